@@ -1,0 +1,263 @@
+"""Block Gibbs sampling with any units clamped and any unobserved.
+
+One step draws, in turn,
+
+    h1 | v, r, h2      factorial in the seed form. In the local form unobserved relations drop out; observed
+                       ones are met by Metropolis–Hastings, proposing blocks of h1 from p(h1 | v, h2)
+    h2 | h1            factorial
+    v  | h1            RBM, GBM: given r, factorial. Triway: with every unobserved relation summed out,
+                       factorial in the local form and object after object in the seed form
+    r  | v, h1         factorial
+
+A plain block sampler freezes the gated seed form: while a relation of i is on, p(v_i = 1) = 1. Hence v
+is drawn with R_i summed out (`collapsed`, the default); the plain kernel stays for contrastive
+divergence, whose one step need not mix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from app.boltzmann.bernoulli import bernoulli
+from app.boltzmann.edges import Edges
+from app.boltzmann.machine import BoltzmannMachine
+from app.boltzmann.rbm import RBM
+from app.boltzmann.triway import Triway
+
+_PROPOSAL_BLOCKS = 8
+
+
+@dataclass(frozen=True)
+class State:
+    """One configuration per chain: v (B, V), r (B, E) over `edges`, h1 (B, H1), h2 (B, H2)."""
+
+    v: Tensor
+    h1: Tensor
+    h2: Tensor
+    r: Tensor
+    edges: Edges
+
+
+@dataclass(frozen=True)
+class Clamp:
+    """Units that keep their value, and relations that are observed.
+
+    Attributes:
+        v, h1, h2: bool masks broadcastable to the blocks; None clamps nothing.
+        edges, r, observed: observed relations, as in `Evidence`. In a Triway machine both ends of an
+            observed unit must be clamped present: the relations of an absent object are off anyway.
+        room: (B,) int64 room types.
+    """
+
+    v: Tensor | None = None
+    h1: Tensor | None = None
+    h2: Tensor | None = None
+    edges: Edges | None = None
+    r: Tensor | None = None
+    observed: Tensor | None = None
+    room: Tensor | None = None
+
+
+FREE = Clamp()
+
+
+def initial_state(
+    machine: BoltzmannMachine, v: Tensor, generator: torch.Generator, clamp: Clamp = FREE
+) -> State:
+    """A state at v with the context drawn from its prior and relations drawn given both."""
+    rows = len(v)
+    h1 = bernoulli(machine.context_bias(clamp.room).sigmoid().expand(rows, -1), generator)
+    h2 = bernoulli(machine.c2.sigmoid().expand(rows, -1), generator)
+    edges, r = sample_relations(machine, v, h1, generator, clamp)
+    return State(v, h1, h2, r, edges)
+
+
+@torch.no_grad()
+def gibbs_step(
+    machine: BoltzmannMachine,
+    state: State,
+    generator: torch.Generator,
+    clamp: Clamp = FREE,
+    *,
+    collapsed: bool = True,
+    relations: bool = True,
+) -> State:
+    """One sweep over h1, h2, v and r.
+
+    Args:
+        collapsed: draw v with its unobserved relations summed out (Triway, seed form).
+        relations: draw r at the end; False keeps the old r where only v matters (local form).
+    """
+    h1 = sample_h1(machine, state, generator, clamp)
+    h2 = state.h2
+    if machine.spec.H2:
+        drawn = bernoulli(machine.second_layer_logits(h1).sigmoid(), generator)
+        h2 = _keep(clamp.h2, h2, drawn)
+    state = replace(state, h1=h1, h2=h2)
+    v = sample_v(machine, state, generator, clamp, collapsed=collapsed)
+    if not relations:
+        return replace(state, v=v)
+    edges, r = sample_relations(machine, v, h1, generator, clamp)
+    return State(v, h1, h2, r, edges)
+
+
+def run(
+    machine: BoltzmannMachine,
+    state: State,
+    generator: torch.Generator,
+    temperatures: Iterable[float],
+    clamp: Clamp = FREE,
+    *,
+    relations: bool = True,
+) -> State:
+    """One Gibbs step per entry of an annealing schedule of temperatures T > 0.
+
+    Tempering scales the weights by 1 / T, which in the seed form is p^(1/T); in the local form it
+    keeps relations locally normalised.
+
+    Raises:
+        ValueError: a temperature is not positive.
+    """
+    for temperature in temperatures:
+        if not temperature > 0:
+            raise ValueError(f"temperature must be positive, not {temperature}")
+        tempered = machine if temperature == 1 else machine.scaled(1 / temperature)
+        state = gibbs_step(tempered, state, generator, clamp, relations=relations)
+    return state
+
+
+def linear_schedule(steps: int, start: float, end: float = 1.0) -> list[float]:
+    """`steps` temperatures from start to end, evenly spaced."""
+    return torch.linspace(start, end, steps, dtype=torch.float64).tolist()
+
+
+def sample_h1(
+    machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp = FREE
+) -> Tensor:
+    """h1 | v, r, h2, (B, H1)."""
+    v, h2 = state.v, state.h2
+    second = h2 if machine.spec.H2 else None
+    if machine.spec.form == "seed":
+        x = machine.hidden_logits(v, state.r, state.edges, second, clamp.room)
+        return _keep(clamp.h1, state.h1, bernoulli(x.sigmoid(), generator))
+    x = machine.context_bias(clamp.room) + v @ machine.W
+    if second is not None:
+        x = x + second @ machine.J.T
+    prior = x.expand(len(v), -1).sigmoid()
+    if clamp.edges is None:
+        return _keep(clamp.h1, state.h1, bernoulli(prior, generator))
+    h1 = state.h1
+    weight = _observed_weight(machine, v, h1, clamp)
+    block = torch.randint(_PROPOSAL_BLOCKS, h1.shape, generator=generator)
+    for k in range(_PROPOSAL_BLOCKS):
+        proposal = torch.where(block == k, bernoulli(prior, generator), h1)
+        proposal = _keep(clamp.h1, h1, proposal)
+        new = _observed_weight(machine, v, proposal, clamp)
+        accept = torch.rand(new.shape, generator=generator, dtype=new.dtype).log() < new - weight
+        h1 = torch.where(accept.unsqueeze(-1), proposal, h1)
+        weight = torch.where(accept, new, weight)
+    return h1
+
+
+def sample_v(
+    machine: BoltzmannMachine,
+    state: State,
+    generator: torch.Generator,
+    clamp: Clamp = FREE,
+    *,
+    collapsed: bool = True,
+) -> Tensor:
+    """v | h1, with unobserved relations summed out where `collapsed`, else v | h1, r; (B, V)."""
+    logits = machine.object_logits(state.h1)
+    if isinstance(machine, RBM):
+        logits = logits + machine.relation_input(state.edges, state.r)
+    elif isinstance(machine, Triway) and machine.spec.form == "seed":
+        if collapsed:
+            return _collapsed_sweep(machine, state, generator, clamp)
+        if bool(machine.kappa.any()):
+            raise ValueError("the plain kernel needs κ = 0: κ ties objects even given h1 and r")
+        held = torch.zeros_like(state.v)
+        held.scatter_reduce_(1, state.edges.subject.expand_as(state.r), state.r, "amax")
+        held.scatter_reduce_(1, state.edges.object.expand_as(state.r), state.r, "amax")
+        return _keep(clamp.v, state.v, bernoulli(logits.sigmoid(), generator).maximum(held))
+    return _keep(clamp.v, state.v, bernoulli(logits.sigmoid(), generator))
+
+
+def _collapsed_sweep(
+    machine: Triway, state: State, generator: torch.Generator, clamp: Clamp
+) -> Tensor:
+    v, h1 = state.v.clone(), state.h1
+    logits = machine.object_logits(h1)
+    for i in range(machine.spec.V):
+        candidate = torch.tensor([[i]])
+        gain = machine.attraction_to_all(v, h1, candidate)[:, 0]
+        drawn = bernoulli((logits[:, i] + gain).sigmoid(), generator)
+        held = None if clamp.v is None else clamp.v.expand_as(v)[:, i]
+        v[:, i] = _keep(held, v[:, i], drawn)
+    return v
+
+
+def sample_relations(
+    machine: BoltzmannMachine,
+    v: Tensor,
+    h1: Tensor,
+    generator: torch.Generator,
+    clamp: Clamp = FREE,
+) -> tuple[Edges, Tensor]:
+    """r | v, h1 over the units that v leaves open; observed units keep their value.
+
+    Returns:
+        The units and r (B, E). In a Triway machine the classes of `clamp.edges` come first.
+    """
+    if not isinstance(machine, Triway):
+        edges = machine.edges(torch.zeros(1, 0, dtype=torch.int64))
+        p = machine.relation_logits(edges, v, h1).sigmoid() * machine.gate(edges, v)
+        r = bernoulli(p, generator)
+        if clamp.edges is None or clamp.r is None or clamp.observed is None:
+            return edges, r
+        return edges, torch.where(clamp.observed, clamp.r, r)
+    pairs = machine.evidence_pairs(clamp.edges, len(v))
+    classes = present_classes(v, pairs.subjects if pairs is not None else None)
+    edges = machine.edges(classes)
+    p = machine.relation_logits(edges, v, h1).sigmoid() * machine.gate(edges, v)
+    r = bernoulli(p, generator)
+    if pairs is None or clamp.r is None or clamp.observed is None:
+        return edges, r
+    n = pairs.subjects.shape[1]
+    grid = edges.unflatten(r)
+    given, known = pairs.unflatten(clamp.r), pairs.unflatten(clamp.observed)
+    grid[..., :n, :n] = torch.where(known, given, grid[..., :n, :n])
+    return edges, grid.flatten(-3)
+
+
+def present_classes(v: Tensor, leading: Tensor | None = None) -> Tensor:
+    """The classes present in each row of v, (B, n) int64 padded with -1; `leading` ones first.
+
+    Args:
+        leading: (B, k) classes that are present and keep their order.
+    """
+    rank = torch.arange(v.shape[-1], dtype=torch.float64).expand(v.shape).clone()
+    rank[v <= 0] = torch.inf
+    if leading is not None:
+        order = torch.arange(leading.shape[1], dtype=torch.float64) - leading.shape[1]
+        rank.scatter_(1, leading, order.expand(leading.shape))
+    width = int(torch.isfinite(rank).sum(1).max()) if len(v) else 0
+    value, index = rank.sort(1)
+    return torch.where(torch.isfinite(value), index, -1)[:, :width]
+
+
+def _observed_weight(machine: BoltzmannMachine, v: Tensor, h1: Tensor, clamp: Clamp) -> Tensor:
+    """log p(observed r | v, h1), (B,)."""
+    if clamp.edges is None or clamp.r is None or clamp.observed is None:
+        raise ValueError("observed relations need edges, r and observed")
+    gate = machine.gate(clamp.edges, v)
+    logits = machine.relation_logits(clamp.edges, v, h1)
+    return machine.relation_term(logits, gate, clamp.r, clamp.observed).sum(-1)
+
+
+def _keep(mask: Tensor | None, old: Tensor, new: Tensor) -> Tensor:
+    return new if mask is None else torch.where(mask, old, new)

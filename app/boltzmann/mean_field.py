@@ -1,0 +1,97 @@
+"""Mean field: the factorial approximation of p(h1, h2 | v, observed r).
+
+Alternates, from h2 at its prior and with damping,
+
+    m2 = sigmoid(c2 + m1'J),   y = c1 + v'W + J m2 + sum_e slope_e(m1) U_e,   m1 = sigmoid(y)
+
+where slope_e is r_e for an observed unit of the seed form and the tangent of the relation term
+otherwise. With one layer and nothing but observed relations (seed) or none (local) it is exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from app.boltzmann.edges import Edges
+from app.boltzmann.machine import BoltzmannMachine
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of some scenes.
+
+    Attributes:
+        v: (B, V) presence.
+        edges: the relation units that may be on.
+        r: (B, E) values of the observed units, 0 elsewhere.
+        observed: (B, E) bool.
+        room: (B,) int64, -1 where no room type is given; None for none at all.
+    """
+
+    v: Tensor
+    edges: Edges | None = None
+    r: Tensor | None = None
+    observed: Tensor | None = None
+    room: Tensor | None = None
+
+    def relations(self, machine: BoltzmannMachine) -> tuple[Edges, Tensor, Tensor] | None:
+        """(edges, r, observed), or None where relations say nothing about the context.
+
+        Unobserved relations drop out of the local form, so there only observed ones matter.
+        """
+        if self.edges is None or not self.edges.shape[-1]:
+            return None
+        shape = (len(self.v), self.edges.shape[-1])
+        if self.r is None or self.observed is None:
+            if machine.spec.form == "local":
+                return None
+            zeros = self.v.new_zeros(shape)
+            return self.edges, zeros, torch.zeros_like(zeros, dtype=torch.bool)
+        if machine.spec.form == "local" and not bool(self.observed.any()):
+            return None
+        return self.edges, self.r, self.observed
+
+
+@dataclass(frozen=True)
+class MeanField:
+    """The fixed point: logits y of h1 (B, H1), without relations x (B, H1), means of h2 (B, H2)."""
+
+    y: Tensor
+    x: Tensor
+    h2: Tensor
+
+
+def mean_field(
+    machine: BoltzmannMachine, evidence: Evidence, *, iterations: int = 10, damping: float = 0.5
+) -> MeanField:
+    """One fixed point of h1 and h2 given the evidence; differentiable in the weights.
+
+    Args:
+        iterations: sweeps over both layers. Fixed, so that the same request gives the same answer.
+        damping: share of the old relation slopes kept in a sweep.
+    """
+    base = machine.context_bias(evidence.room) + evidence.v @ machine.W
+    relations = evidence.relations(machine)
+    two_layers = machine.spec.H2 > 0
+    h2 = machine.c2.sigmoid().expand(len(base), -1)
+    x = base + h2 @ machine.J.T if two_layers else base
+    if relations is None and not two_layers:
+        return MeanField(x, x, h2)
+    y, slopes = x, None
+    for _ in range(iterations):
+        if relations is not None:
+            edges, r, observed = relations
+            gate = machine.gate(edges, evidence.v)
+            logits = machine.relation_logits(edges, evidence.v, y.sigmoid())
+            slope = machine.relation_slope(logits, gate, r, observed)
+            slopes = slope if slopes is None else damping * slopes + (1 - damping) * slope
+            y = x + machine.hidden_input(edges, slopes)
+        if two_layers:
+            h2 = machine.second_layer_logits(y.sigmoid()).sigmoid()
+            y = y - x
+            x = base + h2 @ machine.J.T
+            y = y + x
+    return MeanField(y, x, h2)

@@ -1,0 +1,102 @@
+"""The registry of small machines: one entry here puts a variant through every enumeration test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine, MachineSpec, build
+
+TRIPLES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 0)]
+
+SMALL: dict[str, MachineSpec] = {
+    "rbm": MachineSpec("rbm", V=2, A=2, H1=2, T=4),
+    "rbm-three-classes": MachineSpec("rbm", V=3, A=2, H1=3, T=4, C=2),
+    "gbm": MachineSpec("gbm", V=2, A=2, H1=2, H2=2, T=4),
+    "gbm-one-layer": MachineSpec("gbm", V=3, A=2, H1=2, T=4, C=2),
+    "triway-seed": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, form="seed"),
+    "triway-seed-two-layers": MachineSpec("triway", V=2, A=2, H1=2, H2=2, K=2, form="seed"),
+    "triway-local": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, C=3, form="local"),
+    "triway-local-two-layers": MachineSpec("triway", V=2, A=2, H1=2, H2=2, K=2, T=4, form="local"),
+}
+ONE_LAYER = [name for name, spec in SMALL.items() if not spec.H2]
+SEED_FORM = [name for name, spec in SMALL.items() if spec.form == "seed"]
+
+
+def small_machine(name: str, seed: int = 0, scale: float = 0.8) -> BoltzmannMachine:
+    """A float64 machine with every parameter drawn from N(0, scale²), κ included."""
+    spec = SMALL[name]
+    generator = torch.Generator().manual_seed(seed)
+    machine = build(spec).double()
+    if spec.T:
+        machine.set_triples(torch.tensor(TRIPLES[: spec.T]))
+    with torch.no_grad():
+        for parameter in machine.parameters():
+            noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+            parameter.copy_(noise * scale)
+        if spec.form == "local":
+            machine.kappa.zero_()
+    return machine.requires_grad_(False)
+
+
+def binary(units: int) -> Tensor:
+    """All 2^units binary vectors, (2^units, units) float64."""
+    codes = torch.arange(2**units).unsqueeze(1)
+    return (codes >> torch.arange(units) & 1).double()
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Every state of a small machine with its log-probability.
+
+    v, r, h1, h2: (N, units); log_p: (N,); edges: the frame of all classes that r is laid out on.
+    """
+
+    machine: BoltzmannMachine
+    edges: object
+    v: Tensor
+    r: Tensor
+    h1: Tensor
+    h2: Tensor
+    energy: Tensor
+    log_z: float
+    room: Tensor | None
+
+    @property
+    def p(self) -> Tensor:
+        return (-self.energy - self.log_z).exp()
+
+    def log_sum(self, where: Tensor) -> float:
+        """log sum of exp(-E) over the states of a bool mask."""
+        return float((-self.energy[where]).logsumexp(0))
+
+    def log_odds(self, on: Tensor, given: Tensor) -> float:
+        """log p(on | given) - log p(not on | given)."""
+        return self.log_sum(given & on) - self.log_sum(given & ~on)
+
+
+def full_frame(machine: BoltzmannMachine) -> object:
+    """The relation units between all classes."""
+    return machine.edges(torch.arange(machine.spec.V).unsqueeze(0))
+
+
+def enumerate_joint(machine: BoltzmannMachine, room: int | None = None) -> Joint:
+    """All states (v, r, h1, h2) that have a finite energy."""
+    spec = machine.spec
+    edges = full_frame(machine)
+    sizes = [spec.V, edges.shape[-1], spec.H1, spec.H2]
+    states = binary(sum(sizes))
+    v, r, h1, h2 = states.split(sizes, dim=1)
+    allowed = (r <= machine.gate(edges, v)).all(1)
+    v, r, h1, h2 = v[allowed], r[allowed], h1[allowed], h2[allowed]
+    rooms = None if room is None else torch.full((len(v),), room)
+    energy = machine.energy(v, r, h1, h2, edges, rooms).detach()
+    log_z = float((-energy).logsumexp(0))
+    return Joint(machine, edges, v, r, h1, h2, energy, log_z, rooms)
+
+
+def same(block: Tensor, value: Tensor) -> Tensor:
+    """(N,) bool: rows of a block that equal a value."""
+    return (block == value).all(1)

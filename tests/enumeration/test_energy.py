@@ -1,0 +1,211 @@
+"""Energies against the formulas of the model page, term by term, and F against its definition."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from tests.enumeration.small_machines import (
+    ONE_LAYER,
+    SEED_FORM,
+    SMALL,
+    binary,
+    enumerate_joint,
+    full_frame,
+    small_machine,
+)
+
+
+def relation_logit(machine, e, v, h1):
+    """ℓ_e written out with loops, as on the page."""
+    spec, (a, i, j) = machine.spec, e
+    h = [float(x) for x in h1]
+    table = [tuple(t) for t in machine.triples.tolist()]
+    p = {name: value.detach() for name, value in machine.named_parameters()}
+    if spec.variant in ("rbm", "gbm"):
+        t = table.index(e)
+        logit = p["d"][t] + sum(p["U"][t, k] * h[k] for k in range(spec.H1))
+        if spec.variant == "gbm":
+            logit += p["g"][t, 0] * v[i] + p["g"][t, 1] * v[j]
+        return float(logit)
+    w = p["s"][a, i] + p["o"][a, j]
+    w += sum(p["S"][i, k] * p["R"][a, k] * p["O"][j, k] for k in range(spec.K))
+    if e in table:
+        w += p["residual"][table.index(e)]
+    for x in range(spec.H1):
+        u = p["P"][a, x]
+        u = u + sum(p["S"][i, k] * p["O"][j, k] * p["M"][a, k, x] for k in range(spec.K))
+        w = w + u * h[x]
+    return float(p["d"][a] + w)
+
+
+def energy_by_hand(machine, edges, v, r, h1, h2, room=None):
+    spec = machine.spec
+    p = {name: value.detach() for name, value in machine.named_parameters()}
+    c1 = p["c1"] if room is None else p["c1"] + p["Q"][room]
+    total = -float(p["b"] @ v + c1 @ h1 + p["c2"] @ h2 + v @ p["W"] @ h1 + h1 @ p["J"] @ h2)
+    gated = spec.variant == "triway"
+    for unit, (a, i, j) in enumerate(
+        zip(*(x[0].tolist() for x in (edges.relation, edges.subject, edges.object)), strict=True)
+    ):
+        active = bool(v[i] * v[j]) or not gated
+        if r[unit] and not active:
+            return math.inf
+        if not active:
+            continue
+        logit = relation_logit(machine, (a, i, j), v, h1)
+        total -= float(r[unit]) * logit
+        if spec.form == "local":
+            total += math.log1p(math.exp(logit))
+        elif gated:
+            total -= float(p["kappa"][a])
+    return total
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_energy_is_the_formula(name):
+    machine = small_machine(name)
+    edges = full_frame(machine)
+    generator = torch.Generator().manual_seed(1)
+    room = 1 if machine.spec.C else None
+    for _ in range(60):
+        v, r, h1, h2 = (
+            torch.randint(2, (n,), generator=generator).double()
+            for n in (machine.spec.V, edges.shape[-1], machine.spec.H1, machine.spec.H2)
+        )
+        rooms = None if room is None else torch.tensor([room])
+        ours = machine.energy(v[None], r[None], h1[None], h2[None], edges, rooms)
+        assert float(ours) == pytest.approx(
+            energy_by_hand(machine, edges, v, r, h1, h2, room), rel=1e-12
+        )
+
+
+def test_number_of_gated_states():
+    """V = 2, A = 2, H1 = H2 = 2: 4,240 states with the gate."""
+    assert len(enumerate_joint(small_machine("triway-local-two-layers")).v) == 4240
+
+
+@pytest.mark.parametrize("name", SEED_FORM)
+def test_free_energy_sums_h1_out(name):
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    h2 = joint.h2 if machine.spec.H2 else None
+    free = machine.free_energy(joint.v, joint.r, joint.edges, h2)
+    code = torch.cat([joint.v, joint.r, joint.h2], 1)
+    _, group = code.unique(dim=0, return_inverse=True)
+    for g in range(int(group.max()) + 1):
+        rows = group == g
+        assert float(free[rows][0]) == pytest.approx(-joint.log_sum(rows), rel=1e-10)
+
+
+@pytest.mark.parametrize("name", [n for n in SMALL if n not in SEED_FORM])
+@pytest.mark.parametrize("room", [None, 1])
+def test_local_free_energy_sums_relations_out(name, room):
+    machine = small_machine(name)
+    if room is not None and not machine.spec.C:
+        room = None
+    joint = enumerate_joint(machine, room)
+    h2 = joint.h2 if machine.spec.H2 else None
+    free = machine.free_energy(joint.v, h2=h2, room=joint.room)
+    code = torch.cat([joint.v, joint.h2], 1)
+    _, group = code.unique(dim=0, return_inverse=True)
+    for g in range(int(group.max()) + 1):
+        rows = group == g
+        assert float(free[rows][0]) == pytest.approx(-joint.log_sum(rows), rel=1e-10)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_free_energy_refuses_what_has_no_closed_form(name):
+    machine = small_machine(name)
+    v = torch.ones(1, machine.spec.V).double()
+    edges = full_frame(machine)
+    r = torch.zeros(1, edges.shape[-1]).double()
+    h2 = torch.zeros(1, machine.spec.H2).double() if machine.spec.H2 else None
+    with pytest.raises(ValueError, match="no closed form"):
+        if machine.spec.form == "local":
+            machine.free_energy(v, r, edges, h2)
+        else:
+            machine.free_energy(v, h2=h2)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_conditionals_of_every_block(name):
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    generator = torch.Generator().manual_seed(2)
+    logits = machine.relation_logits(joint.edges, joint.v, joint.h1)
+    second = machine.second_layer_logits(joint.h1)
+    hidden = machine.hidden_logits(
+        joint.v, joint.r, joint.edges, joint.h2 if machine.spec.H2 else None
+    )
+    gate = machine.gate(joint.edges, joint.v)
+    for n in torch.randint(len(joint.v), (40,), generator=generator).tolist():
+        v, r, h1, h2 = (joint.v == joint.v[n], joint.r == joint.r[n], joint.h1 == joint.h1[n],
+                        joint.h2 == joint.h2[n])  # fmt: skip
+        rest = v.all(1) & h1.all(1) & h2.all(1)
+        for e in range(r.shape[1]):
+            others = torch.ones(r.shape[1], dtype=torch.bool)
+            others[e] = False
+            if gate[n, e]:
+                exact = joint.log_odds(joint.r[:, e] > 0, rest & r[:, others].all(1))
+                assert float(logits[n, e]) == pytest.approx(exact, abs=1e-9)
+        for k in range(machine.spec.H2):
+            others = torch.arange(machine.spec.H2) != k
+            given = v.all(1) & r.all(1) & h1.all(1) & h2[:, others].all(1)
+            exact = joint.log_odds(joint.h2[:, k] > 0, given)
+            assert float(second[n, k]) == pytest.approx(exact, abs=1e-9)
+        if machine.spec.form == "seed":
+            for k in range(machine.spec.H1):
+                others = torch.arange(machine.spec.H1) != k
+                given = v.all(1) & r.all(1) & h2.all(1) & h1[:, others].all(1)
+                exact = joint.log_odds(joint.h1[:, k] > 0, given)
+                assert float(hidden[n, k]) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", [n for n, s in SMALL.items() if s.variant == "triway"])
+def test_no_relation_of_an_absent_object_can_be_on(name):
+    machine = small_machine(name)
+    edges = full_frame(machine)
+    for v, r in itertools.product(binary(machine.spec.V), binary(edges.shape[-1])):
+        zeros = torch.zeros(1, machine.spec.H1).double(), torch.zeros(1, machine.spec.H2).double()
+        energy = machine.energy(v[None], r[None], *zeros, edges)
+        on = {int(edges.subject[0, e]) for e in r.nonzero().flatten()}
+        on |= {int(edges.object[0, e]) for e in r.nonzero().flatten()}
+        assert bool(torch.isinf(energy)) == any(v[i] == 0 for i in on)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_hidden_input_is_the_sum_of_rows(name):
+    machine = small_machine(name)
+    edges = full_frame(machine)
+    weight = torch.rand(1, edges.shape[-1], generator=torch.Generator().manual_seed(3)).double()
+    rows = machine.relation_context(edges)
+    expected = (weight.unsqueeze(-1) * rows).sum(1)
+    torch.testing.assert_close(machine.hidden_input(edges, weight), expected)
+
+
+@pytest.mark.parametrize("name", ONE_LAYER)
+def test_attraction_is_what_summing_relations_adds(name):
+    """log sum_{R_i} exp(-E) at v_i = 1 minus at v_i = 0, given h1, is b_i + W_i·h1 + attraction."""
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    for h1 in binary(machine.spec.H1):
+        for v in binary(machine.spec.V):
+            for i in range(machine.spec.V):
+                others = torch.arange(machine.spec.V) != i
+                given = same_rows(joint.h1, h1) & same_rows(joint.v[:, others], v[others])
+                exact = joint.log_odds(joint.v[:, i] > 0, given)
+                absent = v.clone()
+                absent[i] = 0
+                gain = machine.attraction(
+                    absent[None], h1[None], joint.edges, torch.tensor([[i]])
+                )
+                ours = machine.object_logits(h1[None])[0, i] + gain[0, 0]
+                assert float(ours) == pytest.approx(exact, abs=1e-9)
+
+
+def same_rows(block, value):
+    return (block == value).all(1)

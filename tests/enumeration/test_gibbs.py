@@ -1,0 +1,179 @@
+"""The Gibbs kernels leave p stationary, and a fully related object can leave the chain.
+
+Draw states exactly from the enumerated joint, run the kernel once, and compare the histogram with p. The
+yardstick is the total variation of as many exact draws (the Monte-Carlo floor), which separates a
+wrong kernel from slow mixing: a stationary kernel stays at the floor however slowly it mixes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from app.boltzmann.gibbs import (
+    FREE,
+    Clamp,
+    State,
+    gibbs_step,
+    initial_state,
+    linear_schedule,
+    present_classes,
+    run,
+)
+from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+
+CHAINS = 60_000
+
+
+def state_code(machine, state):
+    """One integer per chain from (v, r, h1, h2), with r laid out over all classes."""
+    spec = machine.spec
+    if spec.variant == "triway":
+        dense = torch.zeros(len(state.v), spec.A, spec.V, spec.V).double()
+        e = state.edges
+        index = (e.relation * spec.V + e.subject) * spec.V + e.object
+        dense = dense.flatten(1).scatter_add(1, index, state.r * e.valid)
+    else:
+        dense = state.r
+    bits = torch.cat([state.v, dense, state.h1, state.h2], 1).long()
+    return (bits << torch.arange(bits.shape[1])).sum(1)
+
+
+def histogram(codes, keys):
+    order = keys.argsort()
+    place = torch.searchsorted(keys[order], codes)
+    assert bool((keys[order][place] == codes).all()), "a state of probability zero"
+    counts = torch.bincount(order[place], minlength=len(keys)).double()
+    return counts / counts.sum()
+
+
+def start(joint, generator, given=None):
+    p = joint.p if given is None else torch.where(given, joint.p, 0.0)
+    pick = torch.multinomial(p, CHAINS, replacement=True, generator=generator)
+    v, r, h1, h2 = joint.v[pick], joint.r[pick], joint.h1[pick], joint.h2[pick]
+    rows = joint.edges
+    if joint.machine.spec.variant == "triway":
+        rows = joint.machine.edges(torch.arange(joint.machine.spec.V).expand(CHAINS, -1))
+    return State(v, h1, h2, r, rows), p / p.sum()
+
+
+def check_stationary(joint, clamp, given, seed, **options):
+    """TV within twice the floor's mean; by McDiarmid fails by chance with probability < 1e-9."""
+    generator = torch.Generator().manual_seed(seed)
+    machine = joint.machine
+    state, p = start(joint, generator, given)
+    all_states = State(joint.v, joint.h1, joint.h2, joint.r, joint.edges)
+    if machine.spec.variant == "triway":
+        frame = machine.edges(torch.arange(machine.spec.V).expand(len(joint.v), -1))
+        all_states = replace(all_states, edges=frame)
+    keys = state_code(machine, all_states)
+    floor = 0.5 * (2 * p * (1 - p) / (torch.pi * CHAINS)).sqrt().sum()
+    state = gibbs_step(machine, state, generator, clamp, **options)
+    after = histogram(state_code(machine, state), keys)
+    distance = 0.5 * (after - p).abs().sum()
+    # McDiarmid: one chain moves TV by 1/N, so P(TV > E + t) <= exp(-2 N t²).
+    slack = (9 * torch.log(torch.tensor(10.0)) / (2 * CHAINS)).sqrt()
+    assert float(distance) < float(floor * 1.1 + slack)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_kernel_is_stationary(name):
+    check_stationary(enumerate_joint(small_machine(name)), FREE, None, seed=5)
+
+
+@pytest.mark.parametrize("name", [n for n, s in SMALL.items() if s.form == "seed"])
+def test_plain_block_kernel_is_stationary(name):
+    machine = small_machine(name)
+    if machine.spec.variant == "triway":
+        machine.kappa.zero_()
+    check_stationary(enumerate_joint(machine), FREE, None, seed=6, collapsed=False)
+
+
+def test_plain_block_kernel_refuses_a_compensated_machine():
+    machine = small_machine("triway-seed")
+    generator = torch.Generator().manual_seed(0)
+    state = initial_state(machine, torch.ones(1, 2).double(), generator)
+    with pytest.raises(ValueError, match="κ = 0"):
+        gibbs_step(machine, state, generator, collapsed=False)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_kernel_is_stationary_with_units_clamped_and_relations_observed(name):
+    """v_0 clamped on, one hidden unit clamped off, one relation observed on, the rest free."""
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    loop = (joint.edges.subject[0] == 0) & (joint.edges.object[0] == 0)
+    unit = int(loop.nonzero()[0]) if bool(loop.any()) else 0
+    held = [0] if bool(loop.any()) else [0, 1]
+    mask_v = torch.zeros(1, machine.spec.V, dtype=torch.bool)
+    mask_v[0, held] = True
+    mask_h = torch.zeros(1, machine.spec.H1, dtype=torch.bool)
+    mask_h[0, 1] = True
+    observed = torch.zeros(1, joint.r.shape[1], dtype=torch.bool)
+    observed[0, unit] = True
+    given = (joint.v[:, held] > 0).all(1) & (joint.h1[:, 1] == 0) & (joint.r[:, unit] > 0)
+    if machine.spec.variant == "triway":
+        edges = machine.edges(torch.tensor([held]).expand(CHAINS, -1))
+        size = edges.shape[1]
+        place = [
+            e
+            for e in range(size)
+            if all(
+                int(getattr(edges, end)[0, e]) == int(getattr(joint.edges, end)[0, unit])
+                for end in ("relation", "subject", "object")
+            )
+        ]
+        observed = torch.zeros(1, size, dtype=torch.bool)
+        observed[0, place] = True
+    else:
+        edges = joint.edges
+    clamp = Clamp(
+        v=mask_v,
+        h1=mask_h,
+        edges=edges,
+        r=observed.double().expand(CHAINS, -1),
+        observed=observed.expand(CHAINS, -1),
+    )
+    check_stationary(joint, clamp, given, seed=7)
+
+
+def test_a_fully_related_object_can_leave_the_chain():
+    """Seed form: with all its relations on, an object still leaves under the collapsed kernel."""
+    machine = small_machine("triway-seed")
+    machine.d.fill_(3.0)
+    machine.kappa.zero_()
+    rows = 2000
+    generator = torch.Generator().manual_seed(8)
+    v = torch.ones(rows, machine.spec.V).double()
+    state = initial_state(machine, v, generator)
+    state = replace(state, r=torch.ones_like(state.r))
+    plain = gibbs_step(machine, state, generator, collapsed=False)
+    assert bool((plain.v == 1).all())
+    machine.b.fill_(-40.0)
+    collapsed = gibbs_step(machine, state, generator)
+    assert float(collapsed.v.mean()) < 0.5
+
+
+def test_tempering_scales_the_energy_in_the_seed_form():
+    machine = small_machine("triway-seed-two-layers")
+    joint = enumerate_joint(machine)
+    cold = machine.scaled(0.5)
+    energy = cold.energy(joint.v, joint.r, joint.h1, joint.h2, joint.edges)
+    torch.testing.assert_close(energy, 0.5 * joint.energy)
+
+
+def test_run_refuses_a_temperature_that_is_not_positive():
+    machine = small_machine("rbm")
+    generator = torch.Generator().manual_seed(0)
+    state = initial_state(machine, torch.zeros(1, 2).double(), generator)
+    with pytest.raises(ValueError, match="temperature must be positive"):
+        run(machine, state, generator, [1.0, 0.0])
+    assert linear_schedule(3, 2.0) == [2.0, 1.5, 1.0]
+
+
+def test_present_classes_puts_leading_ones_first():
+    v = torch.tensor([[1.0, 0, 1, 1], [0, 0, 0, 1]])
+    assert present_classes(v).tolist() == [[0, 2, 3], [3, -1, -1]]
+    assert present_classes(v, torch.tensor([[3], [3]])).tolist() == [[3, 0, 2], [3, -1, -1]]

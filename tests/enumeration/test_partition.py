@@ -1,0 +1,53 @@
+"""AIS ≤ log Z ≤ reverse AIS around the exact value."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from app.boltzmann.gibbs import State
+from app.boltzmann.partition import ais, base_log_partition, independent_base, reverse_ais
+from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+
+BETAS = torch.linspace(0, 1, 41).tolist()
+CHAINS = 2000
+
+
+def exact_samples(joint, count, generator):
+    pick = torch.multinomial(joint.p, count, replacement=True, generator=generator)
+    edges = joint.edges
+    if joint.machine.spec.variant == "triway":
+        edges = joint.machine.edges(torch.arange(joint.machine.spec.V).expand(count, -1))
+    return State(joint.v[pick], joint.h1[pick], joint.h2[pick], joint.r[pick], edges)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_base_has_an_exact_partition_function(name):
+    machine = small_machine(name)
+    base = independent_base(machine, torch.tensor([0.3, -0.7, 0.2])[: machine.spec.V])
+    start = machine.scaled(0.0, base)
+    exact = enumerate_joint(start).log_z
+    assert base_log_partition(machine, base) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_forward_and_reverse_bracket_log_z(name):
+    """Both means of log w are bounds in expectation; 5 standard errors of slack each."""
+    machine = small_machine(name)
+    joint = enumerate_joint(machine)
+    generator = torch.Generator().manual_seed(9)
+    forward = ais(machine, BETAS, CHAINS, generator)
+    reverse = reverse_ais(machine, BETAS, exact_samples(joint, CHAINS, generator), generator)
+    slack = 5 * max(forward.standard_error, reverse.standard_error)
+    assert forward.bound <= joint.log_z + slack
+    assert reverse.bound >= joint.log_z - slack
+    assert forward.bound <= forward.log_z and reverse.log_z <= reverse.bound
+    assert forward.log_z == pytest.approx(joint.log_z, abs=slack)
+    assert reverse.log_z == pytest.approx(joint.log_z, abs=slack)
+    assert slack < 0.3
+
+
+@pytest.mark.parametrize("betas", [[0, 1, 0.5], [0.1, 1], [0, 0.5], [0]])
+def test_betas_must_rise_from_zero_to_one(betas):
+    with pytest.raises(ValueError, match="betas"):
+        ais(small_machine("rbm"), betas, 2, torch.Generator())
