@@ -24,8 +24,9 @@ from torch import Tensor
 
 from app.boltzmann.bernoulli import bernoulli
 from app.boltzmann.edges import Edges
+from app.boltzmann.gbm import GBM
 from app.boltzmann.machine import BoltzmannMachine
-from app.boltzmann.rbm import RBM
+from app.boltzmann.presence import presence_product
 from app.boltzmann.triway import Triway
 
 _PROPOSAL_BLOCKS = 8
@@ -141,14 +142,13 @@ def sample_h1(
     """h1 | v, r, h2, (B, H1)."""
     v, h2 = state.v, state.h2
     second = h2 if machine.spec.H2 else None
-    if machine.spec.form == "seed":
-        x = machine.hidden_logits(v, state.r, state.edges, second, clamp.room)
-        return _keep(clamp.h1, state.h1, bernoulli(x.sigmoid(), generator))
-    x = machine.context_bias(clamp.room) + v @ machine.W
+    x = presence_product(v, machine.W).add_(machine.context_bias(clamp.room))
     if second is not None:
-        x = x + second @ machine.J.T
-    prior = x.expand(len(v), -1).sigmoid()
-    if clamp.edges is None:
+        x = torch.addmm(x, second, machine.J.T)
+    if machine.spec.form == "seed" and state.r.shape[-1]:
+        x = x + machine.hidden_input(state.edges, state.r)
+    prior = x.sigmoid_()
+    if machine.spec.form == "seed" or clamp.edges is None:
         return _keep(clamp.h1, state.h1, bernoulli(prior, generator))
     h1 = state.h1
     weight = _observed_weight(machine, v, h1, clamp)
@@ -172,8 +172,9 @@ def sample_v(
     collapsed: bool = True,
 ) -> Tensor:
     """v | h1, with unobserved relations summed out where `collapsed`, else v | h1, r; (B, V)."""
-    logits = machine.object_logits(state.h1)
-    if isinstance(machine, RBM):
+    # addmm: the bias enters with the product, and sigmoid_ overwrites: memory is what a sweep waits for.
+    logits = torch.addmm(machine.b, state.h1, machine.W.T)
+    if isinstance(machine, GBM):
         logits = logits + machine.relation_input(state.edges, state.r)
     elif isinstance(machine, Triway) and machine.spec.form == "seed":
         if collapsed:
@@ -184,7 +185,7 @@ def sample_v(
         held.scatter_reduce_(1, state.edges.subject.expand_as(state.r), state.r, "amax")
         held.scatter_reduce_(1, state.edges.object.expand_as(state.r), state.r, "amax")
         return _keep(clamp.v, state.v, bernoulli(logits.sigmoid(), generator).maximum(held))
-    return _keep(clamp.v, state.v, bernoulli(logits.sigmoid(), generator))
+    return _keep(clamp.v, state.v, bernoulli(logits.sigmoid_(), generator))
 
 
 def _collapsed_sweep(

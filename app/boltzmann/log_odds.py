@@ -17,7 +17,7 @@ from torch.nn.functional import softplus
 from app.boltzmann.draws import HiddenDraws, draw_hidden
 from app.boltzmann.edges import Edges
 from app.boltzmann.machine import BoltzmannMachine
-from app.boltzmann.mean_field import Evidence, mean_field
+from app.boltzmann.mean_field import SWEEPS, Evidence, mean_field
 
 
 class _ContextGain(torch.autograd.Function):
@@ -60,6 +60,7 @@ def object_log_odds(
     evidence: Evidence,
     *,
     candidates: Tensor | None = None,
+    iterations: int = SWEEPS,
 ) -> Tensor:
     """Log-odds of candidate objects with the context at the mean-field fixed point, (B, N).
 
@@ -70,8 +71,9 @@ def object_log_odds(
 
     Args:
         candidates: (B or 1, N) int64; all V classes by default.
+        iterations: sweeps of the mean field.
     """
-    field = mean_field(machine, evidence)
+    field = mean_field(machine, evidence, iterations=iterations)
     if candidates is None:
         gain = machine.b + context_gain(field.y, machine.W)
         candidates = torch.arange(machine.spec.V).unsqueeze(0)

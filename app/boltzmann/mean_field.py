@@ -18,6 +18,9 @@ from torch import Tensor
 from app.boltzmann.edges import Edges
 from app.boltzmann.machine import BoltzmannMachine
 
+# Enough for the slopes to settle on the machines we ship; fixed, so that answers repeat.
+SWEEPS = 10
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -65,12 +68,12 @@ class MeanField:
 
 
 def mean_field(
-    machine: BoltzmannMachine, evidence: Evidence, *, iterations: int = 10, damping: float = 0.5
+    machine: BoltzmannMachine, evidence: Evidence, *, iterations: int = SWEEPS, damping: float = 0.5
 ) -> MeanField:
     """One fixed point of h1 and h2 given the evidence; differentiable in the weights.
 
     Args:
-        iterations: sweeps over both layers. Fixed, so that the same request gives the same answer.
+        iterations: sweeps over both layers.
         damping: share of the old relation slopes kept in a sweep.
     """
     base = machine.context_bias(evidence.room) + evidence.v @ machine.W

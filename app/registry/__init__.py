@@ -1,0 +1,40 @@
+"""Published models: their format, their store, and the verified snapshot a service works with."""
+
+from app.registry.artifact import Artifact, load_artifact, write_artifact
+from app.registry.description import (
+    Calibration,
+    CountSlope,
+    DataSource,
+    Description,
+    Metric,
+    Slope,
+    VocabularyEntry,
+)
+from app.registry.errors import ArtifactError, RegistryError, StoreError
+from app.registry.manifest import Manifest
+from app.registry.models import ArtifactFailure, ModelSet, StoreFailure, load_model_set
+from app.registry.references import AliasTarget
+from app.registry.store import Store
+
+__all__ = [
+    "AliasTarget",
+    "Artifact",
+    "ArtifactError",
+    "ArtifactFailure",
+    "Calibration",
+    "CountSlope",
+    "DataSource",
+    "Description",
+    "Manifest",
+    "Metric",
+    "ModelSet",
+    "RegistryError",
+    "Slope",
+    "Store",
+    "StoreError",
+    "StoreFailure",
+    "VocabularyEntry",
+    "load_artifact",
+    "load_model_set",
+    "write_artifact",
+]

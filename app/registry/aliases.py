@@ -1,0 +1,44 @@
+"""The table of aliases: one small JSON file, replaced as a whole.
+
+{"default": {"name": "...", "version": "..." or null for the latest}}
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from pydantic import TypeAdapter, ValidationError
+
+from app.registry.durable import replace_file
+from app.registry.errors import StoreError, cause
+from app.registry.references import AliasTarget, ModelName
+
+_TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
+
+
+def read_aliases(path: Path) -> dict[str, AliasTarget]:
+    """What each alias points at; nothing where there is no file.
+
+    Raises:
+        StoreError: `invalid_aliases` where the file is not what `write_aliases` writes.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        with os.fdopen(descriptor, "rb") as file:
+            return _TABLE.validate_json(file.read())
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise StoreError("invalid_aliases", f"{path.name}: {cause(error)}") from None
+    except ValidationError as error:
+        detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        raise StoreError("invalid_aliases", f"{path.name}: {detail['msg']}") from None
+
+
+def write_aliases(path: Path, aliases: Mapping[str, AliasTarget], *, prefix: str) -> None:
+    """Replace the table; `prefix` marks the temporary sibling that a crash may leave."""
+    table = dict(sorted(aliases.items()))
+    replace_file(path, _TABLE.dump_json(table, indent=2) + b"\n", prefix=prefix)

@@ -1,0 +1,137 @@
+"""One version of a model: written once, verified whenever it is read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import ArrayLike, NDArray
+
+from app.registry.card import render_card
+from app.registry.description import Calibration, Description
+from app.registry.durable import sync_directory, write_file
+from app.registry.errors import ArtifactError
+from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
+from app.registry.tensors import StorageDtype, pack, require_equal, unpack
+from app.registry.verified import read_verified
+from app.scene.vocabulary import Vocabulary
+
+if TYPE_CHECKING:  # importing torch takes seconds; writing and listing artifacts does without
+    from app.boltzmann import BoltzmannMachine
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Artifact:
+    """A verified model, ready to be asked.
+
+    Attributes:
+        manifest: everything the trainer said about it.
+        machine: in evaluation mode, float32, without gradients.
+        vocabulary: the words of its V object classes and C room types.
+        calibration: from log-odds to promised probabilities.
+        digest: SHA-256 of the manifest's bytes, hexadecimal; it changes if any file does.
+        card: the model card, Markdown.
+        path: the directory it was read from.
+    """
+
+    manifest: Manifest
+    machine: BoltzmannMachine
+    vocabulary: Vocabulary
+    calibration: Calibration
+    digest: str
+    card: str
+    path: Path
+
+
+def write_artifact(
+    directory: Path,
+    description: Description,
+    state: Mapping[str, ArrayLike],
+    *,
+    storage_dtype: StorageDtype = "float32",
+) -> Manifest:
+    """Write an artifact into a new directory and bring it to disk.
+
+    Args:
+        directory: must not exist; its parent must.
+        description: the manifest but for what describes the files.
+        state: the machine's `state_dict()`, or numpy arrays of the same names.
+        storage_dtype: of tensors with two axes or more; see `pack`.
+
+    Raises:
+        ArtifactError: a tensor that an artifact cannot hold; see `pack`.
+        OSError: from the file system.
+    """
+    weights, tensors = pack(state, storage_dtype)
+    card = render_card(description, tensors).encode()
+    manifest = Manifest(
+        **dict(description),
+        tensors=tensors,
+        files={
+            name: FileEntry(sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
+            for name, data in ((WEIGHTS, weights), (CARD, card))
+        },
+    )
+    directory.mkdir(mode=0o755)
+    for name, data in ((WEIGHTS, weights), (CARD, card), (MANIFEST, manifest.to_bytes())):
+        write_file(directory / name, data)
+    sync_directory(directory)
+    return manifest
+
+
+def load_artifact(directory: Path, previous: Artifact | None = None) -> Artifact:
+    """Read and verify an artifact.
+
+    Args:
+        directory: holds the three files and nothing else.
+        previous: an artifact loaded before. The files are verified all the same, but where their
+            digest is unchanged, `previous` itself is returned instead of a second copy.
+
+    Raises:
+        ArtifactError: with the code and reason of the first thing found wrong.
+    """
+    files = read_verified(directory)
+    if previous is not None and previous.digest == files.digest:
+        return previous
+    manifest = files.manifest
+    return Artifact(
+        manifest=manifest,
+        machine=_machine(manifest, unpack(files.weights, manifest.tensors)),
+        vocabulary=manifest.vocabulary.vocabulary(),
+        calibration=manifest.calibration,
+        digest=files.digest,
+        card=files.card,
+        path=directory,
+    )
+
+
+def _machine(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> BoltzmannMachine:
+    import torch
+
+    from app.boltzmann import MachineSpec, build
+
+    try:
+        spec = MachineSpec.from_dict(dict(manifest.spec))
+        # On the meta device nothing is allocated, however large a spec claims to be.
+        with torch.device("meta"):
+            machine = build(spec)
+    except (ValueError, TypeError, RuntimeError, OverflowError) as error:
+        raise ArtifactError("invalid_manifest", f"spec: {error}") from None
+    state = {name: torch.from_numpy(array) for name, array in tensors.items()}
+    require_equal(
+        {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in state.items()},
+        {
+            name: (tensor.dtype, tuple(tensor.shape))
+            for name, tensor in machine.state_dict().items()
+        },
+        "the artifact holds",
+        f"a {spec.variant} of this spec needs",
+    )
+    try:
+        machine.load_state_dict(state, assign=True)
+    except ValueError as error:
+        raise ArtifactError("invalid_tensor", str(error)) from None
+    return machine.eval().requires_grad_(False)

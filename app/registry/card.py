@@ -1,0 +1,102 @@
+"""The model card: what a person should know before a robot acts on this model's answers.
+
+Sections follow Mitchell et al., "Model Cards for Model Reporting", FAT* 2019.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from math import prod
+
+from app.registry.description import DataSource, Description
+from app.registry.manifest import TensorEntry
+
+_RESEARCH_WARNING = """\
+> **Research use.** These weights were learned from {sources}, whose terms allow research use. Do
+> not ship them in a commercial robot without asking the owners of the data; a model trained on
+> freely licensed scenes alone carries no such warning."""
+
+_INTENDED_USE = """\
+For a robot that has recognised the objects of an indoor scene: which spatial relations hold between
+them, which object is missing and where it would stand, which one does not belong, and what such a
+scene looks like."""
+
+_LIMITS = """\
+- The model speaks of classes, not of instances: it says whether a class belongs here, not how many
+  of it. How many chairs a table wants is outside it.
+- Annotators list a few relations of each scene. An unlisted relation counts as wrong in the figures
+  above without being false, and `/relations` answers what an annotator would list.
+- Left and front are meant in the viewer's axes. Where a source has no viewer, one was chosen in
+  training, and these two relations carry that choice.
+- Labels outside the vocabulary are not understood. Structure and vague labels (floor, wall, object)
+  are accepted and never proposed.
+- Rooms unlike those of the sources above are outside what the figures speak of, and so are scenes
+  of which the robot saw a small part.
+- A probability is a statistical statement about such scenes. It is no safety check: do not let a
+  robot move something, or leave it alone, on this answer only."""
+
+
+def render_card(description: Description, tensors: Mapping[str, TensorEntry]) -> str:
+    """The card of a model, Markdown."""
+    words, spec = description.vocabulary, description.spec
+    proposed = sum(not entry.structure for entry in words.objects)
+    weights = sum(prod(e.shape) for e in tensors.values() if e.dtype.startswith("float"))
+    stored = ", ".join(sorted({entry.dtype for entry in tensors.values()}))
+    sections = [
+        f"# {description.name} {description.version}",
+        *_warning(description.data),
+        "## Model",
+        _table(
+            ("", ""),
+            [
+                ("Kind", f"{description.variant}, a Boltzmann machine over objects and relations"),
+                ("Shape", ", ".join(f"{name} {value}" for name, value in spec.items())),
+                ("Weights", f"{weights:,} (stored as {stored})"),
+                ("Object classes", f"{len(words.objects)}, of which {proposed} may be proposed"),
+                ("Relations", ", ".join(words.relations)),
+                ("Room types", ", ".join(words.room_types) or "none"),
+                ("Created", description.created.isoformat()),
+            ],
+        ),
+        "## Intended use",
+        _INTENDED_USE,
+        "## Metrics",
+        _metrics(description),
+        "## Data and terms",
+        _table(
+            ("Source", "Scenes", "Terms", "SHA-256"),
+            [(s.source, f"{s.scenes:,}", s.terms, f"`{s.digest[:16]}…`") for s in description.data],
+        ),
+        f"Terms of the weights: {description.terms}",
+        "## Limits",
+        _LIMITS,
+        "## Made with",
+        ", ".join(f"{name} {version}" for name, version in description.libraries.items())
+        or "not recorded",
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _warning(data: Sequence[DataSource]) -> Iterable[str]:
+    if sources := [source.source for source in data if source.research_only]:
+        yield _RESEARCH_WARNING.format(sources=", ".join(map(_cell, sources)))
+
+
+def _metrics(description: Description) -> str:
+    if not description.metrics:
+        return "None recorded: nothing is known of how well this model answers."
+    rows = [
+        (m.task, m.source, m.metric, f"{m.value:.4g}", f"{m.low:.4g} – {m.high:.4g}", f"{m.n:,}")
+        for m in description.metrics
+    ]
+    return _table(("Task", "Source", "Metric", "Value", "95 % interval", "n"), rows)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(map(_cell, line))} |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    """Text that cannot break out of its cell."""
+    return " ".join(text.replace("|", "\\|").split())

@@ -1,0 +1,208 @@
+"""What a trainer says about a model: everything but its numbers and its files."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import Annotated, Any, Self
+
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    StringConstraints,
+    field_validator,
+    model_validator,
+)
+
+from app.registry.references import ModelName, Version
+from app.scene.relations import CANONICAL
+from app.scene.vocabulary import Vocabulary
+
+Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Text = Annotated[str, StringConstraints(min_length=1)]
+Count = Annotated[int, Field(ge=0)]
+
+
+def _in_utc(moment: datetime) -> datetime:
+    return moment.astimezone(UTC)
+
+
+Timestamp = Annotated[AwareDatetime, AfterValidator(_in_utc)]
+
+
+def to_json(value: Any) -> str:
+    """One line of strict JSON; raises ValueError for NaN and infinity."""
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+class Frozen(BaseModel):
+    """Cannot be changed, and holds no unknown or non-finite field."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class CountSlope(Frozen):
+    """A logit z of an answer, made a log-odds: intercept + slope·z + log_count·log n.
+
+    What n counts is the answer's: instance pairs for relations, objects of the scene for outliers.
+    """
+
+    intercept: float = 0.0
+    slope: float = 1.0
+    log_count: float = 0.0
+
+
+class Slope(Frozen):
+    """intercept + slope·z."""
+
+    intercept: float = 0.0
+    slope: float = 1.0
+
+
+class Calibration(Frozen):
+    """How a machine's log-odds become the probabilities that the service promises.
+
+    The defaults change nothing.
+
+    Attributes:
+        missing_temperature: divides the log-odds before the softmax over absent classes.
+        placed_temperature: the same where the question names a place.
+        placed_relation_weight: weight of the relation's log-odds in that question.
+        outlier: presence log-odds to the log-odds of being an intruder.
+        outlier_threshold: probability from which an object is called an outlier.
+        relation: one entry a canonical relation.
+        misplaced: relation log-odds to the log-odds of being false.
+    """
+
+    missing_temperature: Annotated[float, Field(gt=0)] = 1.0
+    placed_temperature: Annotated[float, Field(gt=0)] = 1.0
+    placed_relation_weight: float = 1.0
+    outlier: CountSlope = CountSlope()
+    outlier_threshold: Annotated[float, Field(ge=0, le=1)] = 0.5
+    relation: tuple[CountSlope, ...]
+    misplaced: Slope = Slope()
+
+    @classmethod
+    def neutral(cls, relations: int) -> Self:
+        """The calibration that changes nothing, for A canonical relations."""
+        return cls(relation=(CountSlope(),) * relations)
+
+
+class ClassEntry(Frozen):
+    """One object class; `size` is its typical extent in metres, x, y, z."""
+
+    label: Text
+    aliases: tuple[Text, ...] = ()
+    structure: bool = False
+    size: tuple[float, float, float] | None = None
+
+
+class VocabularyEntry(Frozen):
+    """The words of a model, in the order of its units."""
+
+    objects: tuple[ClassEntry, ...]
+    relations: tuple[str, ...] = CANONICAL
+    room_types: tuple[Text, ...] = ()
+
+    @model_validator(mode="after")
+    def _is_a_vocabulary(self) -> Self:
+        if self.relations != CANONICAL[: len(self.relations)]:
+            raise ValueError(f"relations must be the canonical ones in their order: {CANONICAL}")
+        self.vocabulary()
+        return self
+
+    @classmethod
+    def of(cls, vocabulary: Vocabulary, relations: int = len(CANONICAL)) -> Self:
+        """The entry of a vocabulary, for a machine of A = `relations`."""
+        return cls.model_validate({**vocabulary.to_dict(), "relations": CANONICAL[:relations]})
+
+    def vocabulary(self) -> Vocabulary:
+        """The vocabulary itself."""
+        return Vocabulary.from_dict(self.model_dump(mode="json", exclude={"relations"}))
+
+
+class DataSource(Frozen):
+    """Scenes that the model was trained on, their digest and their terms."""
+
+    source: Text
+    scenes: Count
+    digest: Sha256
+    terms: Text
+    research_only: bool
+
+
+class Metric(Frozen):
+    """One measured figure with its 95 % interval over n units (scenes, removed objects …)."""
+
+    task: Text
+    source: Text
+    metric: Text
+    value: float
+    low: float
+    high: float
+    n: Annotated[int, Field(ge=1)]
+
+    @model_validator(mode="after")
+    def _is_interval(self) -> Self:
+        if self.low > self.high:
+            raise ValueError(f"low ({self.low}) must not exceed high ({self.high})")
+        return self
+
+
+class Description(Frozen):
+    """What the trainer says about a model; all of the manifest but what describes the files.
+
+    Attributes:
+        name, version: where the artifact is published.
+        created: when; kept in UTC.
+        spec: `MachineSpec.to_dict()`.
+        vocabulary: words in the order of the units; V, A and C of them.
+        calibration: see `Calibration`.
+        training: configuration and seed, free JSON.
+        data: the sources trained on.
+        metrics: measured on held-out scenes.
+        terms: licence of the weights, in words.
+        libraries: versions that the model was trained with.
+    """
+
+    name: ModelName
+    version: Version
+    created: Timestamp
+    spec: dict[str, JsonValue]
+    vocabulary: VocabularyEntry
+    calibration: Calibration
+    training: dict[str, JsonValue]
+    data: tuple[DataSource, ...]
+    metrics: tuple[Metric, ...]
+    terms: Text
+    libraries: dict[str, str]
+
+    @field_validator("spec", "training", "libraries", "terms")
+    @classmethod
+    def _can_be_written(cls, value: JsonValue) -> JsonValue:
+        # pydantic lets NaN and lone surrogates through in free JSON.
+        to_json(value).encode()
+        return value
+
+    @model_validator(mode="after")
+    def _fits_spec(self) -> Self:
+        words = self.vocabulary
+        for name, what, length in (
+            ("V", "vocabulary objects", len(words.objects)),
+            ("A", "vocabulary relations", len(words.relations)),
+            ("A", "calibration relations", len(self.calibration.relation)),
+        ):
+            if self.spec.get(name) != length:
+                raise ValueError(f"{length} {what}, but {name} = {self.spec.get(name)} in the spec")
+        if (rooms := self.spec.get("C", 0)) not in (0, len(words.room_types)):
+            raise ValueError(f"{len(words.room_types)} room types, but C = {rooms} in the spec")
+        return self
+
+    @property
+    def variant(self) -> str:
+        """rbm, gbm or triway."""
+        return str(self.spec.get("variant"))

@@ -1,0 +1,85 @@
+"""Why an artifact or a store was refused: a code for programs and a reason for people."""
+
+from __future__ import annotations
+
+import errno
+import os
+from typing import Literal
+
+ArtifactCode = Literal[
+    "missing_file",
+    "unexpected_file",
+    "unreadable",
+    "truncated",
+    "checksum_mismatch",
+    "unknown_format",
+    "invalid_manifest",
+    "not_safetensors",
+    "wrong_shape",
+    "not_finite",
+    "invalid_tensor",
+    "wrong_place",
+]
+StoreCode = Literal[
+    "invalid_reference",
+    "unknown_model",
+    "unknown_version",
+    "dangling_alias",
+    "invalid_aliases",
+    "version_exists",
+    "name_conflict",
+    "alias_conflict",
+    "unsafe_path",
+    "unreadable",
+    "not_writable",
+    "locked",
+]
+
+
+class RegistryError(Exception):
+    """Base of the registry's errors. Neither code nor reason ever holds an absolute path."""
+
+    code: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.code}: {self.reason}"
+
+
+class ArtifactError(RegistryError):
+    """One artifact cannot be used.
+
+    Attributes:
+        code: machine-readable kind of failure.
+        reason: the same in words, naming the file or tensor, without its folder.
+    """
+
+    code: ArtifactCode
+
+    def __init__(self, code: ArtifactCode, reason: str) -> None:
+        super().__init__(code, reason)
+        self.code = code
+        self.reason = reason
+
+
+class StoreError(RegistryError):
+    """A reference does not resolve, or a change to the store was refused.
+
+    Attributes:
+        code: machine-readable kind of failure.
+        reason: the same in words.
+    """
+
+    code: StoreCode
+
+    def __init__(self, code: StoreCode, reason: str) -> None:
+        super().__init__(code, reason)
+        self.code = code
+        self.reason = reason
+
+
+def cause(error: OSError) -> str:
+    """The system's message without the path that str(error) would show."""
+    if error.errno == errno.ELOOP:
+        return "links are not followed"
+    return os.strerror(error.errno) if error.errno is not None else "input/output error"

@@ -1,0 +1,47 @@
+"""One writer at a time, across processes."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from app.registry.errors import StoreError
+
+
+@contextmanager
+def exclusive(path: Path, timeout: float) -> Iterator[None]:
+    """Hold the lock of a file, created where it is missing and left in place afterwards.
+
+    The kernel releases the lock when its holder ends, however it ends: nobody waits for the dead.
+
+    Args:
+        path: the lock file.
+        timeout: seconds to wait for another holder.
+
+    Raises:
+        StoreError: `locked` after the timeout.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    try:
+        _wait(descriptor, timeout)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _wait(descriptor: int, timeout: float) -> None:
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= deadline:
+                waited = f"another writer has held the store for {timeout:g} s"
+                raise StoreError("locked", waited) from None
+            time.sleep(0.01)
+        else:
+            return

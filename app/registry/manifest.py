@@ -1,0 +1,106 @@
+"""The file beside the weights: a description, and what proves the files to be those described.
+
+A manifest is a JSON object, one top-level member a line, whose last line is the SHA-256 of all
+bytes before it. So a manifest that was cut or altered is recognised by itself, before it is parsed,
+and the checksums it holds of the other files can be believed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from typing import Any, Final, Literal, Self
+
+from pydantic import ValidationError, field_validator
+
+from app.registry.description import Count, Description, Frozen, Sha256, to_json
+from app.registry.errors import ArtifactError
+
+FORMAT: Final = 1
+WEIGHTS: Final = "model.safetensors"
+CARD: Final = "card.md"
+MANIFEST: Final = "manifest.json"
+
+_TRAILER: Final = re.compile(rb',\n"checksum": "([0-9a-f]{64})"\n}\n\Z')
+
+
+class TensorEntry(Frozen):
+    """A tensor as it is stored."""
+
+    dtype: Literal["float16", "float32", "int32", "int64", "bool"]
+    shape: tuple[Count, ...]
+
+
+class FileEntry(Frozen):
+    """Checksum and size of a file."""
+
+    sha256: Sha256
+    bytes: Count
+
+
+class Manifest(Description):
+    """A description, the tensors as stored, and the checksum of every other file."""
+
+    format: Literal[1] = FORMAT
+    tensors: dict[str, TensorEntry]
+    files: dict[str, FileEntry]
+
+    @field_validator("files")
+    @classmethod
+    def _names_every_file(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:
+        if set(files) != {WEIGHTS, CARD}:
+            raise ValueError(f"must name {WEIGHTS} and {CARD}, and no other file")
+        return files
+
+    def to_bytes(self) -> bytes:
+        """The file's contents, checksum last."""
+        members = self.model_dump(mode="json")
+        members = {"format": members.pop("format"), **members}
+        lines = ",\n".join(f"{to_json(name)}: {to_json(value)}" for name, value in members.items())
+        body = f"{{\n{lines}".encode()
+        return body + f',\n"checksum": "{hashlib.sha256(body).hexdigest()}"\n}}\n'.encode()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """Read a manifest back.
+
+        Raises:
+            ArtifactError: `truncated`, `checksum_mismatch`, `unknown_format`, `invalid_manifest`.
+        """
+        trailer = _TRAILER.search(data)
+        if trailer and hashlib.sha256(data[: trailer.start()]).hexdigest().encode() != trailer[1]:
+            raise ArtifactError("checksum_mismatch", f"{MANIFEST} does not match its own checksum")
+        members = _parse(data, complete=trailer is not None)
+        if not _is_known_format(members.get("format")):
+            raise ArtifactError("unknown_format", f"{MANIFEST}: this release reads format {FORMAT}")
+        if not trailer:
+            raise ArtifactError("invalid_manifest", f"{MANIFEST} does not end with its checksum")
+        del members["checksum"]
+        try:
+            return cls.model_validate(members)
+        except ValidationError as error:
+            raise ArtifactError("invalid_manifest", f"{MANIFEST}: {_first(error)}") from None
+
+
+def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
+    try:
+        members = json.loads(data)
+    except (ValueError, RecursionError):
+        if complete:
+            raise ArtifactError("invalid_manifest", f"{MANIFEST} is not JSON") from None
+        raise ArtifactError("truncated", f"{MANIFEST} is cut off or not JSON") from None
+    if not isinstance(members, dict):
+        raise ArtifactError("invalid_manifest", f"{MANIFEST} is not a JSON object")
+    return members
+
+
+def _is_known_format(value: object) -> bool:
+    return type(value) is int and value == FORMAT
+
+
+def _first(error: ValidationError) -> str:
+    """The first complaint and where it is; never the offending value."""
+    detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
+    place = ".".join(str(part) for part in detail["loc"])
+    return f"{place}: {detail['msg']}" if place else str(detail["msg"])

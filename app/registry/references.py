@@ -1,0 +1,116 @@
+"""Names, versions and aliases: their spelling, their order, and what a reference points at.
+
+A reference is an alias, `name` (its latest version), or `name@version`. Spellings are narrow enough
+to be used as file names as they are: no separators, no leading dot, one case.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, ConfigDict
+
+from app.registry.errors import StoreError
+
+_NAME = re.compile(r"[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?")
+_VERSION = re.compile(r"(?:0|[1-9][0-9]{0,8})(?:\.(?:0|[1-9][0-9]{0,8})){2}")
+
+
+def is_name(text: str) -> bool:
+    """Whether text may name a model or an alias: a-z, 0-9, inner `_` and `-`, up to 64."""
+    return _NAME.fullmatch(text) is not None
+
+
+def is_version(text: str) -> bool:
+    """Whether text is MAJOR.MINOR.PATCH, three decimal numbers without leading zeros."""
+    return _VERSION.fullmatch(text) is not None
+
+
+def _require_name(text: str) -> str:
+    if not is_name(text):
+        raise ValueError("must have 1 to 64 characters a-z, 0-9 and, inside, '_' or '-'")
+    return text
+
+
+def _require_version(text: str) -> str:
+    if not is_version(text):
+        raise ValueError("must be MAJOR.MINOR.PATCH without leading zeros, as in 1.0.0")
+    return text
+
+
+ModelName = Annotated[str, AfterValidator(_require_name)]
+Version = Annotated[str, AfterValidator(_require_version)]
+
+
+class AliasTarget(BaseModel):
+    """What an alias stands for: one version, or whatever is the latest (`version` null)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: ModelName
+    version: Version | None = None
+
+    def __str__(self) -> str:
+        return self.name if self.version is None else f"{self.name}@{self.version}"
+
+
+def check_name(text: str, what: str = "model name") -> str:
+    """Return text, or raise StoreError (`invalid_reference`)."""
+    try:
+        return _require_name(text)
+    except ValueError as error:
+        raise StoreError("invalid_reference", f"a {what} {error}") from None
+
+
+def check_version(text: str) -> str:
+    """Return text, or raise StoreError (`invalid_reference`)."""
+    try:
+        return _require_version(text)
+    except ValueError as error:
+        raise StoreError("invalid_reference", f"a version {error}") from None
+
+
+def version_key(version: str) -> tuple[int, ...]:
+    """Sort key: versions are ordered number by number."""
+    return tuple(int(part) for part in version.split("."))
+
+
+def resolve_reference(
+    reference: str,
+    aliases: Mapping[str, AliasTarget],
+    versions: Callable[[str], Sequence[str]],
+) -> tuple[str, str]:
+    """The (name, version) that a reference points at.
+
+    Args:
+        reference: alias, `name`, or `name@version`.
+        aliases: by alias; an alias goes before a model of the same name.
+        versions: of a model, ascending; none where there is no such model.
+
+    Raises:
+        StoreError: `invalid_reference`, `unknown_model`, `unknown_version` or `dangling_alias`.
+    """
+    name, at, version = reference.partition("@")
+    check_name(name)
+    if at:
+        return _pick(AliasTarget(name=name, version=check_version(version)), versions)
+    if (target := aliases.get(name)) is None:
+        return _pick(AliasTarget(name=name), versions)
+    try:
+        return _pick(target, versions)
+    except StoreError as error:
+        raise StoreError("dangling_alias", f"alias '{name}': {error.reason}") from None
+
+
+def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tuple[str, str]:
+    if not (known := versions(target.name)):
+        raise StoreError("unknown_model", f"there is no model or alias named '{target.name}'")
+    if target.version is None:
+        return target.name, known[-1]
+    if target.version not in known:
+        raise StoreError(
+            "unknown_version", f"model '{target.name}' has no version {target.version}"
+        )
+    return target.name, target.version

@@ -1,0 +1,106 @@
+"""Weights as stored: safetensors, half precision where the trainer asked for it, never a pickle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from safetensors import SafetensorError, deserialize
+from safetensors.numpy import save
+
+from app.registry.errors import ArtifactError
+from app.registry.manifest import WEIGHTS, TensorEntry
+
+StorageDtype = Literal["float16", "float32"]
+
+_DTYPES: Final = {
+    "F16": "float16",
+    "F32": "float32",
+    "I32": "int32",
+    "I64": "int64",
+    "BOOL": "bool",
+}
+
+
+def pack(
+    state: Mapping[str, ArrayLike], storage_dtype: StorageDtype
+) -> tuple[bytes, dict[str, TensorEntry]]:
+    """A machine's tensors as a safetensors file, and what the manifest says of them.
+
+    Args:
+        state: numpy arrays or CPU tensors by name. Floating ones become `storage_dtype`, those with
+            at most one axis (biases, which are added unscaled) float32; others stay as they are.
+        storage_dtype: float16 halves the file at a relative error of 2^-11 a weight.
+
+    Raises:
+        ArtifactError: `not_finite`, also where a weight overflows float16 (beyond 65,504);
+            `invalid_tensor` for a dtype that artifacts do not hold.
+    """
+    arrays = {name: _stored(name, value, storage_dtype) for name, value in sorted(state.items())}
+    entries = {
+        name: TensorEntry.model_validate({"dtype": array.dtype.name, "shape": array.shape})
+        for name, array in arrays.items()
+    }
+    return save(arrays), entries
+
+
+def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray[Any]]:
+    """The tensors of a safetensors file, floating ones as float32; writable copies.
+
+    Raises:
+        ArtifactError: `not_safetensors`; `wrong_shape` where names, dtypes or shapes differ from
+            the manifest's; `not_finite`.
+    """
+    try:
+        stored = dict(deserialize(data))  # type: ignore[no-untyped-call]
+    except SafetensorError:
+        raise ArtifactError("not_safetensors", f"{WEIGHTS} is not a safetensors file") from None
+    found = {name: (_DTYPES.get(e["dtype"]), tuple(e["shape"])) for name, e in stored.items()}
+    promised = {name: (entry.dtype, entry.shape) for name, entry in entries.items()}
+    require_equal(found, promised, f"{WEIGHTS} holds", "the manifest says")
+    return {
+        name: _loaded(name, entry["data"], entries[name]) for name, entry in sorted(stored.items())
+    }
+
+
+def require_equal(
+    found: Mapping[str, object], expected: Mapping[str, object], holds: str, says: str
+) -> None:
+    """Compare tensors by name; raise ArtifactError (`wrong_shape`) naming the first difference."""
+    for name in sorted(found.keys() | expected.keys()):
+        if found.get(name) != expected.get(name):
+            raise ArtifactError(
+                "wrong_shape",
+                f"tensor '{name}': {holds} {_words(found, name)}, {says} {_words(expected, name)}",
+            )
+
+
+def _words(tensors: Mapping[str, object], name: str) -> str:
+    return str(tensors[name]) if name in tensors else "none"
+
+
+def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray[Any]:
+    array = np.ascontiguousarray(value).reshape(np.shape(value))  # the former makes () into (1,)
+    if np.issubdtype(array.dtype, np.floating):
+        with np.errstate(over="ignore"):
+            array = array.astype(storage_dtype if array.ndim > 1 else np.float32)
+        _require_finite(name, array, f" in {array.dtype.name}")
+    elif array.dtype.name not in _DTYPES.values():
+        raise ArtifactError("invalid_tensor", f"tensor '{name}' has dtype {array.dtype.name}")
+    return array
+
+
+def _loaded(name: str, data: bytes, entry: TensorEntry) -> NDArray[Any]:
+    array = np.frombuffer(data, dtype=entry.dtype).reshape(entry.shape)
+    if not entry.dtype.startswith("float"):
+        return array.copy()
+    array = array.astype(np.float32)
+    _require_finite(name, array, "")
+    return array
+
+
+def _require_finite(name: str, array: NDArray[Any], where: str) -> None:
+    if not np.isfinite(array).all():
+        raise ArtifactError("not_finite", f"tensor '{name}' holds NaN or infinity{where}")

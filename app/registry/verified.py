@@ -1,0 +1,109 @@
+"""Reading an artifact's directory: every file once, and nothing believed before its checksum.
+
+What is parsed later is the bytes that were hashed here, so a file that is exchanged after the check
+changes nothing. Links are not followed: an artifact lies in its directory or not at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+from app.registry.errors import ArtifactError, cause
+from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
+
+# A vocabulary of 100,000 classes needs about 10 MB.
+_LARGEST_MANIFEST = 32 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class VerifiedFiles:
+    """The contents of an artifact's files, each as its checksum promises.
+
+    Attributes:
+        digest: SHA-256 of the manifest's bytes, hexadecimal; it stands for all files, since the
+            manifest holds their checksums.
+    """
+
+    manifest: Manifest
+    digest: str
+    weights: bytes
+    card: str
+
+
+def read_verified(directory: Path) -> VerifiedFiles:
+    """Read an artifact's files.
+
+    Raises:
+        ArtifactError: a file is missing, unexpected, unreadable, truncated or altered, or the
+            manifest is not one that this release reads.
+    """
+    try:
+        folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise ArtifactError("missing_file", "the artifact's directory does not exist") from None
+    except OSError as error:
+        raise ArtifactError("unreadable", f"the artifact's directory: {cause(error)}") from None
+    try:
+        _require_no_other_file(folder)
+        text = _read(folder, MANIFEST, _LARGEST_MANIFEST)
+        if len(text) > _LARGEST_MANIFEST:
+            raise ArtifactError("invalid_manifest", f"{MANIFEST} is over {_LARGEST_MANIFEST} bytes")
+        manifest = Manifest.from_bytes(text)
+        weights = _read_checked(folder, WEIGHTS, manifest.files[WEIGHTS])
+        card = _read_checked(folder, CARD, manifest.files[CARD])
+    finally:
+        os.close(folder)
+    try:
+        page = card.decode()
+    except UnicodeDecodeError:
+        raise ArtifactError("invalid_manifest", f"{CARD} is not UTF-8") from None
+    return VerifiedFiles(manifest, hashlib.sha256(text).hexdigest(), weights, page)
+
+
+def _require_no_other_file(folder: int) -> None:
+    try:
+        with os.scandir(folder) as entries:
+            extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
+    except OSError as error:
+        raise ArtifactError("unreadable", f"the artifact's directory: {cause(error)}") from None
+    if extra:
+        names = ", ".join(sorted(ascii(name) for name in extra))
+        raise ArtifactError("unexpected_file", f"not part of an artifact: {names}")
+
+
+def _read(folder: int, name: str, limit: int) -> bytes:
+    """The file's bytes; at most limit + 1, where one more than allowed shows that it is too long."""
+    # Without O_NONBLOCK, opening a FIFO put in a file's place would wait for ever.
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(name, flags, dir_fd=folder)
+    except FileNotFoundError:
+        raise ArtifactError("missing_file", f"{name} is missing") from None
+    except OSError as error:
+        raise ArtifactError("unreadable", f"{name}: {cause(error)}") from None
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise ArtifactError("unreadable", f"{name} is not a regular file")
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
+            # The buffer is allocated at once: as large as the file, whatever a manifest claims.
+            return file.read(min(status.st_size, limit) + 1)
+    except OSError as error:
+        raise ArtifactError("unreadable", f"{name}: {cause(error)}") from None
+    finally:
+        os.close(descriptor)
+
+
+def _read_checked(folder: int, name: str, entry: FileEntry) -> bytes:
+    data = _read(folder, name, entry.bytes)
+    if len(data) < entry.bytes:
+        raise ArtifactError("truncated", f"{name} has {len(data)} bytes of {entry.bytes}")
+    if len(data) > entry.bytes:
+        raise ArtifactError("checksum_mismatch", f"{name} has more than its {entry.bytes} bytes")
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise ArtifactError("checksum_mismatch", f"{name} does not match its checksum")
+    return data

@@ -1,0 +1,42 @@
+"""Scenes, canonical relations, vocabularies and geometry; knows nothing of models or services."""
+
+from app.scene.evidence import ClassEvidence, class_evidence, pool_instances
+from app.scene.frames import body_pose, is_optical, is_world_fixed
+from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
+from app.scene.labels import label_key
+from app.scene.observe import observe
+from app.scene.relations import (
+    CANONICAL,
+    OPPOSITES,
+    RELATIONS,
+    canonicalise,
+    contradiction,
+    opposite,
+)
+from app.scene.scene import Scene, SceneObject
+from app.scene.vocabulary import ObjectClass, Vocabulary
+
+__all__ = [
+    "CANONICAL",
+    "OPPOSITES",
+    "RELATIONS",
+    "ClassEvidence",
+    "ObjectClass",
+    "PoseRelations",
+    "Scene",
+    "SceneObject",
+    "Viewpoint",
+    "Vocabulary",
+    "body_pose",
+    "canonicalise",
+    "class_evidence",
+    "contradiction",
+    "derive_relations",
+    "is_optical",
+    "is_world_fixed",
+    "label_key",
+    "observe",
+    "opposite",
+    "pool_instances",
+    "to_viewer_frame",
+]

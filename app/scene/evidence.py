@@ -1,0 +1,120 @@
+"""What a scene tells a model of classes.
+
+Models speak of classes, scenes of instances: r[a, x, y] says that *some* instance of class x stands
+in relation a to some instance of class y. A pair of instances nobody listed never makes it false.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.scene.relations import CANONICAL
+from app.scene.scene import Scene
+
+A = len(CANONICAL)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClassEvidence:
+    """The n distinct classes of a scene and what is known of their relations.
+
+    Attributes:
+        classes: (n,) int64, ascending, distinct.
+        counts: (n,) int64, instances of each class.
+        confidence: (n,) float64 in (0, 1], probability that at least one instance is there.
+        holds: (A, n, n) bool, observed on. ``holds[a, x, y]``: classes[x] stands so to classes[y].
+        observed: (A, n, n) bool, observed on or off; ``holds`` implies ``observed``.
+        room_type: index of the room type, or None.
+    """
+
+    classes: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+    holds: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
+    room_type: int | None
+
+
+def pool_instances(
+    classes: NDArray[np.int64],
+    confidence: NDArray[np.float64],
+    holds: NDArray[np.bool_],
+    observed: NDArray[np.bool_],
+    room_type: int | None = None,
+) -> ClassEvidence:
+    """OR over instances.
+
+    A class-level relation is on if it holds for one pair of instances; it is observed off if it
+    was observed for at least one pair and holds for none; otherwise it is unobserved. A class with
+    a single instance has no pair with itself: its (x, x) relations stay unobserved.
+
+    Args:
+        classes: (N,) class of each instance.
+        confidence: (N,) probability that the instance is there. Instances are taken as independent
+            detections: a class is there with probability 1 - prod(1 - confidence).
+        holds: (A, N, N) relations that hold between instances.
+        observed: (A, N, N) relations of instances that were observed, on or off.
+        room_type: passed through.
+
+    Raises:
+        ValueError: shapes that do not fit each other.
+    """
+    size = len(classes)
+    for name, array in (("holds", holds), ("observed", observed)):
+        if array.shape != (A, size, size):
+            raise ValueError(f"{name} has shape {array.shape}, must be {(A, size, size)}")
+    if confidence.shape != (size,):
+        raise ValueError(f"confidence has shape {confidence.shape}, must be {(size,)}")
+    if size == 0:
+        nothing = np.zeros((A, 0, 0), dtype=np.bool_)
+        empty = np.zeros(0, dtype=np.int64)
+        return ClassEvidence(empty, empty, np.zeros(0), nothing, nothing, room_type)
+    order = np.argsort(classes, kind="stable")
+    unique, starts, counts = np.unique(classes[order], return_index=True, return_counts=True)
+    off_diagonal = ~np.eye(size, dtype=np.bool_)
+    on = _pool(holds & off_diagonal, order, starts)
+    seen = _pool((holds | observed) & off_diagonal, order, starts)
+    absent = np.multiply.reduceat(1.0 - confidence[order], starts)
+    return ClassEvidence(
+        classes=unique.astype(np.int64),
+        counts=counts.astype(np.int64),
+        confidence=1.0 - absent,
+        holds=on,
+        observed=seen,
+        room_type=room_type,
+    )
+
+
+def _pool(
+    pairs: NDArray[np.bool_], order: NDArray[np.int64], starts: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """(A, N, N) over instances to (A, n, n) over runs of equal class."""
+    rows = np.logical_or.reduceat(pairs[:, order], starts, axis=1)
+    return np.logical_or.reduceat(rows[:, :, order], starts, axis=2)
+
+
+def class_evidence(scene: Scene) -> ClassEvidence:
+    """The evidence a scene gives; instances outside the vocabulary are left out.
+
+    Relations derived from poses (``scene.poses``) are on or off for neighbours and unobserved
+    beyond. Relations that were given are on; all others are unobserved, or off where the scene says
+    that its relations are complete.
+    """
+    kept = [i for i, thing in enumerate(scene.objects) if thing.class_index is not None]
+    size = len(kept)
+    classes = np.array([scene.objects[i].class_index for i in kept], dtype=np.int64)
+    confidence = np.array([scene.objects[i].confidence for i in kept], dtype=np.float64)
+    if scene.poses is not None:
+        holds = scene.poses.holds[:, kept][:, :, kept]
+        observed = scene.poses.observed[:, kept][:, :, kept]
+    else:
+        place = {i: position for position, i in enumerate(kept)}
+        holds = np.zeros((A, size, size), dtype=np.bool_)
+        for relation, subject, anchor in scene.relations or ():
+            if subject in place and anchor in place:
+                holds[relation, place[subject], place[anchor]] = True
+        observed = np.full((A, size, size), scene.relations_complete)
+    return pool_instances(classes, confidence, holds, observed, scene.room_type)

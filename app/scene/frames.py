@@ -1,0 +1,74 @@
+"""Coordinate frames of robots (ROS REP 103 and REP 105) to body axes: x forward, y left, z up."""
+
+from __future__ import annotations
+
+import math
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+# Frames that are fixed to the world: where the viewer stands in them must be said.
+WORLD_FRAMES = frozenset({"map", "odom", "world"})
+
+# Farther than this from length 1 a quaternion is a mistake, not rounding.
+_NORM_TOLERANCE = 0.01
+
+
+def is_optical(frame_id: str) -> bool:
+    """Whether a frame has optical axes: z forward, x right, y down."""
+    return frame_id.endswith(("_optical", "_optical_frame"))
+
+
+def is_world_fixed(frame_id: str) -> bool:
+    """Whether a frame is fixed to the world ("map", "robot_1/odom"): its origin is no viewer."""
+    return frame_id.rpartition("/")[2] in WORLD_FRAMES
+
+
+def body_pose(
+    position: Vector,
+    size: Vector | None = None,
+    orientation: Quaternion | None = None,
+    *,
+    optical: bool = False,
+) -> tuple[Vector, Vector | None, float]:
+    """A box of a frame as an upright box in body axes: position, size and yaw.
+
+    A box may be given lying on its side, and in an optical frame an unturned box has its y axis
+    vertical: whichever of its axes is nearest to the vertical becomes z, the extents are reordered
+    to match, and what remains of a tilt is dropped. The optical axis is taken to be level.
+
+    Args:
+        position: centre in the frame.
+        size: extents along the box's own axes, or None.
+        orientation: quaternion (x, y, z, w) from the box's axes to the frame; None = unturned.
+        optical: the frame has optical axes.
+
+    Raises:
+        ValueError: the quaternion is not of length 1.
+    """
+    x, y, z = position
+    columns = _rotation(orientation) if orientation is not None else _IDENTITY
+    if optical:
+        position = (z, -x, -y)
+        columns = tuple((c[2], -c[0], -c[1]) for c in columns)
+    up = max(range(3), key=lambda k: (abs(columns[k][2]), k))
+    ahead, aside = (up + 1) % 3, (up + 2) % 3
+    yaw = math.atan2(columns[ahead][1], columns[ahead][0])
+    upright = None if size is None else (size[ahead], size[aside], size[up])
+    return position, upright, yaw
+
+
+_IDENTITY: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def _rotation(quaternion: Quaternion) -> tuple[Vector, ...]:
+    """The box's axes as vectors of the frame."""
+    norm = math.sqrt(sum(part * part for part in quaternion))
+    if not abs(norm - 1.0) <= _NORM_TOLERANCE:
+        raise ValueError(f"orientation must be a quaternion of length 1, not of length {norm:g}")
+    x, y, z, w = (part / norm for part in quaternion)
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
+        (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
+        (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
+    )

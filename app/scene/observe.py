@@ -1,0 +1,73 @@
+"""A scene with poses to the same scene with the relations one can see in them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.scene.frames import is_world_fixed
+from app.scene.geometry import Viewpoint, derive_relations, to_viewer_frame
+from app.scene.scene import Scene, SceneObject
+
+_UNKNOWN = (math.nan, math.nan, math.nan)
+
+
+def observe(
+    scene: Scene,
+    *,
+    frame_id: str | None = None,
+    viewpoint: Viewpoint | None = None,
+    typical_sizes: NDArray[np.float64] | None = None,
+) -> Scene:
+    """Derive the relations of a scene from the poses of its objects.
+
+    Positions and yaws are those of body axes (`app.scene.frames.body_pose`); the returned scene has
+    them in viewer axes where a viewpoint was given, its ``relations`` list what holds and its
+    ``poses`` also say what does not. A scene that states relations, or has no positions, is
+    returned as it is. In a frame fixed to the world (map, odom, world) left and front mean nothing
+    without a viewpoint: only vertical relations are derived.
+
+    Args:
+        scene: the scene.
+        frame_id: the frame of the positions.
+        viewpoint: where the viewer stands in that frame; by default at its origin, looking along x.
+        typical_sizes: (V, 3) extents in metres for objects without a size, by class; NaN rows where
+            unknown (`Vocabulary.sizes`).
+    """
+    if scene.relations is not None or all(thing.position is None for thing in scene.objects):
+        return scene
+    if viewpoint is not None:
+        scene = replace(scene, objects=_seen_from(scene.objects, viewpoint))
+    positions = np.array([thing.position or _UNKNOWN for thing in scene.objects])
+    sizes = np.array([_extent(thing, typical_sizes) for thing in scene.objects])
+    yaws = np.array([thing.yaw for thing in scene.objects])
+    nobody_looks = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
+    poses = derive_relations(positions, sizes, yaws, horizontal=not nobody_looks)
+    triples = tuple((int(a), int(i), int(j)) for a, i, j in np.argwhere(poses.holds))
+    return replace(scene, relations=triples, poses=poses)
+
+
+def _seen_from(objects: tuple[SceneObject, ...], viewpoint: Viewpoint) -> tuple[SceneObject, ...]:
+    positions, yaws = to_viewer_frame(
+        [thing.position or _UNKNOWN for thing in objects],
+        viewpoint,
+        [thing.yaw for thing in objects],
+    )
+    turned = [
+        thing if thing.position is None else replace(thing, position=(x, y, z), yaw=yaw)
+        for thing, (x, y, z), yaw in zip(objects, positions.tolist(), yaws.tolist(), strict=True)
+    ]
+    return tuple(turned)
+
+
+def _extent(
+    thing: SceneObject, typical_sizes: NDArray[np.float64] | None
+) -> tuple[float, ...] | NDArray[np.float64]:
+    if thing.size is not None:
+        return thing.size
+    if typical_sizes is not None and thing.class_index is not None:
+        return np.asarray(typical_sizes[thing.class_index])
+    return _UNKNOWN

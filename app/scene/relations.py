@@ -1,0 +1,78 @@
+"""The eight spatial relations and their four canonical forms.
+
+A relation and its opposite are one statement read from either end, so only four are stored:
+``right(i, j)`` is ``left(j, i)``. Relation indices throughout the product point into `CANONICAL`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final, TypeVar
+
+CANONICAL: Final[tuple[str, ...]] = ("left", "front", "on-top", "above")
+OPPOSITES: Final[dict[str, str]] = {
+    "left": "right",
+    "front": "behind",
+    "on-top": "under",
+    "above": "below",
+}
+RELATIONS: Final[tuple[str, ...]] = CANONICAL + tuple(OPPOSITES[name] for name in CANONICAL)
+
+LEFT: Final = 0
+FRONT: Final = 1
+ON_TOP: Final = 2
+ABOVE: Final = 3
+
+_INDEX: Final = {name: index for index, name in enumerate(CANONICAL)}
+_FLIPPED: Final = {OPPOSITES[name]: index for index, name in enumerate(CANONICAL)}
+_OPPOSITE: Final = OPPOSITES | {opposite: name for name, opposite in OPPOSITES.items()}
+
+End = TypeVar("End")
+
+
+def _unknown(relation: str) -> ValueError:
+    return ValueError(f"unknown relation {relation!r}: must be one of {', '.join(RELATIONS)}")
+
+
+def opposite(relation: str) -> str:
+    """The relation read from the other end: ``opposite("left") == "right"``.
+
+    Raises:
+        ValueError: the relation is none of `RELATIONS`.
+    """
+    try:
+        return _OPPOSITE[relation]
+    except KeyError:
+        raise _unknown(relation) from None
+
+
+def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, End]:
+    """The same statement in canonical form: (relation index, subject, anchor).
+
+    ``right``, ``behind``, ``under`` and ``below`` exchange their ends; the ends may be of any type.
+
+    Raises:
+        ValueError: the relation is none of `RELATIONS`.
+    """
+    if (index := _INDEX.get(relation)) is not None:
+        return index, subject, anchor
+    if (index := _FLIPPED.get(relation)) is not None:
+        return index, anchor, subject
+    raise _unknown(relation)
+
+
+def contradiction(
+    triples: Iterable[tuple[int, End, End]],
+) -> tuple[tuple[int, End, End], tuple[int, End, End]] | None:
+    """Two canonical triples that say the opposite of each other, or None.
+
+    ``left(i, j)`` and ``left(j, i)`` contradict each other between *things*; between classes with
+    several instances they do not.
+    """
+    seen: set[tuple[int, End, End]] = set()
+    for relation, subject, anchor in triples:
+        flipped = (relation, anchor, subject)
+        if flipped in seen:
+            return flipped, (relation, subject, anchor)
+        seen.add((relation, subject, anchor))
+    return None

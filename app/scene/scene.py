@@ -1,0 +1,110 @@
+"""A scene as one observer knows it: things, and how they stand to each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from app.scene.geometry import PoseRelations
+from app.scene.relations import CANONICAL, contradiction
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SceneObject:
+    """One thing in a scene.
+
+    Attributes:
+        id: its name in this scene.
+        label: its label as it was given.
+        class_index: its class in the model's vocabulary; None where the vocabulary has none.
+        confidence: probability in (0, 1] that the thing is there.
+        position: centre (x, y, z) in metres, viewer axes (x away, y left, z up); None if unknown.
+        size: extents (x, y, z) in metres before the yaw; None if unknown.
+        yaw: turn of the box about z in radians.
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    id: str
+    label: str
+    class_index: int | None
+    confidence: float = 1.0
+    position: Point | None = None
+    size: Point | None = None
+    yaw: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.class_index is not None and self.class_index < 0:
+            raise ValueError(f"class_index of {self.id!r} is negative: {self.class_index}")
+        if not 0.0 < self.confidence <= 1.0:
+            raise ValueError(f"confidence of {self.id!r} must be in (0, 1], not {self.confidence}")
+        if self.position is not None and not _are_finite(self.position):
+            raise ValueError(f"position of {self.id!r} must be three finite metres")
+        if self.size is not None and not (_are_finite(self.size) and min(self.size) > 0):
+            raise ValueError(f"size of {self.id!r} must be three positive metres")
+        if not math.isfinite(self.yaw):
+            raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Things and their relations.
+
+    Attributes:
+        objects: the things; their positions in this tuple name them in ``relations``.
+        relations: canonical triples (relation, subject, object) that hold; None = nobody gave any.
+        relations_complete: whatever is not listed in ``relations`` does not hold.
+        room_type: index of the room type in the model's vocabulary; None if unknown.
+        poses: relations derived from poses (see `app.scene.observe`), which also say what was seen
+            *not* to hold. They take the place of ``relations`` as evidence.
+
+    Raises:
+        ValueError: two things with one id, a triple that points nowhere, joins a thing to itself or
+            contradicts another one, or complete relations where there are none.
+    """
+
+    objects: tuple[SceneObject, ...]
+    relations: tuple[tuple[int, int, int], ...] | None = None
+    relations_complete: bool = False
+    room_type: int | None = None
+    poses: PoseRelations | None = field(default=None, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.objects)
+        if len({thing.id for thing in self.objects}) < n:
+            raise ValueError("two objects of a scene share one id")
+        if self.relations is None:
+            if self.relations_complete:
+                raise ValueError("relations_complete needs relations")
+        else:
+            for triple in self.relations:
+                self._check(triple, n)
+            if clash := contradiction(self.relations):
+                (relation, i, j), _ = clash
+                first, second = self.objects[i].id, self.objects[j].id
+                raise ValueError(
+                    f"{CANONICAL[relation]!r} is claimed both of {first!r} to {second!r} and of "
+                    f"{second!r} to {first!r}"
+                )
+        if self.poses is not None and self.poses.holds.shape != (len(CANONICAL), n, n):
+            raise ValueError(
+                f"poses have shape {self.poses.holds.shape}, must be {(len(CANONICAL), n, n)}"
+            )
+
+    def _check(self, triple: tuple[int, int, int], n: int) -> None:
+        relation, subject, anchor = triple
+        if not 0 <= relation < len(CANONICAL):
+            raise ValueError(f"relation index {relation} is not in 0..{len(CANONICAL) - 1}")
+        for end in (subject, anchor):
+            if not 0 <= end < n:
+                raise ValueError(f"object {end} of a relation is not in 0..{n - 1}")
+        if subject == anchor:
+            raise ValueError(f"{self.objects[subject].id!r} cannot be {CANONICAL[relation]} itself")
+
+
+def _are_finite(point: Sequence[float]) -> bool:
+    return len(point) == 3 and all(map(math.isfinite, point))

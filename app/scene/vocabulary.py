@@ -1,0 +1,217 @@
+"""The object classes and room types a model knows, and the spellings it accepts for them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from rapidfuzz import fuzz, process
+
+from app.scene.labels import label_key
+
+Extents = tuple[float, float, float]
+
+# Below this similarity (0-100) a suggestion is noise: "asdf" is not a misspelt "scarf".
+_SUGGESTION_CUTOFF = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectClass:
+    """A kind of thing.
+
+    Attributes:
+        label: its canonical name.
+        aliases: other names of the same thing; spellings and plurals need no alias.
+        structure: building structure and vague names (floor, wall, object): accepted in scenes,
+            never proposed by a model.
+        size: typical extents (x, y, z) in metres, z vertical; None where unknown.
+
+    Raises:
+        ValueError: an empty name, or a size that is not three positive finite numbers.
+    """
+
+    label: str
+    aliases: tuple[str, ...] = ()
+    structure: bool = False
+    size: Extents | None = None
+
+    def __post_init__(self) -> None:
+        for name in (self.label, *self.aliases):
+            if not label_key(name):
+                raise ValueError(f"object class {self.label!r} has an empty name: {name!r}")
+        if self.size is not None and not _are_extents(self.size):
+            raise ValueError(
+                f"size of {self.label!r} must be three positive metres, not {self.size!r}"
+            )
+
+
+class Vocabulary:
+    """An immutable, ordered set of object classes (V of them) and room types (C of them).
+
+    Args:
+        objects: the classes; their order gives the class indices.
+        room_types: canonical room types; their order gives the room indices.
+
+    Raises:
+        ValueError: no object class, or two classes (or room types) claim one name after
+            normalisation.
+    """
+
+    __slots__ = ("__dict__", "_by_key", "_by_spelling", "_objects", "_room_by_key", "_room_types")
+
+    def __init__(self, objects: Sequence[ObjectClass], room_types: Sequence[str] = ()) -> None:
+        if not objects:
+            raise ValueError("a vocabulary needs at least one object class")
+        self._objects = tuple(objects)
+        self._room_types = tuple(room_types)
+        self._by_key: dict[str, int] = {}
+        self._by_spelling: dict[str, int] = {}
+        for index, entry in enumerate(self._objects):
+            for name in (entry.label, *entry.aliases):
+                claimed = self._by_key.setdefault(label_key(name), index)
+                if claimed != index:
+                    raise ValueError(
+                        f"{name!r} names two object classes: {self._objects[claimed].label!r} "
+                        f"and {entry.label!r}"
+                    )
+                self._by_spelling[name] = index
+        self._room_by_key: dict[str, int] = {}
+        for index, room in enumerate(self._room_types):
+            if not label_key(room):
+                raise ValueError(f"empty room type {room!r}")
+            claimed = self._room_by_key.setdefault(label_key(room), index)
+            if claimed != index:
+                raise ValueError(f"room types {self._room_types[claimed]!r} and {room!r} are one")
+
+    def __len__(self) -> int:
+        return len(self._objects)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Vocabulary):
+            return NotImplemented
+        return self._objects == other._objects and self._room_types == other._room_types
+
+    def __hash__(self) -> int:
+        return hash((self._objects, self._room_types))
+
+    def __repr__(self) -> str:
+        return f"Vocabulary({len(self)} object classes, {len(self._room_types)} room types)"
+
+    @property
+    def objects(self) -> tuple[ObjectClass, ...]:
+        """The object classes, by index."""
+        return self._objects
+
+    @property
+    def room_types(self) -> tuple[str, ...]:
+        """The room types, by index."""
+        return self._room_types
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """The canonical labels, by class index."""
+        return tuple(entry.label for entry in self._objects)
+
+    @cached_property
+    def structure(self) -> NDArray[np.bool_]:
+        """(V,) True for structure and vague classes, which are never proposed. Read-only."""
+        mask = np.array([entry.structure for entry in self._objects], dtype=np.bool_)
+        mask.flags.writeable = False
+        return mask
+
+    @cached_property
+    def sizes(self) -> NDArray[np.float64]:
+        """(V, 3) typical sizes in metres, NaN where unknown. Read-only."""
+        sizes = np.array([entry.size or (math.nan,) * 3 for entry in self._objects])
+        sizes.flags.writeable = False
+        return sizes
+
+    def index(self, label: str) -> int | None:
+        """The class a label names under any accepted spelling; None if there is none."""
+        found = self._by_spelling.get(label)
+        return found if found is not None else self._by_key.get(label_key(label))
+
+    def room_index(self, room: str) -> int | None:
+        """The room type under any spelling ("bed_room" is "bedroom"); None if there is none."""
+        return self._room_by_key.get(label_key(room))
+
+    @cached_property
+    def _names(self) -> dict[str, int]:
+        return {name.casefold().replace("_", " "): i for name, i in self._by_spelling.items()}
+
+    def suggest(self, label: str, limit: int = 3) -> tuple[str, ...]:
+        """At most ``limit`` canonical labels whose names or aliases look most like ``label``.
+
+        Meant for error messages: it compares with every name, so it costs far more than `index`.
+        """
+        matches = process.extract(
+            label.casefold().replace("_", " "),
+            list(self._names),
+            scorer=fuzz.WRatio,
+            limit=4 * limit,
+            score_cutoff=_SUGGESTION_CUTOFF,
+        )
+        # Several aliases of one class may match; dict.fromkeys keeps the best place of each.
+        found = dict.fromkeys(self._objects[self._names[name]].label for name, _, _ in matches)
+        return tuple(found)[:limit]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able values; `from_dict` reads them back."""
+        return {
+            "objects": [
+                {
+                    "label": entry.label,
+                    "aliases": list(entry.aliases),
+                    "structure": entry.structure,
+                    "size": None if entry.size is None else list(entry.size),
+                }
+                for entry in self._objects
+            ],
+            "room_types": list(self._room_types),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Read what `to_dict` wrote; ``aliases``, ``structure`` and ``size`` may be left out.
+
+        Raises:
+            ValueError: a field is missing, unknown or of the wrong type, or see `Vocabulary`.
+        """
+        if not isinstance(values.get("objects"), list):
+            raise ValueError("a vocabulary is a mapping with a list 'objects'")
+        rooms = values.get("room_types", [])
+        if not isinstance(rooms, list):
+            raise ValueError(f"'room_types' must be a list, not {rooms!r}")
+        if not all(isinstance(room, str) for room in rooms):
+            raise ValueError("'room_types' must be a list of strings")
+        return cls([_object_class(entry) for entry in values["objects"]], rooms)
+
+
+def _are_extents(size: Sequence[float]) -> bool:
+    return len(size) == 3 and all(math.isfinite(side) and side > 0 for side in size)
+
+
+def _object_class(entry: Any) -> ObjectClass:
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("label"), str):
+        raise ValueError(f"an object class is a mapping with a 'label', not {entry!r}")
+    if unknown := sorted(set(entry) - {"label", "aliases", "structure", "size"}):
+        raise ValueError(f"unknown fields in object class {entry['label']!r}: {unknown}")
+    aliases, structure = entry.get("aliases", []), entry.get("structure", False)
+    if not isinstance(aliases, list) or not all(isinstance(name, str) for name in aliases):
+        raise ValueError(f"aliases of {entry['label']!r} must be strings, not {aliases!r}")
+    if not isinstance(structure, bool):
+        raise ValueError(f"structure of {entry['label']!r} must be a boolean, not {structure!r}")
+    size = entry.get("size")
+    if size is not None:
+        try:
+            size = tuple(float(side) for side in size)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"size of {entry['label']!r} must be three numbers, not {size!r}"
+            ) from None
+    return ObjectClass(entry["label"], tuple(aliases), structure, size)

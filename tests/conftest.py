@@ -1,0 +1,62 @@
+"""Fixtures and settings that every test shares."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+# Before torch or numpy is imported: one thread, as a serving worker runs, so that tests neither
+# fight over cores nor depend on how a reduction was split.
+for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+# `ci`, the default, draws the same examples on every run. HYPOTHESIS_PROFILE=explore looks further.
+settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True)
+settings.register_profile(
+    "explore",
+    deadline=None,
+    max_examples=2_000,
+    print_blob=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root of the checkout."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def anyio_backend() -> str:
+    """Coroutine tests (`@pytest.mark.anyio`) run on the loop that uvicorn serves with."""
+    return "asyncio"
+
+
+@pytest.fixture(scope="session")
+def require_system_tool() -> Callable[[str], Path]:
+    """Return a function that finds a program, or skips the test where the machine lacks it.
+
+    Under REQUIRE_SYSTEM=1, as in continuous integration, a missing program fails the test: there,
+    a skip would hide that nothing was checked.
+    """
+
+    def find(name: str) -> Path:
+        # Programs from wheels lie beside the interpreter, which need not be on PATH.
+        search = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+        if program := shutil.which(name, path=search):
+            return Path(program)
+        if os.environ.get("REQUIRE_SYSTEM") == "1":
+            pytest.fail(f"{name} is not installed, and REQUIRE_SYSTEM=1 asks for it", pytrace=False)
+        pytest.skip(f"{name} is not installed")
+
+    return find

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.scene.frames import body_pose, is_optical, is_world_fixed
+
+
+def about(axis: tuple[float, float, float], angle: float) -> tuple[float, float, float, float]:
+    sin = math.sin(angle / 2)
+    return (axis[0] * sin, axis[1] * sin, axis[2] * sin, math.cos(angle / 2))
+
+
+def same_turn(a: float, b: float, period: float = 2 * math.pi) -> bool:
+    return abs(math.remainder(a - b, period)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("frame", "optical", "fixed"),
+    [
+        ("base_link", False, False),
+        ("camera_optical", True, False),
+        ("robot/camera_color_optical_frame", True, False),
+        ("optical_table", False, False),
+        ("map", False, True),
+        ("robot_1/odom", False, True),
+        ("/world", False, True),
+        ("map_server", False, False),
+        ("", False, False),
+    ],
+)
+def test_frames_by_name(frame: str, optical: bool, fixed: bool) -> None:
+    assert is_optical(frame) is optical
+    assert is_world_fixed(frame) is fixed
+
+
+def test_optical_axes() -> None:
+    # 3 m ahead, 1 m to the right, 2 m below the camera.
+    position, size, yaw = body_pose((1.0, 2.0, 3.0), (0.1, 0.2, 0.3), optical=True)
+    assert position == (3.0, -1.0, -2.0)
+    # Unturned in optical axes: x is its width, y its height, z its depth.
+    assert size == (0.3, 0.1, 0.2)
+    assert same_turn(yaw, 0.0)
+
+
+@given(st.floats(-3, 3))
+def test_yaw_of_an_upright_box(angle: float) -> None:
+    _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), about((0, 0, 1), angle))
+    assert size == (1.0, 2.0, 3.0)
+    assert same_turn(yaw, angle)
+
+
+@given(st.floats(-3, 3))
+def test_yaw_in_an_optical_frame(angle: float) -> None:
+    # y points down: a turn about it is a turn the other way about the vertical.
+    _, size, yaw = body_pose(
+        (0.0, 0.0, 1.0), (1.0, 2.0, 3.0), about((0, 1, 0), angle), optical=True
+    )
+    assert size == (3.0, 1.0, 2.0)
+    assert same_turn(yaw, -angle)
+
+
+@given(st.sampled_from([math.pi / 2, -math.pi / 2]))
+def test_a_box_on_its_side_stands_on_its_side(angle: float) -> None:
+    _, size, _ = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), about((1, 0, 0), angle))
+    assert size is not None
+    assert size[2] == 2.0
+    assert sorted(size[:2]) == [1.0, 3.0]
+
+
+@given(st.floats(-0.6, 0.6), st.floats(-3, 3))
+def test_a_tilt_is_dropped(tilt: float, angle: float) -> None:
+    # Yaw after a tilt about the box's own x axis leaves that axis horizontal.
+    x, y, z, w = about((0, 0, 1), angle)
+    tx, _, _, tw = about((1, 0, 0), tilt)
+    turned = (w * tx + x * tw, y * tw + z * tx, z * tw - y * tx, w * tw - x * tx)
+    _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), turned)
+    assert size == (1.0, 2.0, 3.0)
+    assert same_turn(yaw, angle)
+
+
+@pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 2), (0, 0, 0, math.nan)])
+def test_quaternions_must_have_length_one(quaternion: tuple[float, float, float, float]) -> None:
+    with pytest.raises(ValueError, match="quaternion of length 1"):
+        body_pose((0.0, 0.0, 0.0), None, quaternion)

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.scene.labels import label_key, singular
+
+WORDS = st.text(alphabet="abcehimnosvxyz", min_size=0, max_size=12)
+
+
+@pytest.mark.parametrize(
+    ("plural", "single"),
+    [
+        ("chairs", "chair"),
+        ("curtains", "curtain"),
+        ("boxes", "box"),
+        ("dishes", "dish"),
+        ("benches", "bench"),
+        ("dresses", "dress"),
+        ("batteries", "battery"),
+        ("shelves", "shelf"),
+        ("bookshelves", "bookshelf"),
+        ("knives", "knife"),
+        ("gloves", "glove"),
+        ("vases", "vase"),
+        ("cases", "case"),
+        ("sofas", "sofa"),
+        ("photos", "photo"),
+        ("potatoes", "potato"),
+        ("shoes", "shoe"),
+        ("ties", "tie"),
+        ("wineglasses", "wineglass"),
+        ("people", "person"),
+        ("women", "woman"),
+        ("mice", "mouse"),
+        ("buses", "bus"),
+        ("tvs", "tv"),
+        ("stairs", "stair"),
+    ],
+)
+def test_plurals(plural: str, single: str) -> None:
+    assert singular(plural) == single
+    assert singular(single) == single
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("glass", "glasses", "sunglasses", "clothes", "scissors", "pants", "jeans", "shorts"),
+        *("bus", "mattress", "grass", "dress", "cactus", "tennis", "gas", "canvas", "lens"),
+        *("thermos", "chess", "as", "s", ""),
+    ],
+)
+def test_what_is_no_plural_stays(word: str) -> None:
+    assert singular(word) == word
+
+
+def test_worn_glasses_and_drinking_glasses_stay_apart() -> None:
+    assert label_key("glasses") != label_key("glass")
+    assert label_key("wine glasses") == label_key("wine glass")
+    assert label_key("clothes") != label_key("cloth")
+
+
+@pytest.mark.parametrize(
+    "spelling",
+    ["garbage bin", "Garbage Bins", "garbage_bin", "GARBAGE-BIN", " garbage\tbin ", "garbage.bins"],
+)
+def test_spellings_share_a_key(spelling: str) -> None:
+    assert label_key(spelling) == "garbagebin"
+
+
+def test_compatibility_characters_fold() -> None:
+    assert label_key("TV") == label_key("ＴＶ") == "tv"
+    assert label_key("Straße") == label_key("STRASSE")
+
+
+@given(WORDS)
+def test_singular_is_idempotent(word: str) -> None:
+    assert singular(singular(word)) == singular(word)
+
+
+@given(st.text(max_size=30))
+def test_keys_are_idempotent(label: str) -> None:
+    assert label_key(label_key(label)) == label_key(label)
+
+
+@given(st.text(max_size=30), st.sampled_from(["_", " ", "-", ".", "  "]))
+def test_keys_ignore_case_and_separators(label: str, separator: str) -> None:
+    assert label_key(separator + label + separator) == label_key(label)
+    assert label_key(label.casefold()) == label_key(label)

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.scene.relations import (
+    CANONICAL,
+    OPPOSITES,
+    RELATIONS,
+    canonicalise,
+    contradiction,
+    opposite,
+)
+
+relations = st.sampled_from(RELATIONS)
+
+
+def test_the_eight_relations() -> None:
+    assert CANONICAL == ("left", "front", "on-top", "above")
+    assert (*CANONICAL, "right", "behind", "under", "below") == RELATIONS
+    assert {name: opposite(name) for name in CANONICAL} == OPPOSITES
+
+
+@given(relations)
+def test_the_opposite_of_the_opposite_is_the_relation(relation: str) -> None:
+    assert opposite(opposite(relation)) == relation
+    assert opposite(relation) != relation
+
+
+@given(relations, st.integers(0, 9), st.integers(0, 9))
+def test_a_relation_and_its_opposite_are_one_statement(relation: str, i: int, j: int) -> None:
+    assert canonicalise(i, relation, j) == canonicalise(j, opposite(relation), i)
+    index, subject, anchor = canonicalise(i, relation, j)
+    assert {subject, anchor} == {i, j}
+    assert CANONICAL[index] in (relation, opposite(relation))
+
+
+@given(st.sampled_from(CANONICAL))
+def test_canonical_relations_keep_their_ends(relation: str) -> None:
+    assert canonicalise("a", relation, "b") == (CANONICAL.index(relation), "a", "b")
+
+
+@pytest.mark.parametrize("name", ["", "Left", "on top", "near", "on_top"])
+def test_other_names_are_refused_by_name(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"unknown relation '{name}'.*on-top"):
+        canonicalise(0, name, 1)
+    with pytest.raises(ValueError, match=rf"unknown relation '{name}'"):
+        opposite(name)
+
+
+def test_contradictions() -> None:
+    assert contradiction([(0, 1, 2), (1, 2, 1), (0, 1, 2)]) is None
+    assert contradiction([(0, 1, 2), (3, 0, 1), (0, 2, 1)]) == ((0, 1, 2), (0, 2, 1))

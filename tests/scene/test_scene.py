@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.scene import PoseRelations, Scene, SceneObject, Viewpoint, observe
+from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+
+DESK = SceneObject("desk", "desk", 0, position=(2.0, 0.0, 0.4), size=(0.8, 1.6, 0.8))
+MONITOR = SceneObject("monitor", "monitor", 1, position=(2.0, 0.2, 1.0), size=(0.1, 0.5, 0.4))
+CHAIR = SceneObject("chair", "chair", 2, position=(1.2, 0.0, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"class_index": -1}, "class_index of 'a'"),
+        ({"confidence": 0.0}, "confidence of 'a'"),
+        ({"confidence": 1.5}, "confidence of 'a'"),
+        ({"confidence": math.nan}, "confidence of 'a'"),
+        ({"position": (0.0, math.nan, 0.0)}, "position of 'a'"),
+        ({"position": (0.0, 0.0)}, "position of 'a'"),
+        ({"size": (1.0, 0.0, 1.0)}, "size of 'a'"),
+        ({"size": (1.0, math.inf, 1.0)}, "size of 'a'"),
+        ({"yaw": math.inf}, "yaw of 'a'"),
+    ],
+)
+def test_bad_objects_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SceneObject(**{"id": "a", "label": "a", "class_index": 0} | change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"objects": (DESK, DESK)}, "share one id"),
+        ({"relations": ((4, 0, 1),)}, "relation index 4"),
+        ({"relations": ((0, 0, 2),)}, "object 2"),
+        ({"relations": ((0, -1, 1),)}, "object -1"),
+        ({"relations": ((0, 1, 1),)}, "'monitor' cannot be left itself"),
+        ({"relations": ((0, 0, 1), (0, 1, 0))}, "'left' is claimed both of 'desk' to 'monitor'"),
+        ({"relations_complete": True}, "relations_complete needs relations"),
+        (
+            {"poses": PoseRelations(np.zeros((4, 1, 1), bool), np.zeros((4, 1, 1), bool))},
+            "poses have shape",
+        ),
+    ],
+)
+def test_bad_scenes_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Scene(**{"objects": (DESK, MONITOR)} | change)
+
+
+def test_an_empty_scene_is_a_scene() -> None:
+    assert Scene(()).relations is None
+
+
+def test_poses_become_relations() -> None:
+    seen = observe(Scene((DESK, MONITOR, CHAIR)))
+    assert set(seen.relations or ()) == {(ON_TOP, 1, 0), (FRONT, 2, 0), (FRONT, 2, 1)}
+    assert seen.poses is not None
+    assert seen.poses.observed[LEFT, 0, 2]
+    assert not seen.poses.observed[ABOVE, 0, 2]  # the chair has no size
+
+
+def test_typical_sizes_take_the_place_of_unknown_ones() -> None:
+    cup = SceneObject("cup", "cup", 2, position=(2.0, -0.5, 0.85))
+    sizes = np.array([[math.nan] * 3, [math.nan] * 3, [0.1, 0.1, 0.1]])
+    without = observe(Scene((DESK, cup)))
+    assert (ON_TOP, 1, 0) not in (without.relations or ())
+    assert observe(Scene((DESK, cup)), typical_sizes=sizes).relations == ((ON_TOP, 1, 0),)
+    # A label outside the vocabulary has no typical size.
+    stranger = SceneObject("cup", "goblet", None, position=(2.0, -0.5, 0.85))
+    assert observe(Scene((DESK, stranger)), typical_sizes=sizes).relations == without.relations
+
+
+def test_in_the_map_without_a_viewpoint_only_heights_count() -> None:
+    scene = Scene((DESK, MONITOR, CHAIR))
+    blind = observe(scene, frame_id="map")
+    assert blind.relations == ((ON_TOP, 1, 0),)
+    assert blind.poses is not None
+    assert not blind.poses.observed[[LEFT, FRONT]].any()
+    placed = observe(scene, frame_id="map", viewpoint=Viewpoint(2.0, 4.0, -math.pi / 2))
+    assert set(placed.relations or ()) == {(ON_TOP, 1, 0), (LEFT, 0, 2), (LEFT, 1, 2)} or set(
+        placed.relations or ()
+    ) == {(ON_TOP, 1, 0), (LEFT, 2, 0), (LEFT, 2, 1)}
+    # Facing -y, the right hand points to -x: the chair (smaller x) stands on the right.
+    assert (LEFT, 0, 2) in (placed.relations or ())
+    assert placed.objects[0].position == pytest.approx((4.0, 0.0, 0.4))
+    assert observe(scene, frame_id="base_link").relations == observe(scene).relations
+
+
+def test_given_relations_are_not_overruled() -> None:
+    scene = Scene((DESK, MONITOR), relations=())
+    assert observe(scene) is scene
+    bare = Scene((SceneObject("a", "a", 0), SceneObject("b", "b", 1)))
+    assert observe(bare) is bare
+
+
+def test_things_without_a_position_stay_unobserved() -> None:
+    seen = observe(Scene((DESK, SceneObject("cup", "cup", 1))), viewpoint=Viewpoint(0, 0, 1.0))
+    assert seen.relations == ()
+    assert seen.poses is not None
+    assert not seen.poses.observed.any()
+    assert seen.objects[1].position is None

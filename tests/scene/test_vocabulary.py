@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.scene.labels import label_key
+from app.scene.vocabulary import ObjectClass, Vocabulary
+
+VOCABULARY = Vocabulary(
+    [
+        ObjectClass("garbage bin", ("trash can", "dustbin")),
+        ObjectClass("tv", ("television",)),
+        ObjectClass("glass", ("wine glass",)),
+        ObjectClass("glasses", ("spectacles",)),
+        ObjectClass("curtain", size=(0.3, 0.3, 2.0)),
+        ObjectClass("wall", structure=True),
+    ],
+    ["bedroom", "living room"],
+)
+
+names = st.sampled_from(
+    [
+        (name, i)
+        for i, entry in enumerate(VOCABULARY.objects)
+        for name in (entry.label, *entry.aliases)
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("label", "expected"),
+    [
+        ("Trash_Cans", "garbage bin"),
+        ("garbage_bin", "garbage bin"),
+        ("TV", "tv"),
+        ("Televisions", "tv"),
+        ("curtains", "curtain"),
+        ("glasses", "glasses"),
+        ("wine glasses", "glass"),
+        ("WALLS", "wall"),
+    ],
+)
+def test_labels_are_found_under_any_spelling(label: str, expected: str) -> None:
+    index = VOCABULARY.index(label)
+    assert index is not None
+    assert VOCABULARY.labels[index] == expected
+
+
+@pytest.mark.parametrize("label", ["", "  ", "sofa", "trash", "can", "curtain rod"])
+def test_other_labels_are_not(label: str) -> None:
+    assert VOCABULARY.index(label) is None
+
+
+@given(names, st.sampled_from([str.upper, str.title, lambda name: name.replace(" ", "_")]))
+def test_every_name_leads_to_its_class(name: tuple[str, int], spell: Any) -> None:
+    text, index = name
+    assert VOCABULARY.index(spell(text)) == index
+    assert VOCABULARY.index(label_key(text)) == index
+
+
+def test_rooms_have_one_spelling() -> None:
+    assert [VOCABULARY.room_index(name) for name in ("bedroom", "bed room", "Bed_Room")] == [0] * 3
+    assert VOCABULARY.room_index("Living-Room") == 1
+    assert VOCABULARY.room_index("garage") is None
+
+
+def test_suggestions_are_near_distinct_canonical_labels() -> None:
+    assert VOCABULARY.suggest("garbge bin")[0] == "garbage bin"
+    assert VOCABULARY.suggest("televison") == ("tv",)
+    assert VOCABULARY.suggest("qqqq") == ()
+    assert len(VOCABULARY.suggest("glases", limit=1)) == 1
+    suggestions = VOCABULARY.suggest("trash can dustbin", limit=3)
+    assert len(set(suggestions)) == len(suggestions)
+
+
+def test_masks_and_sizes() -> None:
+    assert VOCABULARY.structure.tolist() == [False] * 5 + [True]
+    assert VOCABULARY.sizes[4].tolist() == [0.3, 0.3, 2.0]
+    assert np.isnan(VOCABULARY.sizes[[0, 1, 2, 3, 5]]).all()
+    with pytest.raises(ValueError, match="read-only"):
+        VOCABULARY.structure[0] = True
+
+
+def test_the_dictionary_form_survives_json() -> None:
+    again = Vocabulary.from_dict(json.loads(json.dumps(VOCABULARY.to_dict())))
+    assert again == VOCABULARY
+    assert hash(again) == hash(VOCABULARY)
+    assert again != Vocabulary(VOCABULARY.objects)
+    assert len(again) == 6
+
+
+def test_two_classes_cannot_share_a_name() -> None:
+    with pytest.raises(ValueError, match=r"'Trash-Cans' names two object classes: 'bin' and 'can'"):
+        Vocabulary([ObjectClass("bin", ("trash can",)), ObjectClass("can", ("Trash-Cans",))])
+    with pytest.raises(ValueError, match="'bed room' and 'bedroom' are one"):
+        Vocabulary([ObjectClass("bed")], ["bed room", "bedroom"])
+    # An alias that is only another spelling of its own class is harmless.
+    assert len(Vocabulary([ObjectClass("book", ("books",))])) == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({}, "list 'objects'"),
+        ({"objects": []}, "at least one object class"),
+        ({"objects": ["bed"]}, "mapping with a 'label'"),
+        ({"objects": [{"label": ""}]}, "empty name"),
+        ({"objects": [{"label": "bed", "aliases": "cot"}]}, "aliases of 'bed'"),
+        ({"objects": [{"label": "bed", "aliases": ["_"]}]}, "empty name"),
+        ({"objects": [{"label": "bed", "structure": 1}]}, "structure of 'bed'"),
+        ({"objects": [{"label": "bed", "size": [1, 2]}]}, "size of 'bed'"),
+        ({"objects": [{"label": "bed", "size": [1, 2, -1]}]}, "size of 'bed'"),
+        ({"objects": [{"label": "bed", "size": [1, 2, float("nan")]}]}, "size of 'bed'"),
+        ({"objects": [{"label": "bed", "size": "big"}]}, "size of 'bed'"),
+        ({"objects": [{"label": "bed", "colour": "red"}]}, "unknown fields.*colour"),
+        ({"objects": [{"label": "bed"}], "room_types": "attic"}, "room_types"),
+        ({"objects": [{"label": "bed"}], "room_types": [1]}, "room_types"),
+        ({"objects": [{"label": "bed"}], "room_types": [""]}, "empty room type"),
+    ],
+)
+def test_malformed_dictionaries_are_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Vocabulary.from_dict(values)

@@ -1,0 +1,1 @@
+"""Training: from scenes to versioned artifacts. The service never imports it."""

@@ -1,0 +1,152 @@
+"""Encoded scenes as tensors: what an objective sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine, Triway
+from app.boltzmann.edges import Edges, find_triples, pair_edges, triple_keys
+
+if TYPE_CHECKING:
+    from training.datasets import EncodedScene
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B scenes.
+
+    Attributes:
+        v: (B, V) presence.
+        classes, counts: (B, n) int64, classes -1 where padded.
+        holds, observed: (B, A, n, n) relations between those classes.
+        room: (B,) int64, -1 where nobody said.
+        annotated: (B, V) bool: the source mentions the class at all; elsewhere v says nothing.
+    """
+
+    v: Tensor
+    classes: Tensor
+    counts: Tensor
+    holds: Tensor
+    observed: Tensor
+    room: Tensor
+    annotated: Tensor
+
+    def __len__(self) -> int:
+        return len(self.v)
+
+    def rows(self, index: Tensor) -> Batch:
+        """Some scenes of the batch (indices or a mask)."""
+        return Batch(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class SceneTensors:
+    """A whole set of scenes, from which batches are cut.
+
+    Attributes:
+        scenes: the encoded scenes.
+        v: (N, V); room: (N,); source: (N,) int64 index into annotated_classes.
+        annotated_classes: (sources, V) bool.
+    """
+
+    scenes: Sequence[EncodedScene]
+    v: Tensor
+    room: Tensor
+    source: Tensor
+    annotated_classes: Tensor
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def batch(self, index: Tensor) -> Batch:
+        """The scenes at the given positions."""
+        chosen = [self.scenes[k].evidence for k in index.tolist()]
+        n = max((len(e.classes) for e in chosen), default=0)
+        relations = chosen[0].holds.shape[0] if chosen else 0
+        classes = np.full((len(chosen), n), -1, dtype=np.int64)
+        counts = np.ones((len(chosen), n), dtype=np.int64)
+        holds = np.zeros((len(chosen), relations, n, n), dtype=np.float32)
+        observed = np.zeros((len(chosen), relations, n, n), dtype=np.bool_)
+        for row, e in enumerate(chosen):
+            m = len(e.classes)
+            classes[row, :m], counts[row, :m] = e.classes, e.counts
+            holds[row, :, :m, :m], observed[row, :, :m, :m] = e.holds, e.observed
+        return Batch(
+            v=self.v[index],
+            classes=torch.from_numpy(classes),
+            counts=torch.from_numpy(counts),
+            holds=torch.from_numpy(holds),
+            observed=torch.from_numpy(observed),
+            room=self.room[index],
+            annotated=self.annotated_classes[self.source[index]],
+        )
+
+
+def scene_tensors(
+    scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], size: int
+) -> SceneTensors:
+    """Tensors of encoded scenes.
+
+    Args:
+        annotated: per source, (V,) bool of the classes that it mentions.
+        size: V.
+
+    Raises:
+        ValueError: a scene of a source that `annotated` does not know.
+    """
+    names = sorted(annotated)
+    if missing := {scene.source for scene in scenes} - set(names):
+        raise ValueError(f"no annotated classes for the sources {sorted(missing)}")
+    v = torch.zeros(len(scenes), size)
+    for row, scene in enumerate(scenes):
+        v[row, torch.from_numpy(scene.evidence.classes)] = 1.0
+    return SceneTensors(
+        scenes=scenes,
+        v=v,
+        room=torch.tensor([scene.room_type for scene in scenes], dtype=torch.int64),
+        source=torch.tensor([names.index(scene.source) for scene in scenes], dtype=torch.int64),
+        annotated_classes=torch.from_numpy(np.stack([annotated[name] for name in names])),
+    )
+
+
+def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
+    """(edges, r, observed) of a batch in the machine's own layout.
+
+    In an ungated machine the units that touch an absent class are off, and observed so where the
+    scene's relations were annotated at all.
+    """
+    if isinstance(machine, Triway):
+        edges = machine.edges(batch.classes, batch.counts)
+        return edges, batch.holds.flatten(1), batch.observed.flatten(1)
+    edges = machine.edges(batch.classes)
+    pairs = pair_edges(batch.classes, batch.holds.shape[1])
+    keys = triple_keys(pairs.relation, pairs.subject, pairs.object, machine.spec.V)
+    position, found = find_triples(machine.triple_keys, keys)
+    found = found & pairs.valid
+    row, slot = found.nonzero(as_tuple=True)
+    unit = position[row, slot]
+    r = torch.zeros(len(batch), machine.spec.T)
+    r[row, unit] = batch.holds.flatten(1)[row, slot]
+    annotated = batch.observed.flatten(1).any(1)
+    observed = annotated.unsqueeze(1).expand(-1, machine.spec.T).clone()
+    observed[row, unit] = batch.observed.flatten(1)[row, slot]
+    return edges, r, observed
+
+
+def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
+    """(T, 3) of the (a, i, j) that hold in at least `minimum` scenes, sorted."""
+    keys: list[np.ndarray] = []
+    for scene in scenes:
+        relation, subject, object_ = scene.evidence.holds.nonzero()
+        classes = scene.evidence.classes
+        keys.append((relation * size + classes[subject]) * size + classes[object_])
+    values, counts = np.unique(np.concatenate([*keys, np.zeros(0, np.int64)]), return_counts=True)
+    kept = values[counts >= minimum].astype(np.int64)
+    table = np.stack([kept // size // size, kept // size % size, kept % size], 1)
+    return torch.from_numpy(table).to(torch.int32)

@@ -1,0 +1,128 @@
+"""The one validated file that says how a model is trained; stored with the artifact."""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from app.boltzmann.spec import Form, Variant
+
+
+class ConfigError(ValueError):
+    """A configuration file that cannot be used; says which entry and why."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DataConfig(_Section):
+    """Which scenes: sources by name (`rooms` is the built-in generator), and how they are split."""
+
+    sources: tuple[str, ...] = Field(min_length=1)
+    vocabulary: str = "indoor"
+    split: Literal["group", "random"] = "group"
+    split_seed: int = 0
+    rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
+    limit: int | None = Field(default=None, ge=10, description="at most so many scenes a source")
+
+
+class MachineConfig(_Section):
+    """The shape of the machine; V, A, C and T follow from the data."""
+
+    variant: Variant
+    H1: int = Field(default=200, ge=1)
+    H2: int = Field(default=100, ge=0)
+    K: int = Field(default=32, ge=0)
+    form: Form = "seed"
+    min_triple_count: int = Field(default=1, ge=1)
+    initial_scale: float = Field(default=0.05, gt=0)
+    initial_c1: float = 0.0
+
+
+class ObjectiveConfig(_Section):
+    """What is minimised, and the knobs of that objective."""
+
+    name: Literal["contrastive_divergence", "persistent_cd", "composite"]
+    k: int = Field(default=1, ge=1, description="Gibbs steps an update (CD, PCD)")
+    chains: int = Field(default=128, ge=1, description="persistent chains (PCD)")
+    presence_weight: float = Field(default=0.1, ge=0, description="presence against absence")
+    relation_weight: float = Field(default=0.05, ge=0)
+    room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of withheld room types")
+    structure_dropout: float = Field(default=0.5, ge=0, le=1)
+    object_dropout: float = Field(default=0.0, ge=0, lt=1)
+
+
+class TrainingConfig(_Section):
+    """Optimiser and stopping."""
+
+    optimiser: Literal["adamw", "sgd"] = "adamw"
+    learning_rate: float = Field(default=0.01, gt=0)
+    schedule: Literal["one_cycle", "constant"] = "one_cycle"
+    epochs: int = Field(default=30, ge=1)
+    batch_size: int = Field(default=64, ge=1)
+    weight_decay: float = Field(default=0.0, ge=0)
+    residual_decay: float = Field(default=0.0, ge=0)
+    averaging: float = Field(default=0.0, ge=0, lt=1, description="decay of the weight average")
+    patience: int | None = Field(default=None, ge=1)
+    seed: int = 0
+    threads: int = Field(default=1, ge=1)
+
+
+class Config(_Section):
+    """Everything that decides the weights."""
+
+    name: str = Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")
+    description: str = ""
+    data: DataConfig
+    machine: MachineConfig
+    objective: ObjectiveConfig
+    training: TrainingConfig = TrainingConfig()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Config:
+        if self.machine.variant == "rbm" and self.machine.H2:
+            raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
+        if self.machine.variant != "triway" and self.machine.form != "seed":
+            raise ValueError("machine.form = 'local' is defined for the triway variant only")
+        if "rooms" in self.data.sources and not self.data.rooms:
+            raise ValueError("data.rooms must say how many rooms to generate")
+        return self
+
+    @property
+    def digest(self) -> str:
+        """sha256 of the configuration; a checkpoint resumes only under the one it began with."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
+
+def shipped_configs() -> dict[str, Path]:
+    """The configurations that come with the package, by name."""
+    folder = Path(__file__).parent / "configs"
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_config(reference: str, *, seed: int | None = None) -> Config:
+    """Read a TOML file, or a shipped configuration by its name.
+
+    Raises:
+        ConfigError: no such file, not TOML, or an entry that does not fit.
+    """
+    path = shipped_configs().get(reference, Path(reference))
+    if not path.is_file():
+        known = ", ".join(shipped_configs())
+        raise ConfigError(f"no configuration {reference!r}: give a TOML file or one of {known}")
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        if seed is not None:
+            values.setdefault("training", {})["seed"] = seed
+        return Config.model_validate(values)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path.name} is not TOML: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise ConfigError(f"{path.name}: {place}: {first['msg']}") from error

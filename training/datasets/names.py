@@ -1,0 +1,94 @@
+"""Curated names: which labels mean one thing, and which mean no thing at all."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from pathlib import Path
+
+from app.scene import label_key
+
+NAMES_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "names.toml"
+
+
+@dataclass(frozen=True)
+class Names:
+    """What `vocabularies/names.toml` says, by key.
+
+    Attributes:
+        base: classes of every indoor vocabulary.
+        structure: classes that are accepted and never proposed.
+        not_objects: labels that become no class.
+        outdoor: labels that become no class of an indoor vocabulary.
+        aliases: other names of each class.
+        rooms: other names of each room type; "" lists words that name none.
+    """
+
+    base: tuple[str, ...] = ()
+    structure: tuple[str, ...] = ()
+    not_objects: tuple[str, ...] = ()
+    outdoor: tuple[str, ...] = ()
+    aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for title, table in (("aliases", self.aliases), ("rooms", self.rooms)):
+            owner: dict[str, str] = {}
+            for name, others in table.items():
+                for other in (name, *others):
+                    if other and owner.setdefault(label_key(other), name) != name:
+                        first = owner[label_key(other)]
+                        raise ValueError(f"{title}: {other!r} names both {first!r} and {name!r}")
+        for name in self.base:
+            if (other := self.canonical(name)) != name:
+                raise ValueError(f"the base class {name!r} is an alias of {other!r}")
+
+    def canonical(self, label: str) -> str:
+        """The curated name of a label, or the label itself, in lower case with single spaces."""
+        found = self._by_key.get(label_key(label))
+        return found if found is not None else " ".join(label.casefold().replace("_", " ").split())
+
+    def canonical_room(self, room: str | None) -> str | None:
+        """The one spelling of a room type; None where it names none."""
+        if room is None:
+            return None
+        found = self._rooms_by_key.get(label_key(room))
+        if found is None:
+            found = " ".join(room.casefold().replace("_", " ").split())
+        return found or None
+
+    @cached_property
+    def _by_key(self) -> dict[str, str]:
+        keys = {label_key(name): name for name in (*self.base, *self.structure)}
+        for name, others in self.aliases.items():
+            for other in (name, *others):
+                keys.setdefault(label_key(other), name)
+        return keys
+
+    @cached_property
+    def _rooms_by_key(self) -> dict[str, str]:
+        return {
+            label_key(other): name
+            for name, others in self.rooms.items()
+            for other in (name, *others)
+            if other
+        }
+
+
+@cache
+def curated_names(path: Path = NAMES_FILE) -> Names:
+    """Read the curated names.
+
+    Raises:
+        ValueError: a name that means two things.
+    """
+    values = tomllib.loads(path.read_text(encoding="utf-8"))
+    return Names(
+        base=tuple(values["base"]),
+        structure=tuple(values["structure"]),
+        not_objects=tuple(values["not_objects"]),
+        outdoor=tuple(values["outdoor"]),
+        aliases={name: tuple(others) for name, others in values["aliases"].items()},
+        rooms={name: tuple(others) for name, others in values["rooms"].items()},
+    )

@@ -1,0 +1,174 @@
+"""Vocabularies from annotated scenes and curated names."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from app.scene import ObjectClass, Vocabulary, label_key
+from training.datasets.names import Names, curated_names
+from training.datasets.records import AnnotatedScene
+
+INDOOR_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "indoor.json"
+
+# Fewer mentions than this do not train a class.
+MINIMUM_MENTIONS = 8
+# Fewer boxes than this give no typical size.
+MINIMUM_BOXES = 5
+
+
+def build_vocabulary(
+    scenes: Iterable[AnnotatedScene],
+    names: Names,
+    *,
+    minimum: int = MINIMUM_MENTIONS,
+    outdoor: bool = False,
+) -> Vocabulary:
+    """The classes that scenes mention often enough, most frequent first, and their aliases.
+
+    Labels are pooled under their curated names before they are counted. The base classes of
+    ``names`` are in the vocabulary however seldom they are mentioned; labels of ``not_objects`` never
+    are, those of ``outdoor`` only on request. Aliases are the curated ones, and the spellings seen
+    that no normalisation finds. Room types are kept under the same minimum, counted in scenes.
+
+    Raises:
+        ValueError: no scene mentions any class often enough.
+    """
+    mentions: Counter[str] = Counter()
+    rooms: Counter[str] = Counter()
+    spelled: dict[str, str] = {}
+    for scene in scenes:
+        for thing in scene.objects:
+            label = names.canonical(thing.label)
+            # Spellings with one key are one label: the first seen stands for all of them.
+            mentions[spelled.setdefault(label_key(label), label)] += 1
+        if room := names.canonical_room(scene.room_type):
+            rooms[room] += 1
+    refused = {label_key(name) for name in names.not_objects}
+    if not outdoor:
+        refused |= {label_key(name) for name in names.outdoor}
+    kept = set(names.base) | {label for label, count in mentions.items() if count >= minimum}
+    structure = {label_key(name) for name in names.structure}
+    return Vocabulary(
+        [
+            ObjectClass(
+                label,
+                aliases=names.aliases.get(label, ()),
+                structure=label_key(label) in structure,
+            )
+            for label in sorted(kept, key=lambda label: (-mentions[label], label))
+            if label_key(label) not in refused
+        ],
+        sorted(room for room, count in rooms.items() if count >= minimum),
+    )
+
+
+def write_indoor_vocabulary(
+    scenes: Iterable[AnnotatedScene], path: Path = INDOOR_FILE
+) -> Vocabulary:
+    """Build the indoor vocabulary from the scenes of all sources and write it, one class a line."""
+    vocabulary = build_vocabulary(scenes, curated_names())
+    values = vocabulary.to_dict()
+    for entry in values["objects"]:
+        # Sizes come from the training data (`with_typical_sizes`), not from this file.
+        del entry["size"]
+    lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in values["objects"])
+    rooms = json.dumps(values["room_types"], ensure_ascii=False)
+    path.write_text(
+        f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n', encoding="utf-8"
+    )
+    return vocabulary
+
+
+def indoor_vocabulary(path: Path = INDOOR_FILE) -> Vocabulary:
+    """The committed indoor vocabulary."""
+    return Vocabulary.from_dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def source_vocabulary(
+    scenes: Iterable[AnnotatedScene], *, minimum: int = MINIMUM_MENTIONS
+) -> Vocabulary:
+    """A vocabulary of what the given scenes mention alone: no base classes, curated names.
+
+    For models trained on one source, such as ProcTHOR or the generated rooms.
+    """
+    names = curated_names()
+    mentioned_only = Names(
+        structure=names.structure,
+        not_objects=names.not_objects,
+        aliases=_reachable(names),
+        rooms=names.rooms,
+    )
+    return build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
+
+
+def _reachable(names: Names) -> dict[str, tuple[str, ...]]:
+    """Aliases, with an entry for every curated class so that its spelling stays canonical."""
+    return {name: () for name in (*names.base, *names.structure)} | names.aliases
+
+
+def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
+    """The vocabulary with the median box of each class.
+
+    The yaw of an object without a box is unknown, so its typical footprint is a square: the side is
+    the median of sqrt(dx * dy), which keeps the area.
+
+    Args:
+        vocabulary: the classes; those with fewer than `MINIMUM_BOXES` boxes keep their size.
+        scenes: scenes with boxes; others are passed over.
+    """
+    boxes: dict[int, list[tuple[float, float]]] = {}
+    found: dict[str, int | None] = {}
+    for scene in scenes:
+        for thing in scene.objects:
+            if thing.size is None:
+                continue
+            if thing.label not in found:
+                found[thing.label] = vocabulary.index(thing.label)
+            if (index := found[thing.label]) is not None:
+                x, y, z = thing.size
+                boxes.setdefault(index, []).append(((x * y) ** 0.5, z))
+    return Vocabulary(
+        [
+            _sized(entry, boxes.get(index, ()))
+            for index, entry in enumerate(vocabulary.objects)
+        ],
+        vocabulary.room_types,
+    )
+
+
+def _sized(entry: ObjectClass, boxes: Sequence[tuple[float, float]]) -> ObjectClass:
+    if len(boxes) < MINIMUM_BOXES:
+        return entry
+    side, height = (round(float(value), 3) for value in np.median(boxes, axis=0))
+    return ObjectClass(entry.label, entry.aliases, entry.structure, (side, side, height))
+
+
+def coverage(
+    vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene], *, structure: bool = True
+) -> float:
+    """Share of the object mentions of scenes that a vocabulary covers.
+
+    Args:
+        vocabulary: the vocabulary.
+        scenes: the scenes.
+        structure: count mentions of structure classes; otherwise they are left out altogether.
+
+    Raises:
+        ValueError: the scenes mention nothing.
+    """
+    known = total = 0
+    mentions = Counter(thing.label for scene in scenes for thing in scene.objects)
+    for label, count in mentions.items():
+        index = vocabulary.index(label)
+        if index is not None and not structure and vocabulary.structure[index]:
+            continue
+        total += count
+        known += count * (index is not None)
+    if not total:
+        raise ValueError("the scenes mention no object")
+    return known / total

@@ -1,0 +1,140 @@
+"""T2: one class left out with all its instances and relations, ranked among all absent classes.
+
+Every relation is unobserved, so nothing of the removed object can leak. Ties score their expectation
+under random order. Structure classes are neither removed nor candidates; scenes with fewer than two
+other classes are skipped. A mention outside the vocabulary would score 0 (`with_unknown`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine, Triway
+from app.boltzmann.log_odds import object_log_odds
+from app.boltzmann.mean_field import Evidence
+from training.batches import SceneTensors
+from training.evaluation.intervals import Figure, ratio_figure
+
+# Log-odds (B, V) of every class given presence (B, V) and the counts of present classes (B, V).
+ObjectScore = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Every removed object of a set of scenes.
+
+    Attributes:
+        scene: (N,) position of the scene in the set.
+        target: (N,) the removed class.
+        rank: (N,) expected reciprocal rank's ingredients: classes ranked above the target.
+        ties: (N,) other classes with exactly its score.
+        log_probability: (N,) of the target under a softmax over absent candidates.
+        scenes, skipped: how many scenes were given, and how many had too few classes.
+    """
+
+    scene: NDArray[np.int64]
+    target: NDArray[np.int64]
+    above: NDArray[np.int64]
+    ties: NDArray[np.int64]
+    log_probability: NDArray[np.float64]
+    scenes: int
+    skipped: int
+
+    def reciprocal_rank(self) -> NDArray[np.float64]:
+        """Expectation of 1 / rank under random order of ties, (N,)."""
+        # Mean of 1/r over r = above + 1 .. above + ties + 1, by harmonic numbers.
+        harmonic = np.concatenate([[0.0], np.cumsum(1.0 / np.arange(1, self._length() + 1))])
+        last = self.above + self.ties + 1
+        return (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
+
+    def top(self, k: int) -> NDArray[np.float64]:
+        """Probability that the target is among the first k, (N,)."""
+        return np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
+
+    def _length(self) -> int:
+        return int((self.above + self.ties).max(initial=0)) + 1
+
+    def figure(self, values: NDArray[np.float64]) -> Figure:
+        """Mean of per-object values with a bootstrap interval over scenes."""
+        top = np.bincount(self.scene, weights=values, minlength=self.scenes)
+        count = np.bincount(self.scene, minlength=self.scenes).astype(np.float64)
+        return ratio_figure(top, count)
+
+
+def machine_score(machine: BoltzmannMachine) -> ObjectScore:
+    """Log-odds under a machine with every relation unobserved.
+
+    Seed-form machines sum relations out at the mean-field fixed point.
+    """
+
+    def score(v: Tensor) -> Tensor:
+        edges = None
+        if machine.spec.form == "seed":
+            if isinstance(machine, Triway):
+                n = int(v.sum(1).max())
+                value, index = v.topk(n, dim=1)
+                edges = machine.edges(torch.where(value > 0, index, -1))
+            else:
+                edges = machine.edges(torch.zeros(1, 0, dtype=torch.int64))
+        return object_log_odds(machine, Evidence(v, edges))
+
+    return score
+
+
+@torch.no_grad()
+def leave_one_out(
+    scenes: SceneTensors, structure: Tensor, score: ObjectScore, *, block: int = 256
+) -> LeaveOneOut:
+    """Remove every non-structure class of every scene in turn and rank it.
+
+    Args:
+        structure: (V,) bool.
+        score: log-odds of all classes, higher = likelier missing.
+    """
+    removable = (scenes.v > 0) & ~structure
+    enough = removable.sum(1) >= 2
+    row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
+    above, ties, log_p = [], [], []
+    for start in range(0, len(row), block):
+        r, t = row[start : start + block], target[start : start + block]
+        v = scenes.v[r].scatter(1, t.unsqueeze(1), 0.0)
+        values = score(v).masked_fill((v > 0) | structure, -torch.inf)
+        chosen = values.gather(1, t.unsqueeze(1))
+        above.append((values > chosen).sum(1))
+        ties.append((values == chosen).sum(1) - 1)
+        log_p.append((chosen.squeeze(1) - values.logsumexp(1)).double())
+    empty = torch.zeros(0)
+    return LeaveOneOut(
+        scene=row.numpy(),
+        target=target.numpy(),
+        above=torch.cat(above or [empty.long()]).numpy(),
+        ties=torch.cat(ties or [empty.long()]).numpy(),
+        log_probability=torch.cat(log_p or [empty.double()]).numpy(),
+        scenes=len(scenes),
+        skipped=int((~enough).sum()),
+    )
+
+
+def with_unknown(result: LeaveOneOut, unknown: NDArray[np.int64]) -> Figure:
+    """MRR where mentions outside the vocabulary count as removed objects that score 0.
+
+    Args:
+        unknown: (scenes,) such mentions per scene.
+    """
+    top = np.bincount(result.scene, weights=result.reciprocal_rank(), minlength=result.scenes)
+    count = np.bincount(result.scene, minlength=result.scenes) + unknown
+    return ratio_figure(top, count.astype(np.float64))
+
+
+def missing_figures(result: LeaveOneOut) -> dict[str, Figure]:
+    """MRR and top-1/5/10, micro-averaged over removed objects."""
+    figures = {"mrr": result.figure(result.reciprocal_rank())}
+    for k in (1, 5, 10):
+        figures[f"top{k}"] = result.figure(result.top(k))
+    return figures

@@ -1,0 +1,24 @@
+"""Training objectives, by name: one entry here is trained, tested and documented like the others.
+
+An objective is called with the machine, a batch and a generator, and returns a loss whose gradient is
+that of the objective (`Objective`). It may keep state between calls (persistent chains), which a
+checkpoint stores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from app.boltzmann import BoltzmannMachine
+from training.config import ObjectiveConfig
+from training.objectives.base import Objective
+from training.objectives.composite import CompositeLikelihood
+from training.objectives.contrastive import ContrastiveDivergence, PersistentCD
+
+OBJECTIVES: dict[str, Callable[[ObjectiveConfig, BoltzmannMachine], Objective]] = {
+    "contrastive_divergence": ContrastiveDivergence,
+    "persistent_cd": PersistentCD,
+    "composite": CompositeLikelihood,
+}
+
+__all__ = ["OBJECTIVES", "CompositeLikelihood", "ContrastiveDivergence", "Objective", "PersistentCD"]

@@ -1,0 +1,192 @@
+"""Contrastive divergence, plain and persistent, by differences of the energy.
+
+The gradient of the negative log-likelihood is <dE>_data - <dE>_model. Both terms are energies of
+sampled states, so autograd turns any variant's energy into its update; h1 enters by its mean given the
+rest (Rao–Blackwell), which is exact because the seed form's energy is linear in it.
+
+In the local form relations sum to one given (v, h1), so their model term has mean zero and is left out:
+what remains is the machine of (v, h1, h2) and log p(r | v, h1) on the data.
+
+Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002); Tieleman,
+"Training RBMs using approximations to the likelihood gradient" (2008); Montavon and Müller, "Deep
+Boltzmann machines and the centering trick" (2012); Melchior, Fischer and Wiskott, "How to center deep
+Boltzmann machines" (2016).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from app.boltzmann import BoltzmannMachine
+from app.boltzmann.bernoulli import bernoulli
+from app.boltzmann.edges import Edges
+from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state, sample_relations
+from app.boltzmann.mean_field import Evidence, mean_field
+from training.batches import Batch, relation_units
+from training.config import ObjectiveConfig
+from training.objectives.base import Objective, withhold_rooms
+
+
+@torch.no_grad()
+def data_state(
+    machine: BoltzmannMachine, batch: Batch, room: Tensor, generator: torch.Generator
+) -> tuple[State, Tensor]:
+    """Hidden units and unobserved relations drawn given the data, and which relations are observed.
+
+    The hidden layers are drawn from the mean-field fixed point given the observed relations.
+    """
+    edges, r, observed = relation_units(machine, batch)
+    field = mean_field(machine, Evidence(batch.v, edges, r, observed, room), iterations=5)
+    h1 = bernoulli(field.y.sigmoid(), generator)
+    h2 = bernoulli(field.h2, generator)
+    p = machine.relation_logits(edges, batch.v, h1).sigmoid() * machine.gate(edges, batch.v)
+    r = torch.where(observed, r, bernoulli(p, generator))
+    return State(batch.v, h1, h2, r, edges), observed
+
+
+def object_energy(
+    machine: BoltzmannMachine, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor
+) -> Tensor:
+    """The energy without relations, (B,)."""
+    context = (h1 * (machine.context_bias(room) + v @ machine.W)).sum(-1)
+    return -(v @ machine.b + h2 @ machine.c2 + context + ((h1 @ machine.J) * h2).sum(-1))
+
+
+def relation_nll(
+    machine: BoltzmannMachine, edges: Edges, v: Tensor, h1: Tensor, r: Tensor, observed: Tensor
+) -> Tensor:
+    """-log p(observed r | v, h1), (B,)."""
+    logits = machine.relation_logits(edges, v, h1)
+    weight = observed * machine.gate(edges, v)
+    return ((softplus(logits) - r * logits) * weight).sum(-1)
+
+
+def energy_of(machine: BoltzmannMachine, state: State, room: Tensor) -> Tensor:
+    """E of a seed-form state with h1 at its mean given the rest, (B,)."""
+    second = state.h2 if machine.spec.H2 else None
+    with torch.no_grad():
+        h1 = machine.hidden_logits(state.v, state.r, state.edges, second, room).sigmoid()
+    return machine.energy(state.v, state.r, h1, state.h2, state.edges, room)
+
+
+def energy_difference(
+    machine: BoltzmannMachine, data: State, observed: Tensor, model: State, room: Tensor
+) -> Tensor:
+    """mean E(data) - mean E(model), plus -log p(r | v, h1) in the local form."""
+    if machine.spec.form == "local":
+        positive = object_energy(machine, data.v, data.h1, data.h2, room)
+        positive = positive + relation_nll(
+            machine, data.edges, data.v, data.h1, data.r, observed
+        )
+        return positive.mean() - object_energy(machine, model.v, model.h1, model.h2, room).mean()
+    return energy_of(machine, data, room).mean() - energy_of(machine, model, room).mean()
+
+
+class ContrastiveDivergence(Objective):
+    """CD-k: the model term from k Gibbs steps started at the data."""
+
+    def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
+        """mean E(data) - mean E(after k steps)."""
+        room = withhold_rooms(batch, self.config.room_dropout, generator)
+        data, observed = data_state(machine, batch, room, generator)
+        relations = machine.spec.form == "seed"
+        model = data
+        for _ in range(self.config.k):
+            model = gibbs_step(
+                machine,
+                model,
+                generator,
+                Clamp(room=room),
+                collapsed=False,
+                relations=relations,
+            )
+        return energy_difference(machine, data, observed, model, room)
+
+
+class PersistentCD(Objective):
+    """PCD-k with centred gradients: the model term from chains that go on between updates."""
+
+    def __init__(self, config: ObjectiveConfig, machine: BoltzmannMachine) -> None:
+        super().__init__(config, machine)
+        spec = machine.spec
+        self.chains: State | None = None
+        self.saved: dict[str, Tensor] = {}
+        # Data means as running averages: the offsets of v, h1 and h2.
+        self.offsets = [torch.full((n,), 0.5) for n in (spec.V, spec.H1, spec.H2)]
+
+    def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
+        """mean E(data) - mean E(chains)."""
+        free = torch.full((len(batch),), -1)
+        data, observed = data_state(machine, batch, free, generator)
+        chains = self._resume(machine, generator)
+        relations = machine.spec.form == "seed"
+        for _ in range(self.config.k):
+            chains = gibbs_step(machine, chains, generator, relations=relations)
+        self.chains = chains
+        for offset, block in zip(self.offsets, (data.v, data.h1, data.h2), strict=True):
+            offset.lerp_(block.mean(0), 0.01)
+        no_room = torch.full((len(chains.v),), -1)
+        if machine.spec.form == "local":
+            model = object_energy(machine, chains.v, chains.h1, chains.h2, no_room).mean()
+            positive = object_energy(machine, data.v, data.h1, data.h2, free)
+            nll = relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
+            return (positive + nll).mean() - model
+        return energy_of(machine, data, free).mean() - energy_of(machine, chains, no_room).mean()
+
+    def adjust_gradients(self, machine: BoltzmannMachine) -> None:
+        """The centred gradient: weights see (v - μ)(h - λ), biases make up for the offsets."""
+        centre_gradients(machine, *self.offsets)
+
+    def _resume(self, machine: BoltzmannMachine, generator: torch.Generator) -> State:
+        if self.chains is not None:
+            return self.chains
+        rows = self.config.chains
+        v = bernoulli(machine.b.detach().sigmoid().expand(rows, -1), generator)
+        v = self.saved.get("v", v)
+        state = initial_state(machine, v, generator)
+        if not self.saved:
+            return state
+        edges, r = sample_relations(machine, v, self.saved["h1"], generator)
+        return replace(state, h1=self.saved["h1"], h2=self.saved["h2"], edges=edges, r=r)
+
+    def state(self) -> dict[str, Tensor]:
+        """Offsets and the chains; their relations are drawn anew from (v, h1) on resuming."""
+        names = ("offset_v", "offset_h1", "offset_h2")
+        state = dict(zip(names, self.offsets, strict=True))
+        if self.chains is not None:
+            state |= {"v": self.chains.v, "h1": self.chains.h1, "h2": self.chains.h2}
+        return state
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore the offsets and remember where the chains were."""
+        self.offsets = [state[name] for name in ("offset_v", "offset_h1", "offset_h2")]
+        self.saved = {name: state[name] for name in ("v", "h1", "h2") if name in state}
+
+
+@torch.no_grad()
+def centre_gradients(
+    machine: BoltzmannMachine, mu: Tensor, lambda1: Tensor, lambda2: Tensor
+) -> None:
+    """Turn gradients by (b, c1, c2, W, J) into centred ones, in place.
+
+    With d<v>, d<h1>, d<vh1> the differences of data and model: the weight's centred gradient is
+    d<vh1> - μ d<h1>' - d<v> λ1', and a bias gives up what its weights' offsets already move.
+    """
+    b, c1, c2 = (getattr(machine, name).grad for name in ("b", "c1", "c2"))
+    W, J = machine.W.grad, machine.J.grad
+    if b is None or c1 is None or W is None:
+        raise ValueError("centre_gradients needs the gradients of b, c1 and W")
+    before_b, before_c1 = b.clone(), c1.clone()
+    W.sub_(torch.outer(mu, before_c1)).sub_(torch.outer(before_b, lambda1))
+    b.sub_(W @ lambda1)
+    c1.sub_(mu @ W)
+    if J is None or c2 is None or not machine.spec.H2:
+        return
+    before_c2 = c2.clone()
+    J.sub_(torch.outer(lambda1, before_c2)).sub_(torch.outer(before_c1, lambda2))
+    c1.sub_(J @ lambda2)
+    c2.sub_(lambda1 @ J)

@@ -1,0 +1,321 @@
+"""One trainer for every machine and objective: updates, early stopping, checkpoints, curves.
+
+With one thread and the same seed two runs give bit-identical weights, whether or not either was
+interrupted and resumed at an epoch's end.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine, MachineSpec, Triway, build
+from training.batches import SceneTensors, seen_triples
+from training.checkpoints import load_checkpoint, save_checkpoint
+from training.config import Config
+from training.curves import Epoch, write_csv, write_plot
+from training.evaluation.missing import leave_one_out, machine_score
+from training.evaluation.reconstruction import reconstruction_error
+from training.evaluation.relations import machine_score as relation_score
+from training.evaluation.relations import rank_relations
+from training.objectives import OBJECTIVES, CompositeLikelihood
+
+_VALIDATION_SCENES = 400
+
+# Called after every update with (epoch, share of the epoch done, mean loss so far).
+Progress = Callable[[int, float, float], None]
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Tensors of the three parts, and what the machine's shape follows from."""
+
+    train: SceneTensors
+    validation: SceneTensors
+    test: SceneTensors
+    structure: Tensor
+    relations: int
+    room_types: int
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The machine with its best weights, the curve, and where the best epoch was."""
+
+    machine: BoltzmannMachine
+    epochs: list[Epoch]
+    best_epoch: int
+    seconds: float
+    finished: bool
+
+
+def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
+    """A machine at its starting weights: small random matrices, biases at the training frequencies."""
+    shape = config.machine
+    V = data.train.v.shape[1]
+    triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
+    spec = MachineSpec(
+        variant=shape.variant,
+        V=V,
+        A=data.relations,
+        H1=shape.H1,
+        H2=shape.H2,
+        C=data.room_types,
+        K=shape.K if shape.variant == "triway" else 0,
+        T=len(triples),
+        form=shape.form,
+    )
+    machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
+    with torch.no_grad():
+        annotated = data.train.annotated_classes[data.train.source].sum(0)
+        machine.b.copy_(log_odds_of(data.train.v.sum(0), annotated))
+        machine.c1.fill_(shape.initial_c1)
+        machine.Q.zero_()
+        _start_relations(machine, data.train)
+    return machine
+
+
+def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
+    """Smoothed log-odds of a frequency; 1/2 is added to both sides."""
+    return ((count + 0.5) / (total - count + 0.5)).log()
+
+
+def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
+    """Relation biases at the frequencies seen where relations were annotated."""
+    A = machine.spec.A
+    held, seen = torch.zeros(A), torch.zeros(A)
+    per_unit = torch.zeros(machine.spec.T)
+    V, annotated = machine.spec.V, 0
+    for scene in scenes.scenes:
+        e = scene.evidence
+        if not e.observed.any():
+            continue
+        annotated += 1
+        held += torch.from_numpy(e.holds.sum((1, 2)))
+        seen += torch.from_numpy(e.observed.sum((1, 2)))
+        if not isinstance(machine, Triway):
+            relation, subject, object_ = e.holds.nonzero()
+            keys = (relation * V + e.classes[subject]) * V + e.classes[object_]
+            place = torch.searchsorted(machine.triple_keys, torch.from_numpy(keys))
+            place = place.clamp(max=max(machine.spec.T - 1, 0))
+            if machine.spec.T:
+                per_unit[place[machine.triple_keys[place] == torch.from_numpy(keys)]] += 1
+    if isinstance(machine, Triway):
+        machine.d.copy_(log_odds_of(held, seen))
+    else:
+        machine.get_parameter("d").copy_(log_odds_of(per_unit, torch.full_like(per_unit, annotated)))
+
+
+class Trainer:
+    """Trains one configuration on one set of scenes.
+
+    Args:
+        config: what to train.
+        data: tensors of the split scenes.
+        folder: where `checkpoint.pt`, `curve.csv` and `curve.png` go; None keeps nothing.
+    """
+
+    def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
+        self.config, self.data, self.folder = config, data, folder
+        torch.set_num_threads(config.training.threads)
+        self.generator = torch.Generator().manual_seed(config.training.seed)
+        self.machine = new_machine(config, data, self.generator)
+        self.objective = OBJECTIVES[config.objective.name](config.objective, self.machine)
+        if isinstance(self.objective, CompositeLikelihood):
+            self.objective.structure = data.structure
+        self.optimiser = self._optimiser()
+        self.steps_per_epoch = max(1, math.ceil(len(data.train) / config.training.batch_size))
+        self.scheduler = self._scheduler()
+        self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
+        self.updates = 0
+        self.epochs: list[Epoch] = []
+        self.best: dict[str, Tensor] = {}
+        self.best_epoch, self.best_score = -1, -math.inf
+        self.seconds = 0.0
+
+    def _optimiser(self) -> torch.optim.Optimizer:
+        t = self.config.training
+        matrices, biases, residual = [], [], []
+        for name, parameter in self.machine.named_parameters():
+            if name == "kappa":
+                continue
+            group = residual if name == "residual" else biases if parameter.dim() == 1 else matrices
+            group.append(parameter)
+        groups = [
+            {"params": matrices, "weight_decay": t.weight_decay},
+            {"params": biases, "weight_decay": 0.0},
+            {"params": residual, "weight_decay": t.residual_decay},
+        ]
+        groups = [group for group in groups if group["params"]]
+        if t.optimiser == "sgd":
+            return torch.optim.SGD(groups, lr=t.learning_rate)
+        return torch.optim.AdamW(groups, lr=t.learning_rate)
+
+    def _scheduler(self) -> torch.optim.lr_scheduler.LRScheduler:
+        t = self.config.training
+        if t.schedule == "constant":
+            return torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda _: 1.0)
+        total = t.epochs * self.steps_per_epoch + 1
+        return torch.optim.lr_scheduler.OneCycleLR(
+            self.optimiser, t.learning_rate, total_steps=total, pct_start=0.1
+        )
+
+    # -- the run --------------------------------------------------------------------------------
+
+    def resume(self) -> bool:
+        """Go on from the folder's checkpoint; False where there is none.
+
+        Raises:
+            CheckpointError: the checkpoint is unreadable or of another configuration.
+        """
+        if self.folder is None or not (self.folder / "checkpoint.pt").exists():
+            return False
+        state = load_checkpoint(self.folder / "checkpoint.pt", self.config.digest)
+        self.machine.load_state_dict(state["machine"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.scheduler.load_state_dict(state["scheduler"])
+        self.objective.load_state(state["objective"])
+        self.generator.set_state(state["generator"])
+        self.average, self.best = state["average"], state["best"]
+        self.best_epoch, self.best_score = state["best_epoch"], state["best_score"]
+        self.updates, self.seconds = state["updates"], state["seconds"]
+        self.epochs = [Epoch(**row) for row in state["epochs"]]
+        return True
+
+    def run(self, progress: Progress | None = None) -> TrainingResult:
+        """Train to the last epoch or until patience runs out.
+
+        KeyboardInterrupt passes through; the last finished epoch is on disk by then.
+        """
+        while len(self.epochs) < self.config.training.epochs and not self._out_of_patience():
+            self._epoch(progress)
+            self._save()
+        parameters = dict(self.machine.named_parameters())
+        with torch.no_grad():
+            for name, value in self.best.items():
+                parameters[name].copy_(value)
+        return TrainingResult(self.machine, self.epochs, self.best_epoch, self.seconds, True)
+
+    def _out_of_patience(self) -> bool:
+        patience = self.config.training.patience
+        return patience is not None and len(self.epochs) - 1 - self.best_epoch >= patience
+
+    def _epoch(self, progress: Progress | None) -> None:
+        began = time.perf_counter()
+        number = len(self.epochs)
+        order = torch.randperm(len(self.data.train), generator=self.generator)
+        total = 0.0
+        size = self.config.training.batch_size
+        for step in range(self.steps_per_epoch):
+            batch = self.data.train.batch(order[step * size : (step + 1) * size])
+            total += self._update(batch)
+            if progress is not None:
+                progress(number, (step + 1) / self.steps_per_epoch, total / (step + 1))
+        loss = total / self.steps_per_epoch
+        if not math.isfinite(loss):
+            raise FloatingPointError(f"the loss of epoch {number} is {loss}: lower the learning rate")
+        self._close_epoch(number, loss, began)
+
+    def _update(self, batch: Any) -> float:
+        loss = self.objective.loss(self.machine, batch, self.generator)
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.objective.adjust_gradients(self.machine)
+        self.optimiser.step()
+        self.scheduler.step()
+        self.updates += 1
+        decay = self.config.training.averaging
+        if decay:
+            # A young average forgets its start faster (bias correction).
+            weight = 1 - min(decay, self.updates / (self.updates + 10))
+            for name, parameter in self.machine.named_parameters():
+                self.average[name].lerp_(parameter.detach(), weight)
+        return float(loss.detach())
+
+    @torch.no_grad()
+    def _close_epoch(self, number: int, loss: float, began: float) -> None:
+        """Measure the (averaged) weights on validation scenes and remember the best."""
+        parameters = dict(self.machine.named_parameters())
+        current = {name: p.detach().clone() for name, p in parameters.items()}
+        if self.config.training.averaging:
+            for name, p in parameters.items():
+                p.copy_(self.average[name])
+        mrr, precision = self._validate()
+        object_train, relation_train = reconstruction_error(self.machine, self.data.train)
+        object_val, relation_val = reconstruction_error(self.machine, self.data.validation)
+        score = mrr + (0.0 if math.isnan(precision) else precision)
+        if score > self.best_score:
+            self.best_score, self.best_epoch = score, number
+            self.best = {name: p.detach().clone() for name, p in parameters.items()}
+        for name, p in parameters.items():
+            p.copy_(current[name])
+        seconds = time.perf_counter() - began
+        self.seconds += seconds
+        self.epochs.append(
+            Epoch(
+                number, loss, object_train, relation_train, object_val, relation_val, mrr, precision,
+                seconds,
+            )
+        )  # fmt: skip
+
+    def _validate(self) -> tuple[float, float]:
+        """(MRR of removed objects, R-precision of relations) on a fixed part of validation."""
+        generator = torch.Generator().manual_seed(0)
+        pick = torch.randperm(len(self.data.validation), generator=generator)[:_VALIDATION_SCENES]
+        sample = subset(self.data.validation, pick)
+        result = leave_one_out(sample, self.data.structure, machine_score(self.machine))
+        mrr = float(result.reciprocal_rank().mean()) if len(result.target) else float("nan")
+        annotated = [
+            k
+            for k, scene in enumerate(self.data.validation.scenes)
+            if scene.evidence.holds.any()
+        ][:_VALIDATION_SCENES]
+        if not annotated:
+            return mrr, float("nan")
+        sample = subset(self.data.validation, torch.tensor(annotated))
+        ranking = rank_relations(
+            sample, self.data.structure, relation_score(self.machine, draws=16)
+        )
+        return mrr, float(ranking.hits.sum() / max(ranking.annotated.sum(), 1))
+
+    def _save(self) -> None:
+        if self.folder is None:
+            return
+        save_checkpoint(
+            self.folder / "checkpoint.pt",
+            {
+                "digest": self.config.digest,
+                "machine": self.machine.state_dict(),
+                "optimiser": self.optimiser.state_dict(),
+                "scheduler": self.scheduler.state_dict(),
+                "objective": self.objective.state(),
+                "generator": self.generator.get_state(),
+                "average": self.average,
+                "best": self.best,
+                "best_epoch": self.best_epoch,
+                "best_score": self.best_score,
+                "updates": self.updates,
+                "seconds": self.seconds,
+                "epochs": [asdict(epoch) for epoch in self.epochs],
+            },
+        )
+        write_csv(self.folder / "curve.csv", self.epochs)
+        write_plot(self.folder / "curve.png", self.epochs, self.config.name)
+
+
+def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
+    """The scenes at the given positions."""
+    return SceneTensors(
+        scenes=[scenes.scenes[k] for k in index.tolist()],
+        v=scenes.v[index],
+        room=scenes.room[index],
+        source=scenes.source[index],
+        annotated_classes=scenes.annotated_classes,
+    )
