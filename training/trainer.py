@@ -158,14 +158,20 @@ class Trainer:
             return torch.optim.SGD(groups, lr=t.learning_rate)
         return torch.optim.AdamW(groups, lr=t.learning_rate)
 
-    def _scheduler(self) -> torch.optim.lr_scheduler.LRScheduler:
+    def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
+        """One cycle: a linear rise over a tenth of the updates, then a cosine down to zero."""
         t = self.config.training
         if t.schedule == "constant":
             return torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda _: 1.0)
-        total = t.epochs * self.steps_per_epoch + 1
-        return torch.optim.lr_scheduler.OneCycleLR(
-            self.optimiser, t.learning_rate, total_steps=total, pct_start=0.1
-        )
+        total = t.epochs * self.steps_per_epoch
+        rise = max(1, total // 10)
+
+        def factor(step: int) -> float:
+            if step < rise:
+                return (step + 1) / rise
+            return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(total - rise, 1)))
+
+        return torch.optim.lr_scheduler.LambdaLR(self.optimiser, factor)
 
     # -- the run --------------------------------------------------------------------------------
 

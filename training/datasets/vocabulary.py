@@ -31,23 +31,28 @@ def build_vocabulary(
     """The classes that scenes mention often enough, most frequent first, and their aliases.
 
     Labels are pooled under their curated names before they are counted. The base classes of
-    ``names`` are in the vocabulary however seldom they are mentioned; labels of ``not_objects`` never
-    are, those of ``outdoor`` only on request. Aliases are the curated ones, and the spellings seen
-    that no normalisation finds. Room types are kept under the same minimum, counted in scenes.
+    ``names`` are in the vocabulary however seldom they are mentioned; labels of ``not_objects``
+    never are, those of ``outdoor`` only on request. Room types are kept under the same minimum,
+    counted in scenes.
 
     Raises:
         ValueError: no scene mentions any class often enough.
     """
-    mentions: Counter[str] = Counter()
+    spellings: dict[str, Counter[str]] = {}
     rooms: Counter[str] = Counter()
-    spelled: dict[str, str] = {}
     for scene in scenes:
         for thing in scene.objects:
             label = names.canonical(thing.label)
-            # Spellings with one key are one label: the first seen stands for all of them.
-            mentions[spelled.setdefault(label_key(label), label)] += 1
+            spellings.setdefault(label_key(label), Counter())[label] += 1
         if room := names.canonical_room(scene.room_type):
             rooms[room] += 1
+    # Spellings with one key are one label; the most common one stands for all of them.
+    mentions = Counter(
+        {
+            min(found, key=lambda label: (-found[label], label)): found.total()
+            for found in spellings.values()
+        }
+    )
     refused = {label_key(name) for name in names.not_objects}
     if not outdoor:
         refused |= {label_key(name) for name in names.outdoor}
@@ -78,9 +83,7 @@ def write_indoor_vocabulary(
         del entry["size"]
     lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in values["objects"])
     rooms = json.dumps(values["room_types"], ensure_ascii=False)
-    path.write_text(
-        f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n', encoding="utf-8"
-    )
+    path.write_text(f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n', encoding="utf-8")
     return vocabulary
 
 
@@ -108,7 +111,7 @@ def source_vocabulary(
 
 def _reachable(names: Names) -> dict[str, tuple[str, ...]]:
     """Aliases, with an entry for every curated class so that its spelling stays canonical."""
-    return {name: () for name in (*names.base, *names.structure)} | names.aliases
+    return dict.fromkeys((*names.base, *names.structure), ()) | names.aliases
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
@@ -133,10 +136,7 @@ def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene])
                 x, y, z = thing.size
                 boxes.setdefault(index, []).append(((x * y) ** 0.5, z))
     return Vocabulary(
-        [
-            _sized(entry, boxes.get(index, ()))
-            for index, entry in enumerate(vocabulary.objects)
-        ],
+        [_sized(entry, boxes.get(index, ())) for index, entry in enumerate(vocabulary.objects)],
         vocabulary.room_types,
     )
 

@@ -18,11 +18,11 @@ from training.batches import Batch, SceneTensors, relation_units
 def reconstruction_error(
     machine: BoltzmannMachine, scenes: SceneTensors, *, limit: int = 512, block: int = 64
 ) -> tuple[float, float]:
-    """(object error, relation error) over at most `limit` scenes; nan where nothing was annotated."""
+    """(object error, relation error) over `limit` random scenes; nan where nothing was annotated."""
     object_sum = relation_sum = 0.0
     objects = relations = 0
-    for start in range(0, min(len(scenes), limit), block):
-        index = torch.arange(start, min(start + block, len(scenes), limit))
+    chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:limit]
+    for index in chosen.split(block):
         batch = scenes.batch(index)
         error, error_r, units = _errors(machine, batch)
         object_sum, objects = object_sum + error, objects + batch.v.numel()

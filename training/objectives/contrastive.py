@@ -15,20 +15,20 @@ Boltzmann machines" (2016).
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
 from app.boltzmann import BoltzmannMachine
 from app.boltzmann.bernoulli import bernoulli
-from app.boltzmann.edges import Edges
-from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state, sample_relations
+from app.boltzmann.edges import Edges, PairEdges
+from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state
 from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
 from training.objectives.base import Objective, withhold_rooms
+
+_OFFSETS = ("offset_v", "offset_h1", "offset_h2")
 
 
 @torch.no_grad()
@@ -144,27 +144,28 @@ class PersistentCD(Objective):
     def _resume(self, machine: BoltzmannMachine, generator: torch.Generator) -> State:
         if self.chains is not None:
             return self.chains
-        rows = self.config.chains
-        v = bernoulli(machine.b.detach().sigmoid().expand(rows, -1), generator)
-        v = self.saved.get("v", v)
-        state = initial_state(machine, v, generator)
         if not self.saved:
-            return state
-        edges, r = sample_relations(machine, v, self.saved["h1"], generator)
-        return replace(state, h1=self.saved["h1"], h2=self.saved["h2"], edges=edges, r=r)
+            b = machine.b.detach().sigmoid().expand(self.config.chains, -1)
+            return initial_state(machine, bernoulli(b, generator), generator)
+        edges = machine.edges(self.saved["classes"])
+        return State(edges=edges, **{name: self.saved[name] for name in ("v", "h1", "h2", "r")})
 
     def state(self) -> dict[str, Tensor]:
-        """Offsets and the chains; their relations are drawn anew from (v, h1) on resuming."""
-        names = ("offset_v", "offset_h1", "offset_h2")
-        state = dict(zip(names, self.offsets, strict=True))
-        if self.chains is not None:
-            state |= {"v": self.chains.v, "h1": self.chains.h1, "h2": self.chains.h2}
-        return state
+        """The offsets, and the chains with the classes that their relations are laid out over."""
+        state = dict(zip(_OFFSETS, self.offsets, strict=True))
+        if self.chains is None:
+            return state
+        edges = self.chains.edges
+        classes = torch.zeros(1, 0, dtype=torch.int64)
+        if isinstance(edges, PairEdges):
+            classes = torch.where(edges.valid_subjects, edges.subjects, -1)
+        blocks = {name: getattr(self.chains, name) for name in ("v", "h1", "h2", "r")}
+        return state | blocks | {"classes": classes}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore the offsets and remember where the chains were."""
-        self.offsets = [state[name] for name in ("offset_v", "offset_h1", "offset_h2")]
-        self.saved = {name: state[name] for name in ("v", "h1", "h2") if name in state}
+        self.offsets = [state[name] for name in _OFFSETS]
+        self.saved = {name: value for name, value in state.items() if name not in _OFFSETS}
 
 
 @torch.no_grad()

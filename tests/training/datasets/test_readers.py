@@ -1,0 +1,517 @@
+"""Every reader, on small files of the official layout written here.
+
+A reader is tested by being listed: `LAYOUTS` must name every format of `READERS`.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from app.scene import CANONICAL
+from training.datasets import READERS, DatasetError, encode, indoor_vocabulary, read_scenes
+from training.datasets.readers import guess_format
+
+Write = Callable[[Path], Path]
+
+
+def write_json(path: Path, content: Any) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+# ------------------------------------------------------------------------------- JSON lines
+
+DESK_SCENE: dict[str, Any] = {
+    "scene_id": "a",
+    "source": "robot",
+    "group": "lab",
+    "room_type": "office",
+    "objects": [
+        {"id": 0, "label": "desk", "position": [2, 0, 0.4], "size": [0.8, 1.6, 0.8], "yaw": 0.0},
+        {"id": 1, "label": "monitor", "position": [2, 0, 1], "supported_by": 0},
+        {"id": "x", "label": "cup", "box2d": [1, 2, 3, 4]},
+    ],
+    "relations": [[1, "on-top", 0], ["x", "right", 1], ["x", "right", 1]],
+    "viewer_frame": True,
+}
+BARE_SCENE: dict[str, Any] = {"scene_id": "b", "objects": [{"id": 0, "label": "bed"}]}
+
+
+def write_jsonl(folder: Path) -> Path:
+    path = folder / "scenes.jsonl"
+    path.write_text(f"{json.dumps(DESK_SCENE)}\n\n{json.dumps(BARE_SCENE)}\n")
+    return path
+
+
+def test_jsonl(tmp_path: Path) -> None:
+    first, second = READERS["jsonl"](write_jsonl(tmp_path))
+    assert (first.scene_id, first.source, first.group) == ("a", "robot", "lab")
+    assert (first.room_type, first.viewer_frame) == ("office", True)
+    desk, monitor, cup = first.objects
+    assert (desk.id, desk.position, desk.size) == ("0", (2.0, 0.0, 0.4), (0.8, 1.6, 0.8))
+    assert (monitor.supported_by, monitor.size) == ("0", None)
+    assert (cup.id, cup.box2d) == ("x", (1.0, 2.0, 3.0, 4.0))
+    assert first.relations == ((1, "on-top", 0), (2, "right", 1))
+    assert (second.group, second.room_type, second.relations) == ("b", None, None)
+    assert second.viewer_frame is False
+
+
+def test_jsonl_gzipped(tmp_path: Path) -> None:
+    plain = write_jsonl(tmp_path)
+    packed = tmp_path / "packed.jsonl.gz"
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    assert read_scenes(packed) == read_scenes(plain)
+    packed.write_bytes(packed.read_bytes()[:-20])
+    with pytest.raises(DatasetError, match=r"packed\.jsonl\.gz: cannot be read"):
+        read_scenes(packed)
+
+
+def test_jsonl_of_known_sources(tmp_path: Path) -> None:
+    things = [{"id": 0, "label": "cup"}, {"id": 1, "label": "table"}]
+    lines = [
+        {"scene_id": "v", "source": "vrd", "objects": things,
+         "relations": [[0, "on the top of", 1], [0, "wear", 1], [1, "beneath", 1]]},
+        {"scene_id": "g", "source": "3dssg", "objects": things,
+         "relations": [[0, "lying on", 1], [1, "close by", 0], [1, "lower than", 0]]},
+        {"scene_id": "n", "source": "sunrgbd-bedroom-3d", "objects": things, "relations": None},
+    ]  # fmt: skip
+    path = tmp_path / "known.jsonl"
+    path.write_text("\n".join(map(json.dumps, lines)))
+    vrd, graph, bedroom = read_scenes(path)
+    assert vrd.relations == ((0, "on-top", 1),)
+    assert graph.relations == ((0, "on-top", 1), (1, "below", 0))
+    assert bedroom.relations is None
+    assert bedroom.viewer_frame is True
+
+
+def change(scene: dict[str, Any], **fields: Any) -> dict[str, Any]:
+    return scene | fields
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("{", "not JSON"),
+        ("[]", "a scene must be a JSON object, not list"),
+        ('{"scene_id": "a"}', "a scene lacks objects"),
+        (json.dumps(change(BARE_SCENE, scene_id=" ")), "scene_id must be a non-empty string"),
+        (json.dumps(change(BARE_SCENE, colour="red")), "unknown fields: colour"),
+        (json.dumps(change(BARE_SCENE, objects={})), "objects must be a list"),
+        (json.dumps(change(BARE_SCENE, objects=["bed"])), "an object must be a JSON object"),
+        (json.dumps(change(BARE_SCENE, objects=[{"id": 0}])), "an object lacks label"),
+        (json.dumps(change(BARE_SCENE, objects=[{"id": 0, "label": ""}])), "label must be"),
+        (json.dumps(change(BARE_SCENE, objects=[{"id": 1.5, "label": "a"}])), "an id must be"),
+        (json.dumps(change(BARE_SCENE, objects=BARE_SCENE["objects"] * 2)), "objects with one id"),
+        (json.dumps(change(BARE_SCENE, room_type=3)), "room_type must be"),
+        (json.dumps(change(BARE_SCENE, viewer_frame="yes")), "viewer_frame must be"),
+        (json.dumps(change(BARE_SCENE, relations={})), "relations must be a list or null"),
+        (json.dumps(change(BARE_SCENE, relations=[[0, "left"]])), "a relation is"),
+        (json.dumps(change(BARE_SCENE, relations=[[0, "left", 7]])), "not in the scene"),
+        (json.dumps(change(DESK_SCENE, relations=[[0, "near", 1]])), "unknown relation 'near'"),
+        *(
+            (json.dumps(change(BARE_SCENE, objects=[{"id": 0, "label": "a"} | extra])), message)
+            for extra, message in (
+                ({"position": [1, 2]}, "position must be a list of 3 numbers"),
+                ({"position": [1, 2, "3"]}, "position must be a list of 3 numbers"),
+                ({"position": [1, 2, math.inf]}, "position of '0' must be 3 finite"),
+                ({"size": [1, 2, 0]}, "size of '0' must be positive"),
+                ({"yaw": "north"}, "yaw must be a number"),
+                ({"yaw": math.nan}, "yaw of '0' must be finite"),
+                ({"box2d": [3, 0, 1, 1]}, "box2d of '0' must be"),
+                ({"supported_by": 9}, "'0' is supported by '9': no such id"),
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_malformed_jsonl(tmp_path: Path, line: str, message: str) -> None:
+    path = tmp_path / "scenes.jsonl"
+    path.write_text(f"{json.dumps(change(BARE_SCENE, scene_id='good'))}\n{line}\n")
+    with pytest.raises(DatasetError, match=message) as caught:
+        read_scenes(path)
+    assert caught.value.path == path
+    assert caught.value.where == "line 2"
+    assert str(path) in str(caught.value)
+
+
+def test_jsonl_with_a_scene_twice(tmp_path: Path) -> None:
+    path = tmp_path / "scenes.jsonl"
+    path.write_text(f"{json.dumps(BARE_SCENE)}\n" * 2)
+    with pytest.raises(DatasetError, match=r"line 2: scene 'b' is on line 1 already"):
+        read_scenes(path)
+
+
+# ------------------------------------------------------------------------------- 3DSSG
+
+RESCANS = [
+    {"reference": "room-1", "type": "train", "scans": [{"reference": "room-1b", "removed": []}]},
+    {"reference": "room-2", "type": "validation", "scans": []},
+]
+SPLITS = {
+    "scans": [
+        {
+            "scan": "room-1b",
+            "split": 2,
+            "objects": {"1": "floor", "4": "bed", "7": "pillow"},
+            "relationships": [
+                [7, 4, 15, "lying on"],
+                [4, 1, 14, "standing on"],
+                [7, 4, 1, "left"],
+                [4, 7, 2, "right"],
+                [7, 4, 5, "close by"],
+                [7, 7, 9, "bigger than"],
+            ],
+        }
+    ]
+}
+WHOLE = {
+    "scans": [{"scan": "room-2", "relationships": [["3", "2", 11, "higher than"]]}],
+}
+OBJECTS = {
+    "scans": [
+        {
+            "scan": "room-2",
+            "objects": [
+                {"global_id": "6", "label": "shelf", "id": "2", "ply_color": "#aec7e8"},
+                {"global_id": "7", "label": "picture", "id": "3", "attributes": {}},
+            ],
+        }
+    ]
+}
+
+
+def write_3dssg(folder: Path) -> Path:
+    write_json(folder / "3RScan.json", RESCANS)
+    return write_json(folder / "relationships_train.json", SPLITS)
+
+
+def test_3dssg_splits(tmp_path: Path) -> None:
+    (scene,) = READERS["3dssg"](write_3dssg(tmp_path))
+    assert (scene.scene_id, scene.group) == ("3dssg-room-1b-2", "3rscan-room-1")
+    assert [(thing.id, thing.label) for thing in scene.objects] == [
+        ("1", "floor"),
+        ("4", "bed"),
+        ("7", "pillow"),
+    ]
+    assert scene.relations == (
+        (2, "on-top", 1),
+        (1, "on-top", 0),
+        (2, "left", 1),
+        (1, "right", 2),
+    )
+    # Both spellings of one statement become one triple.
+    (encoded,) = encode([scene], indoor_vocabulary())
+    assert encoded.instance_holds.sum() == 2  # pillow on bed and left of it; the floor drops out
+
+
+def test_3dssg_whole(tmp_path: Path) -> None:
+    write_3dssg(tmp_path)
+    write_json(tmp_path / "objects.json", OBJECTS)
+    (scene,) = read_scenes(write_json(tmp_path / "relationships.json", WHOLE))
+    assert (scene.scene_id, scene.group) == ("3dssg-room-2", "3rscan-room-2")
+    assert [thing.label for thing in scene.objects] == ["shelf", "picture"]
+    assert scene.relations == ((1, "above", 0),)
+
+
+def test_3dssg_needs_its_companions(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "relationships.json", WHOLE)
+    with pytest.raises(DatasetError, match=r"3RScan\.json: cannot be read"):
+        read_scenes(path)
+    write_json(tmp_path / "3RScan.json", RESCANS)
+    with pytest.raises(DatasetError, match=r"objects\.json: cannot be read"):
+        read_scenes(path)
+    write_json(tmp_path / "objects.json", {"scans": []})
+    with pytest.raises(DatasetError, match=r"scans\[0\]: scan room-2 is not in objects\.json"):
+        read_scenes(path)
+    write_json(tmp_path / "3RScan.json", RESCANS[:1])
+    write_json(tmp_path / "objects.json", OBJECTS)
+    with pytest.raises(DatasetError, match=r"scans\[0\]: scan room-2 is not in 3RScan\.json"):
+        read_scenes(path)
+
+
+SCAN = SPLITS["scans"][0]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "must be an object, not list"),
+        ({}, "lacks 'scans'"),
+        ({"scans": {}}, "'scans' must be of type list"),
+        ({"scans": ["room-1"]}, r"scans\[0\]: must be an object"),
+        ({"scans": [SCAN | {"scan": 3}]}, r"scans\[0\]: 'scan' must be of type str"),
+        ({"scans": [SCAN | {"objects": []}]}, r"scans\[0\]: 'objects' must be of type dict"),
+        ({"scans": [SCAN | {"objects": {"1": ""}, "relationships": []}]}, "empty label"),
+        ({"scans": [{**SCAN, "relationships": 1}]}, "'relationships' must be of type list"),
+        ({"scans": [SCAN | {"relationships": [[7, 4]]}]}, r"relationships\[0\]: must be \[subject"),
+        ({"scans": [SCAN | {"relationships": [[9, 4, 1, "left"]]}]}, "not in the scan"),
+        ({"scans": [SCAN, SCAN]}, r"scans\[1\]: scene 3dssg-room-1b-2 is listed twice"),
+    ],
+)
+def test_malformed_3dssg(tmp_path: Path, content: Any, message: str) -> None:
+    path = write_3dssg(tmp_path)
+    write_json(path, content)
+    with pytest.raises(DatasetError, match=message) as caught:
+        read_scenes(path)
+    assert caught.value.path == path
+
+
+# ------------------------------------------------------------------------------- SUN RGB-D
+
+HALF_TURN = math.radians(30)
+BOXES = [
+    {
+        "basis": np.eye(3),
+        "coeffs": np.array([[1.0, 0.5, 0.4]]),
+        "centroid": np.array([[0.5, 3.0, -0.6]]),
+        "classname": "bed",
+        "orientation": np.array([[0.0, -1.0, 0.0]]),
+        "label": np.array([[1]]),
+    },
+    {
+        # Turned by 30 degrees against the clock, seen from above; a negative half extent occurs.
+        "basis": np.array(
+            [
+                [math.cos(HALF_TURN), math.sin(HALF_TURN), 0.0],
+                [-math.sin(HALF_TURN), math.cos(HALF_TURN), 0.0],
+                [0.0, 0.0, 1.0],
+            ]
+        ),
+        "coeffs": np.array([[-0.2, 0.3, 0.25]]),
+        "centroid": np.array([[1.2, 2.5, -0.7]]),
+        "classname": "night_stand",
+        "orientation": np.array([[0.0, -1.0, 0.0]]),
+        "label": np.array([[2]]),
+    },
+]
+
+
+def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
+    """A 1 x n MATLAB struct array."""
+    if not entries:
+        return np.zeros((0, 0))
+    array = np.empty((1, len(entries)), dtype=[(name, object) for name in entries[0]])
+    for column, entry in enumerate(entries):
+        array[0, column] = tuple(entry.values())
+    return array
+
+
+def frame(name: str, boxes: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "sequenceName": name,
+        "groundtruth3DBB": struct_array(boxes),
+        "Rtilt": np.eye(3),
+        "K": np.eye(3),
+        "depthpath": f"{name}/depth/1.png",
+        "rgbpath": f"{name}/image/1.jpg",
+        "sensorType": "kv2",
+        "valid": np.array([[1]]),
+    }
+
+
+def write_mat(folder: Path) -> Path:
+    path = folder / "SUNRGBDMeta3DBB_v2.mat"
+    frames = [
+        frame("SUNRGBD/kv2/kinect2data/0001", BOXES),
+        frame("SUNRGBD/kv2/kinect2data/0002", []),
+        frame("SUNRGBD/kv2/kinect2data/0003", BOXES[:1]),
+        frame("SUNRGBD/xtion/sun3ddata/brown_1/f1/", BOXES[:1]),
+        frame("SUNRGBD/xtion/sun3ddata/brown_1/f2/", BOXES[:1]),
+    ]
+    room = folder / "SUNRGBD/kv2/kinect2data/0001"
+    room.mkdir(parents=True, exist_ok=True)
+    (room / "scene.txt").write_text("bedroom")
+    savemat(path, {"SUNRGBDMeta": struct_array(frames)})
+    return path
+
+
+def test_sunrgbd_mat(tmp_path: Path) -> None:
+    scenes = READERS["sunrgbd-mat"](write_mat(tmp_path))
+    assert [scene.scene_id.rpartition("/")[2] for scene in scenes] == ["0001", "0003", "f1", "f2"]
+    assert [scene.room_type for scene in scenes] == ["bedroom", None, None, None]
+    first, second, brown, brown_again = (scene.group for scene in scenes)
+    assert first == second != brown == brown_again
+    assert all(scene.viewer_frame for scene in scenes)
+    bed, stand = scenes[0].objects
+    assert (bed.label, stand.label) == ("bed", "night_stand")
+    # 3 m away and half a metre to the right: x away, y left.
+    assert bed.position == (3.0, -0.5, -0.6)
+    assert stand.size == pytest.approx((0.4, 0.6, 0.5))
+    assert corners(bed) == pytest.approx(expected_corners(BOXES[0]))
+    assert corners(stand) == pytest.approx(expected_corners(BOXES[1]))
+
+
+def corners(thing: Any) -> list[tuple[float, float]]:
+    (x, y, _), (width, depth, _) = thing.position, thing.size
+    cos, sin = math.cos(thing.yaw), math.sin(thing.yaw)
+    return sorted(
+        (round(x + cos * u - sin * v, 6), round(y + sin * u + cos * v, 6))
+        for u in (-width / 2, width / 2)
+        for v in (-depth / 2, depth / 2)
+    )
+
+
+def expected_corners(box: dict[str, Any]) -> list[tuple[float, float]]:
+    """Corners straight from the definition: centroid plus signed half extents along the basis."""
+    found = []
+    for u in (-1, 1):
+        for v in (-1, 1):
+            x, y, _ = box["centroid"][0] + np.array([u, v, 0]) * box["coeffs"][0] @ box["basis"]
+            found.append((round(float(y), 6), round(float(-x), 6)))
+    return sorted(found)
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ({"coeffs": np.array([[1.0, 0.5]])}, r"coeffs must be finite, of shape \(3,\)"),
+        ({"coeffs": np.array([[1.0, 0.5, 0.0]])}, "must be positive"),
+        ({"centroid": np.array([[1.0, math.nan, 0.0]])}, "centroid must be finite"),
+        ({"basis": "none"}, "basis is not numeric"),
+        ({"classname": ""}, "empty label"),
+        (None, "lacks the field classname"),
+    ],
+)
+def test_malformed_sunrgbd_mat(tmp_path: Path, box: Any, message: str) -> None:
+    broken = BOXES[0] | box if box else {k: v for k, v in BOXES[0].items() if k != "classname"}
+    path = tmp_path / "SUNRGBDMeta3DBB_v2.mat"
+    savemat(path, {"SUNRGBDMeta": struct_array([frame("SUNRGBD/kv2/a/1", [broken])])})
+    with pytest.raises(DatasetError, match=message) as caught:
+        read_scenes(path)
+    assert caught.value.where == "SUNRGBDMeta(1).groundtruth3DBB(1)"
+
+
+def test_mat_files_of_other_content(tmp_path: Path) -> None:
+    path = tmp_path / "other.mat"
+    savemat(path, {"data": np.eye(2)})
+    with pytest.raises(DatasetError, match="holds no variable SUNRGBDMeta"):
+        read_scenes(path)
+    savemat(path, {"SUNRGBDMeta": struct_array([{"K": np.eye(3)}])})
+    with pytest.raises(DatasetError, match=r"SUNRGBDMeta\(1\): lacks the field sequenceName"):
+        read_scenes(path)
+
+
+# ------------------------------------------------------------------------------- COCO
+
+COCO: dict[str, Any] = {
+    "images": [
+        {"id": 9, "file_name": "9.jpg", "width": 640, "height": 480},
+        {"id": 4, "file_name": "4.jpg", "width": 640, "height": 480},
+    ],
+    "categories": [{"id": 62, "name": "chair"}, {"id": 67, "name": "dining table"}],
+    "annotations": [
+        {"id": 1, "image_id": 9, "category_id": 62, "bbox": [10, 100, 50, 80], "iscrowd": 0},
+        {"id": 2, "image_id": 9, "category_id": 67, "bbox": [90, 110, 100.5, 60], "iscrowd": 0},
+        {"id": 3, "image_id": 9, "category_id": 62, "bbox": [0, 0, 640, 480], "iscrowd": 1},
+    ],
+}
+
+
+def write_coco(folder: Path) -> Path:
+    return write_json(folder / "instances_val2017.json", COCO)
+
+
+def test_coco(tmp_path: Path) -> None:
+    (scene,) = READERS["coco"](write_coco(tmp_path))
+    assert (scene.scene_id, scene.relations) == ("coco-9", None)
+    assert [(thing.label, thing.box2d) for thing in scene.objects] == [
+        ("chair", (10.0, 100.0, 60.0, 180.0)),
+        ("dining table", (90.0, 110.0, 190.5, 170.0)),
+    ]
+    (encoded,) = encode([scene], indoor_vocabulary())
+    assert np.argwhere(encoded.instance_holds).tolist() == [[CANONICAL.index("left"), 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "must be an object"),
+        ({"images": [], "annotations": []}, "lacks 'categories'"),
+        (COCO | {"categories": [{"id": 62}]}, r"categories\[0\]: lacks 'name'"),
+        (COCO | {"images": []}, r"annotations\[0\]: image_id 9 is not among the images"),
+        (COCO | {"categories": []}, r"annotations\[0\]: category_id 62 is not among"),
+        *(
+            (COCO | {"annotations": [COCO["annotations"][0] | extra]}, message)
+            for extra, message in (
+                ({"bbox": [1, 2, 3]}, r"annotations\[0\]: bbox must be"),
+                ({"bbox": [1, 2, -3, 4]}, "bbox must be"),
+                ({"bbox": [1, 2, 3, "4"]}, "bbox must be"),
+                ({"id": "first"}, "'id' must be of type int"),
+            )
+        ),
+        (COCO | {"annotations": COCO["annotations"][:1] * 2}, "two annotations with one id"),
+    ],
+)
+def test_malformed_coco(tmp_path: Path, content: Any, message: str) -> None:
+    path = write_json(tmp_path / "instances.json", content)
+    with pytest.raises(DatasetError, match=message) as caught:
+        read_scenes(path)
+    assert caught.value.path == path
+
+
+# ------------------------------------------------------------------------------- all of them
+
+LAYOUTS: dict[str, Write] = {
+    "jsonl": write_jsonl,
+    "3dssg": write_3dssg,
+    "sunrgbd-mat": write_mat,
+    "coco": write_coco,
+}
+
+
+def test_every_reader_is_tested() -> None:
+    assert set(LAYOUTS) == set(READERS)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_readers_are_found_by_file_name(name: str, tmp_path: Path) -> None:
+    path = LAYOUTS[name](tmp_path)
+    assert guess_format(path) == name
+    scenes = read_scenes(path)
+    assert scenes
+    assert scenes == READERS[name](path)
+    assert len({(scene.source, scene.scene_id) for scene in scenes}) == len(scenes)
+    assert all(scene.group for scene in scenes)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_read_can_be_encoded(name: str, tmp_path: Path) -> None:
+    vocabulary = indoor_vocabulary()
+    scenes = read_scenes(LAYOUTS[name](tmp_path))
+    for scene, encoded in zip(scenes, encode(scenes, vocabulary), strict=True):
+        assert encoded.unknown == 0
+        assert len(encoded.instance_classes) == len(scene.objects)
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("content", [b"", b"\x00\xff\xfe nonsense", b"[1, 2"])
+def test_files_of_nonsense(name: str, content: bytes, tmp_path: Path) -> None:
+    path = LAYOUTS[name](tmp_path)
+    path.write_bytes(content)
+    if name == "jsonl" and not content:
+        assert read_scenes(path) == []
+        return
+    with pytest.raises(DatasetError, match="(?i)" + path.name) as caught:
+        read_scenes(path)
+    assert caught.value.problem
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_missing_files(name: str, tmp_path: Path) -> None:
+    path = LAYOUTS[name](tmp_path)
+    path.unlink()
+    with pytest.raises(DatasetError, match=path.name):
+        read_scenes(path)
+
+
+def test_unknown_file_names(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="the name fits no known format"):
+        read_scenes(tmp_path / "scenes.csv")

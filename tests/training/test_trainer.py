@@ -1,0 +1,118 @@
+"""The trainer on generated rooms: determinism, resuming, early stopping, the files of a run."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+import torch
+
+from app.boltzmann import Triway
+from training.checkpoints import CheckpointError
+from training.config import Config
+from training.pipeline import prepare
+from training.runs import RunError, load_run, save_run
+from training.trainer import Trainer
+
+
+def small_config(**training) -> Config:
+    return Config.model_validate(
+        {
+            "name": "small-triway",
+            "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 150},
+            "machine": {"variant": "triway", "form": "local", "H1": 12, "H2": 6, "K": 4},
+            "objective": {"name": "composite", "relation_weight": 0.1},
+            "training": {"epochs": 3, "batch_size": 32, "averaging": 0.9, **training},
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return prepare(small_config(), tmp_path_factory.mktemp("none")).training_data()
+
+
+def weights(machine):
+    return {name: p.clone() for name, p in machine.named_parameters()}
+
+
+def same(first, second):
+    return all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_same_seed_gives_the_same_bits_and_another_seed_does_not(data):
+    first = weights(Trainer(small_config(), data).run().machine)
+    assert same(first, weights(Trainer(small_config(), data).run().machine))
+    assert not same(first, weights(Trainer(small_config(seed=1), data).run().machine))
+
+
+class Interrupt:
+    """Raises KeyboardInterrupt in the middle of the second epoch, as ctrl-C does."""
+
+    def __call__(self, epoch, done, loss):
+        if epoch == 1 and done > 0.4:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("objective", ["composite", "persistent_cd"])
+def test_an_interrupted_run_resumes_to_the_same_bits(data, tmp_path, objective):
+    config = small_config()
+    config = config.model_copy(
+        update={"objective": config.objective.model_copy(update={"name": objective, "chains": 16})}
+    )
+    whole = Trainer(config, data).run()
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(config, data, tmp_path).run(Interrupt())
+    again = Trainer(config, data, tmp_path)
+    assert again.resume()
+    assert len(again.epochs) == 1
+    assert same(weights(whole.machine), weights(again.run().machine))
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(data, tmp_path):
+    Trainer(small_config(epochs=1), data, tmp_path).run()
+    with pytest.raises(CheckpointError, match="another configuration"):
+        Trainer(small_config(epochs=2), data, tmp_path).resume()
+
+
+def test_a_broken_checkpoint_is_refused(data, tmp_path):
+    (tmp_path / "checkpoint.pt").write_bytes(b"not a checkpoint")
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        Trainer(small_config(), data, tmp_path).resume()
+
+
+def test_the_curve_has_objects_and_relations_separately(data, tmp_path):
+    Trainer(small_config(epochs=10, learning_rate=0.03), data, tmp_path).run()
+    with (tmp_path / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["epoch"] for row in rows] == [str(n) for n in range(10)]
+    for unit in ("object", "relation"):
+        errors = [float(row[f"{unit}_error_validation"]) for row in rows]
+        assert all(0 < error < 1 for error in errors)
+        assert errors[-1] < errors[0]
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_patience_ends_a_run_early(data):
+    config = small_config(epochs=30, patience=1, learning_rate=1e-9, averaging=0.0)
+    result = Trainer(config, data).run()
+    assert len(result.epochs) < 30
+    assert result.best_epoch < len(result.epochs)
+
+
+def test_a_diverging_run_says_so(data):
+    with pytest.raises(FloatingPointError, match="learning rate"):
+        Trainer(small_config(optimiser="sgd", learning_rate=1e30), data).run()
+
+
+def test_a_finished_run_is_read_back(data, tmp_path):
+    config = small_config()
+    result = Trainer(config, data, tmp_path).run()
+    with pytest.raises(RunError, match="no finished run"):
+        load_run(tmp_path)
+    save_run(tmp_path, config, result)
+    run = load_run(tmp_path)
+    assert run.config == config
+    assert isinstance(run.machine, Triway)
+    assert same(weights(result.machine), weights(run.machine))
+    assert run.epochs == 3

@@ -1,0 +1,284 @@
+"""From log-odds to the probabilities the service promises, fitted on validation scenes.
+
+    missing    softmax(log-odds / T): the class that was taken away, given that exactly one was
+    placed     softmax(log-odds / T + w·log p(relation to the anchor)): given where it stood as well
+    outlier    the object is an intruder, where half of the scenes are clean
+    relation   an annotator would list this relation for this pair of instances
+    misplaced  the relation is false, where one triple in half of the scenes was altered
+
+Temperatures minimise the negative log-likelihood; the others are logistic regressions (Platt scaling).
+
+Sources: Platt, "Probabilistic outputs for support vector machines" (1999); Guo, Pleiss, Sun and
+Weinberger, "On calibration of modern neural networks" (2017).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize, minimize_scalar
+from sklearn.linear_model import LogisticRegression
+
+from app.reasoning import missing, outliers
+from app.registry import Artifact, Calibration, CountSlope, Slope
+from app.scene import CANONICAL, Scene, SceneObject
+from training.batches import SceneTensors
+from training.datasets import EncodedScene
+from training.evaluation.missing import ObjectScore, leave_one_out, machine_score
+from training.evaluation.outliers import IntruderScores, intruder_scores
+from training.evaluation.relations import machine_score as relation_score
+from training.trainer import subset
+
+# An alarm in at most 5 % of untouched scenes is promised; the margin is for scenes not seen here.
+_ALARM_SHARE = 0.035
+_SCENES = 800
+_PLACED_EXAMPLES = 300
+_MISPLACED_SCENES = 300
+
+
+def calibrate(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> Calibration:
+    """Fit every entry of the calibration.
+
+    Args:
+        artifact: with the neutral calibration.
+        scenes: validation scenes.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    pick = torch.randperm(len(scenes), generator=generator)
+    sample = subset(scenes, pick[:_SCENES])
+    annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
+    related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64))
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    score = machine_score(artifact.machine)
+    outlier, threshold = fit_outlier(intruder_scores(sample, structure, score, seed=seed), seed)
+    calibration = Calibration.neutral(artifact.machine.spec.A).model_copy(
+        update={
+            "missing_temperature": fit_missing(sample, structure, score),
+            "outlier": outlier,
+            "outlier_threshold": threshold,
+        }
+    )
+    if not len(related):
+        return calibration
+    temperature, weight = fit_placed(artifact, related.scenes[:_PLACED_EXAMPLES], seed)
+    return calibration.model_copy(
+        update={
+            "placed_temperature": temperature,
+            "placed_relation_weight": weight,
+            "relation": fit_relations(artifact, related),
+            "misplaced": fit_misplaced(artifact, related.scenes[:_MISPLACED_SCENES], seed),
+        }
+    )
+
+
+def fit_missing(scenes: SceneTensors, structure: torch.Tensor, score: ObjectScore) -> float:
+    """The temperature of least negative log-likelihood of the removed class."""
+
+    def nll(log_temperature: float) -> float:
+        temperature = float(np.exp(log_temperature))
+        result = leave_one_out(scenes, structure, lambda v: score(v) / temperature)
+        return -float(result.log_probability.mean())
+
+    found = minimize_scalar(nll, bounds=(-1.0, 1.5), method="bounded", options={"xatol": 0.02})
+    return float(np.exp(found.x))
+
+
+def fit_outlier(scores: IntruderScores, seed: int = 0) -> tuple[CountSlope, float]:
+    """Logistic regression of "is the intruder", half of the scenes clean, and the alarm threshold."""
+    rng = np.random.default_rng(seed)
+    clean_scene = rng.random(int(scores.scene.max()) + 1) < 0.5
+    used = scores.clean == clean_scene[scores.scene]
+    features = np.stack([scores.log_odds, np.log(scores.size)], 1)
+    slope, size, intercept = _logistic(features[used], scores.intruder[used])
+    entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
+    logits = intercept + features @ np.array([slope, size])
+    worst = [
+        logits[(scores.scene == scene) & scores.clean].max()
+        for scene in np.unique(scores.scene[scores.clean])
+    ]
+    return entry, float(_sigmoid(np.quantile(worst, 1 - _ALARM_SHARE)))
+
+
+def fit_relations(artifact: Artifact, scenes: SceneTensors) -> tuple[CountSlope, ...]:
+    """Per canonical relation, from class-level log-odds to instance pairs."""
+    score = relation_score(artifact.machine)
+    structure = artifact.vocabulary.structure
+    rows: list[list[NDArray[np.float64]]] = [[] for _ in range(artifact.machine.spec.A)]
+    for start in range(0, len(scenes), 32):
+        index = torch.arange(start, min(start + 32, len(scenes)))
+        with torch.no_grad():
+            values = score(scenes.batch(index)).double().numpy()
+        for row, k in enumerate(index.tolist()):
+            for a, examples in enumerate(_instance_pairs(scenes.scenes[k], values[row], structure)):
+                rows[a].append(examples)
+    return tuple(_fit_relation(np.concatenate(examples)) for examples in rows)
+
+
+def _instance_pairs(
+    scene: EncodedScene, values: NDArray[np.float64], structure: NDArray[np.bool_]
+) -> list[NDArray[np.float64]]:
+    """Per relation, (pairs, 3): class log-odds, log n_i + log n_j, and whether it was listed."""
+    evidence = scene.evidence
+    place = np.searchsorted(evidence.classes, scene.instance_classes)
+    logs = np.log(evidence.counts[place])
+    usable = ~structure[scene.instance_classes]
+    pair = usable[:, None] & usable[None, :] & ~np.eye(len(place), dtype=np.bool_)
+    both = logs[:, None] + logs[None, :]
+    examples = []
+    for a in range(len(values)):
+        logit = values[a][place[:, None], place[None, :]]
+        kept = pair & scene.instance_observed[a] & np.isfinite(logit)
+        examples.append(np.stack([logit[kept], both[kept], scene.instance_holds[a][kept]], 1))
+    return examples
+
+
+def _fit_relation(examples: NDArray[np.float64]) -> CountSlope:
+    if len(np.unique(examples[:, 2])) < 2:
+        return CountSlope()
+    slope, count, intercept = _logistic(examples[:, :2], examples[:, 2] > 0)
+    return CountSlope(intercept=intercept, slope=slope, log_count=count)
+
+
+def fit_placed(
+    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+) -> tuple[float, float]:
+    """Temperature and relation weight for the missing object with a known place."""
+    rng = np.random.default_rng(seed)
+    alone, both, targets = [], [], []
+    label = {name: k for k, name in enumerate(artifact.vocabulary.labels)}
+    for encoded in scenes:
+        case = placed_case(encoded, artifact.vocabulary.structure, rng)
+        if case is None:
+            continue
+        scene, at, target = case
+        columns = []
+        for weight in (0.0, 1.0):
+            answers = missing(_with(artifact, placed_relation_weight=weight), scene,
+                              top_k=len(label), at=at)  # fmt: skip
+            column = np.full(len(label), -np.inf)
+            for answer in answers:
+                column[label[answer.label]] = np.log(max(answer.probability, 1e-300))
+            columns.append(column)
+        alone.append(columns[0])
+        both.append(columns[1])
+        targets.append(target)
+    if len(targets) < 10:
+        return 1.0, 1.0
+    base, joint, truth = np.stack(alone), np.stack(both), np.array(targets)
+    # Differences of the two softmaxes are the relation's log-probability, up to a constant a row.
+    finite = np.isfinite(base)
+    gain = np.where(finite, joint, 0.0) - np.where(finite, base, 0.0)
+
+    def nll(x: NDArray[np.float64]) -> float:
+        logits = np.where(finite, np.where(finite, base, 0.0) / np.exp(x[0]) + x[1] * gain, -np.inf)
+        top = logits.max(1, keepdims=True)
+        total = np.log(np.exp(logits - top).sum(1)) + top[:, 0]
+        return float((total - logits[np.arange(len(truth)), truth]).mean())
+
+    found = minimize(nll, np.array([0.0, 1.0]), method="Nelder-Mead")
+    return float(np.exp(found.x[0])), float(found.x[1])
+
+
+def placed_case(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[Scene, tuple[str, int], int] | None:
+    """A scene with one class taken out, and one relation of it to something that stayed."""
+    evidence = encoded.evidence
+    usable = ~structure[evidence.classes]
+    pairs = evidence.holds & usable[:, None] & usable[None, :]
+    pairs &= ~np.eye(len(usable), dtype=np.bool_)
+    found = np.argwhere(pairs)
+    if usable.sum() < 3 or not len(found):
+        return None
+    a, x, y = found[rng.integers(len(found))]
+    kept = [k for k, c in enumerate(encoded.instance_classes) if c != evidence.classes[x]]
+    scene = scene_of(encoded, kept, triples=())
+    anchor = next(
+        p for p, k in enumerate(kept) if encoded.instance_classes[k] == evidence.classes[y]
+    )
+    return scene, (CANONICAL[a], anchor), int(evidence.classes[x])
+
+
+def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Slope:
+    """Logistic regression of "this relation is false" on its log-odds given the rest."""
+    rng = np.random.default_rng(seed)
+    rows: list[tuple[float, bool]] = []
+    for encoded in scenes:
+        case = altered_case(encoded, artifact.vocabulary.structure, rng)
+        if case is None:
+            continue
+        scene, false = case
+        _, misplaced = outliers(artifact, scene)
+        for answer in misplaced:
+            p = np.clip(answer.probability, 1e-9, 1 - 1e-9)
+            triple = (CANONICAL.index(answer.relation), answer.subject, answer.object)
+            rows.append((float(np.log(p / (1 - p))), triple == false))
+    examples = np.array(rows)
+    if len(examples) < 20 or len(np.unique(examples[:, 1])) < 2:
+        return Slope()
+    slope, intercept = _logistic(examples[:, :1], examples[:, 1] > 0)
+    return Slope(intercept=intercept, slope=slope)
+
+
+def altered_case(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[Scene, tuple[int, int, int] | None] | None:
+    """A scene with its triples; in half of them one was replaced by one that is not true there."""
+    usable = ~structure[encoded.instance_classes]
+    holds = encoded.instance_holds & usable[:, None] & usable[None, :]
+    triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(holds)]
+    if len(triples) < 2:
+        return None
+    if len(triples) > 40:
+        chosen = sorted(rng.choice(len(triples), 40, replace=False).tolist())
+        triples = [triples[k] for k in chosen]
+    everything = range(len(encoded.instance_classes))
+    if rng.random() < 0.5:
+        return scene_of(encoded, everything, triples), None
+    place = int(rng.integers(len(triples)))
+    for _ in range(50):
+        a, i, j = triples[place]
+        if rng.random() < 0.5:
+            a = int(rng.integers(len(CANONICAL)))
+        else:
+            j = int(rng.integers(len(usable)))
+        if i == j or not usable[j] or holds[a, i, j] or holds[a, j, i]:
+            continue
+        altered = [*triples[:place], (a, i, j), *triples[place + 1 :]]
+        return scene_of(encoded, everything, altered), (a, i, j)
+    return None
+
+
+def scene_of(
+    encoded: EncodedScene,
+    kept: Sequence[int],
+    triples: Sequence[tuple[int, int, int]],
+) -> Scene:
+    """The instances at the given positions as a request would give them."""
+    objects = tuple(
+        SceneObject(id=str(k), label=str(c), class_index=int(c))
+        for k, c in enumerate(encoded.instance_classes[list(kept)])
+    )
+    room = encoded.room_type
+    return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
+
+
+def _with(artifact: Artifact, **changes: float) -> Artifact:
+    calibration = artifact.calibration.model_copy(update=changes)
+    return dataclasses.replace(artifact, calibration=calibration)
+
+
+def _logistic(features: NDArray[np.float64], truth: NDArray[np.bool_]) -> list[float]:
+    """Coefficients and intercept of an (almost) unpenalised logistic regression."""
+    fit = LogisticRegression(C=1e6, max_iter=1000).fit(features, truth)
+    return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]
+
+
+def _sigmoid(x: float) -> float:
+    return float(1 / (1 + np.exp(-x)))
+
+

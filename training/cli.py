@@ -1,0 +1,229 @@
+"""The command line: train, evaluate, publish, list.
+
+Ctrl-C during training leaves a checkpoint of the last finished epoch; the same command goes on from it.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import torch
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from app.registry import RegistryError, Store, load_model_set
+from training.baselines.bernoulli_rbm import fit_bernoulli_rbm
+from training.checkpoints import CheckpointError
+from training.config import Config, ConfigError, load_config, shipped_configs
+from training.datasets import DatasetError
+from training.evaluation.report import Row, by_source, evaluate, missing_rows
+from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
+from training.publish import publish_run
+from training.runs import RunError, load_run, save_run
+from training.trainer import Trainer, subset
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
+console = Console()
+
+Data = Annotated[Path, typer.Option("--data", help="folder with the scene files")]
+Runs = Annotated[Path, typer.Option("--runs", help="folder for training runs")]
+StorePath = Annotated[Path, typer.Option("--store", help="the model store")]
+Alias = Annotated[str | None, typer.Option("--alias", help="point this alias at it afterwards")]
+_DATA, _RUNS, _STORE = Path("../shared/data"), Path("runs"), Path("model_store")
+
+
+@app.command()
+def train(
+    configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
+    data: Data = _DATA,
+    runs: Runs = _RUNS,
+    seed: Annotated[int | None, typer.Option(help="in place of the configuration's")] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="ignore a checkpoint")] = False,
+    publish: Annotated[str | None, typer.Option(help="publish as this version")] = None,
+    alias: Alias = None,
+    store: StorePath = _STORE,
+) -> None:
+    """Train a configuration; with --publish also calibrate, evaluate and publish it."""
+    try:
+        config = load_config(configuration, seed=seed)
+        scenes = _prepare(config, data)
+        folder = runs / config.name / f"seed-{config.training.seed}"
+        _train(config, scenes, folder, fresh)
+        if publish is not None:
+            _publish(folder, scenes, store, publish, alias)
+    except (ConfigError, DatasetError, CheckpointError, RegistryError, FloatingPointError) as error:
+        _fail(error)
+
+
+@app.command()
+def publish(
+    folder: Annotated[Path, typer.Argument(help="a finished run")],
+    version: Annotated[str, typer.Argument(help="such as 1.0.0")],
+    data: Data = _DATA,
+    store: StorePath = _STORE,
+    alias: Alias = None,
+) -> None:
+    """Calibrate, evaluate and publish a finished run."""
+    try:
+        scenes = _prepare(load_run(folder).config, data)
+        _publish(folder, scenes, store, version, alias)
+    except (RunError, ConfigError, DatasetError, RegistryError) as error:
+        _fail(error)
+
+
+@app.command(name="evaluate")
+def evaluate_command(
+    models: Annotated[list[str], typer.Argument(help="aliases, names or name@version")],
+    data: Data = _DATA,
+    store: StorePath = _STORE,
+    source: Annotated[list[str] | None, typer.Option(help="only these sources")] = None,
+    part: Annotated[str, typer.Option(help="train, validation or test")] = "test",
+    baseline: Annotated[bool, typer.Option(help="train scikit-learn's BernoulliRBM too")] = False,
+    output: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
+) -> None:
+    """Evaluate stored models on the split they were trained with; T1a, T2 and T3."""
+    try:
+        tables: dict[str, list[Row]] = {}
+        for reference in models:
+            artifact = Store(store).load(*Store(store).resolve(reference))
+            config = Config.model_validate(artifact.manifest.training["config"])
+            chosen = tuple(source) if source else config.data.sources
+            wanted = config.data.model_copy(update={"sources": chosen})
+            with console.status("reading scenes"):
+                # All sources take part in the split, so that the parts are those of training.
+                scenes = split_and_encode(
+                    config.data, read_sources(config.data, data), artifact.vocabulary
+                )
+            tensors = scenes.training_data()
+            some = {"train": tensors.train, "validation": tensors.validation, "test": tensors.test}
+            if part not in some:
+                raise ConfigError(f"part must be one of {', '.join(some)}, not {part!r}")
+            index = [
+                k for k, scene in enumerate(some[part].scenes) if scene.source in wanted.sources
+            ]
+            test = subset(some[part], torch.tensor(index, dtype=torch.int64))
+            with console.status(reference) as status:
+                tables[reference] = evaluate(
+                    artifact.machine, test, tensors.structure, progress=status.update
+                )
+                if baseline and "BernoulliRBM" not in str(tables):
+                    status.update("training the baseline")
+                    tables["BernoulliRBM"] = _baseline(tensors.train, test, tensors.structure)
+    except (ConfigError, DatasetError, RegistryError) as error:
+        _fail(error)
+    _show(tables)
+    if output is not None:
+        rows = {name: [_flat(row) for row in table] for name, table in tables.items()}
+        output.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+
+
+@app.command(name="list")
+def list_command(store: StorePath = _STORE) -> None:
+    """The store's models, and the configurations that come with the package."""
+    try:
+        models = load_model_set(Store(store))
+    except RegistryError as error:
+        _fail(error)
+    table = Table("model", "version", "variant", "state", title="Published")
+    for (name, version), entry in sorted(models.entries.items()):
+        state = getattr(entry, "reason", "verified")
+        variant = entry.manifest.variant if hasattr(entry, "manifest") else "?"
+        table.add_row(name, version, variant, state)
+    console.print(table)
+    for alias, target in models.aliases.items():
+        console.print(f"{alias} → {target}")
+    console.print("Configurations:", ", ".join(shipped_configs()))
+
+
+def _prepare(config: Config, data: Path) -> SplitScenes:
+    with console.status("reading and encoding scenes"):
+        scenes = prepare(config, data)
+    sizes = ", ".join(f"{len(some)} {part}" for part, some in scenes.parts.items())
+    console.print(f"{len(scenes.vocabulary)} object classes; scenes: {sizes}")
+    return scenes
+
+
+def _train(config: Config, scenes: SplitScenes, folder: Path, fresh: bool) -> None:
+    if fresh:
+        for name in ("checkpoint.pt", "result.json"):
+            (folder / name).unlink(missing_ok=True)
+    trainer = Trainer(config, scenes.training_data(), folder)
+    if trainer.resume():
+        console.print(f"resuming after epoch {len(trainer.epochs)}")
+    console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
+    columns = ("[progress.description]{task.description}", BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as bar:
+        task = bar.add_task(config.name, total=config.training.epochs, note="")
+
+        def show(epoch: int, done: float, loss: float) -> None:
+            note = f"loss {loss:.3f}"
+            if trainer.epochs:
+                last = trainer.epochs[-1]
+                note += f"  MRR {last.mrr_validation:.3f}"
+                note += f"  R-precision {last.r_precision_validation:.3f}"
+            bar.update(task, completed=epoch + done, note=note)
+
+        try:
+            result = trainer.run(show)
+        except KeyboardInterrupt:
+            bar.stop()
+            console.print(
+                f"stopped after epoch {len(trainer.epochs)}; the same command goes on from there"
+            )
+            raise typer.Exit(130) from None
+    save_run(folder, config, result)
+    best = result.epochs[result.best_epoch]
+    console.print(
+        f"best epoch {result.best_epoch + 1} of {len(result.epochs)} in {result.seconds:.0f} s: "
+        f"MRR {best.mrr_validation:.3f}, R-precision {best.r_precision_validation:.3f}; "
+        f"curve in {folder / 'curve.png'}"
+    )
+
+
+def _publish(
+    folder: Path, scenes: SplitScenes, store: Path, version: str, alias: str | None
+) -> None:
+    with console.status("publishing") as status:
+        artifact = publish_run(
+            load_run(folder), scenes, Store(store), version, alias=alias, progress=status.update
+        )
+    manifest = artifact.manifest
+    console.print(f"published {manifest.name}@{manifest.version}, digest {artifact.digest[:12]}")
+
+
+def _baseline(train, test, structure):  # type: ignore[no-untyped-def]
+    rows: list[Row] = []
+    for source, some in by_source(test):
+        index = [k for k, scene in enumerate(train.scenes) if scene.source == source]
+        machine = fit_bernoulli_rbm(train.v[index])
+        rows += missing_rows(machine, some, structure, source)
+    return rows
+
+
+def _show(tables: dict[str, list[Row]]) -> None:
+    figures: dict[tuple[str, str, str], dict[str, str]] = {}
+    for name, rows in tables.items():
+        for row in rows:
+            key = (row.task, row.source, row.metric)
+            figures.setdefault(key, {})[name] = str(row.figure)
+    table = Table("task", "source", "metric", *tables)
+    for key, values in sorted(figures.items()):
+        table.add_row(*key, *(values.get(name, "") for name in tables))
+    console.print(table)
+
+
+def _flat(row: Row) -> dict[str, str | float]:
+    f = row.figure
+    return {
+        "task": row.task, "source": row.source, "metric": row.metric,
+        "value": f.value, "low": f.low, "high": f.high, "n": f.n,
+    }  # fmt: skip
+
+
+def _fail(error: Exception) -> NoReturn:
+    console.print(f"[red]error:[/red] {error}")
+    raise typer.Exit(1)

@@ -1,0 +1,41 @@
+"""Scenes from files and from the room generator, and what a model sees of them."""
+
+from training.datasets.encode import EncodedScene, annotated_classes, encode
+from training.datasets.names import Names, curated_names
+from training.datasets.readers import READERS, Reader, read_all, read_scenes
+from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
+from training.datasets.rooms import generate_rooms, rooms_vocabulary
+from training.datasets.splits import FRACTIONS, split
+from training.datasets.vocabulary import (
+    build_vocabulary,
+    coverage,
+    indoor_vocabulary,
+    source_vocabulary,
+    with_typical_sizes,
+    write_indoor_vocabulary,
+)
+
+__all__ = [
+    "FRACTIONS",
+    "READERS",
+    "AnnotatedObject",
+    "AnnotatedScene",
+    "DatasetError",
+    "EncodedScene",
+    "Names",
+    "Reader",
+    "annotated_classes",
+    "build_vocabulary",
+    "coverage",
+    "curated_names",
+    "encode",
+    "generate_rooms",
+    "indoor_vocabulary",
+    "read_all",
+    "read_scenes",
+    "rooms_vocabulary",
+    "source_vocabulary",
+    "split",
+    "with_typical_sizes",
+    "write_indoor_vocabulary",
+]

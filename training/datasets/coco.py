@@ -1,0 +1,69 @@
+"""Instances in images, in the layout of COCO (Lin et al., ECCV 2014): ``instances*.json``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from training.datasets.json_file import load_json, take
+from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d, DatasetError
+
+SOURCE = "coco"
+
+
+def read_coco(path: Path) -> list[AnnotatedScene]:
+    """Read the images that show anything, with boxes in the image plane.
+
+    Boxes around crowds are left out: they are no single thing. Left and above follow from the boxes
+    when scenes are encoded (`training.datasets.image_plane`).
+
+    Raises:
+        DatasetError: the file is not in the layout of COCO.
+    """
+    content = load_json(path)
+    categories: dict[int, str] = {}
+    for number, entry in enumerate(take(path, "", content, "categories", list)):
+        where = f"categories[{number}]"
+        categories[take(path, where, entry, "id", int)] = take(path, where, entry, "name", str)
+    images: dict[int, list[AnnotatedObject]] = {}
+    for number, entry in enumerate(take(path, "", content, "images", list)):
+        images[take(path, f"images[{number}]", entry, "id", int)] = []
+    for number, entry in enumerate(take(path, "", content, "annotations", list)):
+        where = f"annotations[{number}]"
+        image = take(path, where, entry, "image_id", int)
+        category = take(path, where, entry, "category_id", int)
+        if image not in images:
+            raise DatasetError(path, where, f"image_id {image} is not among the images")
+        if category not in categories:
+            raise DatasetError(path, where, f"category_id {category} is not among the categories")
+        if entry.get("iscrowd"):
+            continue
+        key = str(take(path, where, entry, "id", int))
+        try:
+            box = AnnotatedObject(key, categories[category], box2d=_box(path, where, entry))
+        except DatasetError:
+            raise
+        except ValueError as error:
+            raise DatasetError(path, where, str(error)) from error
+        images[image].append(box)
+    scenes = []
+    for image, objects in images.items():
+        name = f"{SOURCE}-{image}"
+        if len({thing.id for thing in objects}) < len(objects):
+            raise DatasetError(path, f"image {image}", "two annotations with one id")
+        if objects:
+            scenes.append(AnnotatedScene(name, SOURCE, name, None, tuple(objects)))
+    return scenes
+
+
+def _box(path: Path, where: str, entry: dict[str, Any]) -> Box2d:
+    bbox = take(path, where, entry, "bbox", list)
+    if (
+        len(bbox) != 4
+        or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in bbox)
+        or min(bbox[2:]) < 0
+    ):
+        raise DatasetError(path, where, f"bbox must be [x, y, width, height], not {bbox!r}")
+    x, y, width, height = map(float, bbox)
+    return (x, y, x + width, y + height)

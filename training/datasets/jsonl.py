@@ -1,0 +1,152 @@
+"""Scenes as JSON lines, plain or gzipped: the product's own format.
+
+One scene a line: ``scene_id``, ``source``, ``group``, ``room_type`` (or null), ``objects``
+[{``id``, ``label``, ``position``?, ``size``?, ``yaw``?, ``supported_by``?, ``box2d``?}],
+``relations`` [[subject id, predicate, object id]] or null where nobody annotated any, and
+``viewer_frame``? (true where positions are in viewer axes: x away, y left, z up).
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from training.datasets.predicates import relation_of
+from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
+
+_SCENE_FIELDS = {"scene_id", "source", "group", "room_type", "objects", "relations", "viewer_frame"}
+_OBJECT_FIELDS = {"id", "label", "position", "size", "yaw", "supported_by", "box2d"}
+
+# Sources recorded in viewer axes before the format could say so.
+_VIEWER_SOURCES = frozenset({"sunrgbd-bedroom-3d"})
+
+
+def read_jsonl(path: Path) -> list[AnnotatedScene]:
+    """Read every scene of a ``.jsonl`` or ``.jsonl.gz`` file.
+
+    Raises:
+        DatasetError: the file cannot be read, or a line is not a scene.
+    """
+    scenes: list[AnnotatedScene] = []
+    seen: dict[tuple[str, str], int] = {}
+    for number, line in enumerate(_lines(path), 1):
+        if not line.strip():
+            continue
+        where = f"line {number}"
+        try:
+            scene = _scene(json.loads(line))
+        except json.JSONDecodeError as error:
+            raise DatasetError(path, where, f"not JSON: {error}") from error
+        except ValueError as error:
+            raise DatasetError(path, where, str(error)) from error
+        if (first := seen.setdefault((scene.source, scene.scene_id), number)) != number:
+            raise DatasetError(path, where, f"scene {scene.scene_id!r} is on line {first} already")
+        scenes.append(scene)
+    return scenes
+
+
+def _lines(path: Path) -> Iterator[str]:
+    opener = gzip.open if path.suffix == ".gz" else open
+    try:
+        with opener(path, "rt", encoding="utf-8") as file:
+            yield from file
+    except (OSError, EOFError, UnicodeDecodeError, zlib.error) as error:
+        raise DatasetError(path, "", f"cannot be read: {error}") from error
+
+
+def _scene(values: Any) -> AnnotatedScene:
+    _check_fields("a scene", values, {"scene_id", "objects"}, _SCENE_FIELDS)
+    scene_id = _text("scene_id", values["scene_id"])
+    source = _text("source", values.get("source", "jsonl"))
+    if not isinstance(values["objects"], list):
+        raise ValueError("objects must be a list")
+    objects = tuple(_object(entry) for entry in values["objects"])
+    viewer_frame = values.get("viewer_frame", source in _VIEWER_SOURCES)
+    if not isinstance(viewer_frame, bool):
+        raise ValueError(f"viewer_frame must be true or false, not {viewer_frame!r}")
+    room_type = values.get("room_type")
+    return AnnotatedScene(
+        scene_id=scene_id,
+        source=source,
+        group=_text("group", values.get("group", scene_id)),
+        room_type=None if room_type is None else _text("room_type", room_type),
+        objects=objects,
+        relations=_relations(values.get("relations"), source, objects),
+        viewer_frame=viewer_frame,
+    )
+
+
+def _object(values: Any) -> AnnotatedObject:
+    _check_fields("an object", values, {"id", "label"}, _OBJECT_FIELDS)
+    supported_by = values.get("supported_by")
+    yaw = values.get("yaw", 0.0)
+    if not _is_number(yaw):
+        raise ValueError(f"yaw must be a number, not {yaw!r}")
+    return AnnotatedObject(
+        id=_id(values["id"]),
+        label=_text("label", values["label"]),
+        position=_numbers("position", values.get("position"), 3),
+        size=_numbers("size", values.get("size"), 3),
+        yaw=float(yaw),
+        supported_by=None if supported_by is None else _id(supported_by),
+        box2d=_numbers("box2d", values.get("box2d"), 4),
+    )
+
+
+def _relations(
+    values: Any, source: str, objects: tuple[AnnotatedObject, ...]
+) -> tuple[tuple[int, str, int], ...] | None:
+    if values is None:
+        return None
+    if not isinstance(values, list):
+        raise ValueError("relations must be a list or null")
+    place = {thing.id: index for index, thing in enumerate(objects)}
+    found: dict[tuple[int, str, int], None] = {}
+    for entry in values:
+        if not isinstance(entry, list) or len(entry) != 3:
+            raise ValueError(f"a relation is [subject id, predicate, object id], not {entry!r}")
+        subject, anchor = place.get(_id(entry[0])), place.get(_id(entry[2]))
+        if subject is None or anchor is None:
+            raise ValueError(f"relation {entry!r} names an object that is not in the scene")
+        relation = relation_of(source, _text("predicate", entry[1]))
+        # Image annotators now and then relate a thing to itself; that says nothing.
+        if relation is not None and subject != anchor:
+            found[subject, relation, anchor] = None
+    return tuple(found)
+
+
+def _check_fields(what: str, values: Any, needed: set[str], known: set[str]) -> None:
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{what} must be a JSON object, not {type(values).__name__}")
+    if missing := sorted(needed - set(values)):
+        raise ValueError(f"{what} lacks {', '.join(missing)}")
+    if unknown := sorted(set(values) - known):
+        raise ValueError(f"{what} has unknown fields: {', '.join(unknown)}")
+
+
+def _text(name: str, value: Any) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"{name} must be a non-empty string, not {value!r}")
+    return value
+
+
+def _id(value: Any) -> str:
+    if isinstance(value, bool) or not isinstance(value, (str, int)):
+        raise ValueError(f"an id must be a string or an integer, not {value!r}")
+    return str(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _numbers(name: str, values: Any, length: int) -> Any:
+    if values is None:
+        return None
+    if not isinstance(values, list) or len(values) != length or not all(map(_is_number, values)):
+        raise ValueError(f"{name} must be a list of {length} numbers, not {values!r}")
+    return tuple(float(value) for value in values)

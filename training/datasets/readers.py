@@ -1,0 +1,63 @@
+"""Every reader by the name of its format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Final
+
+from training.datasets.coco import read_coco
+from training.datasets.jsonl import read_jsonl
+from training.datasets.records import AnnotatedScene, DatasetError
+from training.datasets.sunrgbd_mat import read_sunrgbd_mat
+from training.datasets.threedssg import read_3dssg
+
+Reader = Callable[[Path], list[AnnotatedScene]]
+
+READERS: Final[dict[str, Reader]] = {
+    "jsonl": read_jsonl,
+    "3dssg": read_3dssg,
+    "sunrgbd-mat": read_sunrgbd_mat,
+    "coco": read_coco,
+}
+
+
+def guess_format(path: Path) -> str:
+    """The format of a file by its name.
+
+    Raises:
+        DatasetError: the name fits none.
+    """
+    name = path.name
+    if name.endswith((".jsonl", ".jsonl.gz")):
+        return "jsonl"
+    if name.endswith(".mat"):
+        return "sunrgbd-mat"
+    if name.startswith("relationships") and name.endswith(".json"):
+        return "3dssg"
+    if name.startswith("instances") and name.endswith(".json"):
+        return "coco"
+    raise DatasetError(
+        path,
+        "",
+        "the name fits no known format: *.jsonl, *.jsonl.gz, *.mat, relationships*.json or "
+        "instances*.json",
+    )
+
+
+def read_scenes(path: Path) -> list[AnnotatedScene]:
+    """Read a file in whichever known format its name announces.
+
+    Raises:
+        DatasetError: the name fits no format, or the file is malformed.
+    """
+    return READERS[guess_format(path)](path)
+
+
+def read_all(paths: Iterable[Path]) -> list[AnnotatedScene]:
+    """The scenes of several files, in order.
+
+    Raises:
+        DatasetError: see `read_scenes`.
+    """
+    return [scene for path in paths for scene in read_scenes(path)]

@@ -1,0 +1,256 @@
+"""A small procedural generator of furnished rooms.
+
+For tests, examples and machines without data: real sources are read from files. Rooms are drawn
+from the tables of `training.datasets.furniture`; furniture stands at walls without overlapping,
+small things stand on it, and relations follow from the boxes by the rules of `app.scene.geometry`.
+Every room is seen one to three times, from different sides and with some small things gone: those
+views share a group, as frames of one place do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.scene import Viewpoint, Vocabulary, to_viewer_frame
+from app.scene.footprints import overlap_and_gap
+from training.datasets.furniture import ROOMS, Beside, Piece, Size, Small
+from training.datasets.records import AnnotatedObject, AnnotatedScene
+from training.datasets.vocabulary import source_vocabulary
+
+SOURCE = "rooms"
+
+_HEIGHT = 2.6  # m, floor to ceiling
+_ATTEMPTS = 20  # at a free place for one thing, before it is left out
+_GONE = 0.1  # share of small things missing from a view
+_CLEARANCE = 0.02  # m between pieces of furniture
+
+
+@dataclass(frozen=True, slots=True)
+class _Box:
+    label: str
+    x: float
+    y: float
+    z: float
+    size: Size
+    yaw: float
+    support: int | None = None
+
+    @property
+    def top(self) -> float:
+        return self.z + self.size[2] / 2
+
+
+def generate_rooms(count: int, seed: int) -> list[AnnotatedScene]:
+    """Draw ``count`` scenes; the same seed draws the same scenes.
+
+    Positions are in viewer axes, boxes have sizes and yaws, what lies on furniture names it as its
+    support, and ``relations`` is None: they are derived when scenes are encoded.
+
+    Raises:
+        ValueError: ``count`` is negative.
+    """
+    if count < 0:
+        raise ValueError(f"count must not be negative, not {count}")
+    rng = np.random.default_rng(seed)
+    scenes: list[AnnotatedScene] = []
+    room = 0
+    while len(scenes) < count:
+        room_type = str(rng.choice(list(ROOMS)))
+        layout = _Layout(rng, room_type)
+        views = range(int(rng.integers(1, 4)))
+        scenes += [layout.seen(f"rooms-{seed}-{room}", view) for view in views]
+        room += 1
+    return scenes[:count]
+
+
+def rooms_vocabulary() -> Vocabulary:
+    """The vocabulary of the generator: everything its tables can put into a room."""
+    labels = sorted({label for pieces in ROOMS.values() for label in _labels(pieces)})
+    things = tuple(AnnotatedObject(str(i), label) for i, label in enumerate(labels))
+    scenes = [AnnotatedScene(room, SOURCE, room, room, things) for room in ROOMS]
+    return source_vocabulary(scenes, minimum=1)
+
+
+def _labels(pieces: tuple[Piece, ...]) -> list[str]:
+    found = []
+    for piece in pieces:
+        found += [piece.label, *(small.label for small in piece.carries)]
+        found += _labels(tuple(beside.piece for beside in piece.beside))
+    return found
+
+
+class _Layout:
+    """One furnished room, in room axes: a corner at the origin, walls along x and y."""
+
+    def __init__(self, rng: np.random.Generator, room_type: str) -> None:
+        self.rng = rng
+        self.room_type = room_type
+        self.width, self.depth = rng.uniform(3.2, 5.5), rng.uniform(3.0, 5.0)
+        self.boxes: list[_Box] = []
+        for piece in ROOMS[room_type]:
+            for _ in range(piece.most):
+                if rng.random() < piece.chance:
+                    self._furnish(piece)
+
+    def seen(self, group: str, view: int) -> AnnotatedScene:
+        """The room as somebody sees it from the middle of one wall."""
+        viewpoint = (
+            Viewpoint(0.0, self.depth / 2, 0.0),
+            Viewpoint(self.width / 2, 0.0, math.pi / 2),
+            Viewpoint(self.width, self.depth / 2, math.pi),
+            Viewpoint(self.width / 2, self.depth, -math.pi / 2),
+        )[int(self.rng.integers(4))]
+        kept = [
+            index
+            for index, box in enumerate(self.boxes)
+            if box.support is None or self.rng.random() >= _GONE
+        ]
+        boxes = [self.boxes[index] for index in kept]
+        positions, yaws = to_viewer_frame(
+            [(box.x, box.y, box.z) for box in boxes], viewpoint, [box.yaw for box in boxes]
+        )
+        return AnnotatedScene(
+            scene_id=f"{group}-{view}",
+            source=SOURCE,
+            group=group,
+            room_type=self.room_type,
+            objects=tuple(
+                AnnotatedObject(
+                    id=str(index),
+                    label=box.label,
+                    position=(x, y, z),
+                    size=box.size,
+                    yaw=yaw,
+                    supported_by=None if box.support is None else str(box.support),
+                )
+                for index, box, (x, y, z), yaw in zip(
+                    kept, boxes, positions.tolist(), yaws.tolist(), strict=True
+                )
+            ),
+            viewer_frame=True,
+        )
+
+    def _size(self, mean: Size) -> Size:
+        x, y, z = (
+            side * factor
+            for side, factor in zip(mean, self.rng.uniform(0.88, 1.12, 3), strict=True)
+        )
+        return (float(x), float(y), float(z))
+
+    def _furnish(self, piece: Piece) -> None:
+        size = self._size(piece.size)
+        for _ in range(_ATTEMPTS):
+            if (box := self._propose(piece, size)) is not None and self._free(box):
+                self._place(piece, box)
+                return
+
+    def _propose(self, piece: Piece, size: Size) -> _Box | None:
+        """A place for a piece of furniture, or None where the room is too small for it."""
+        if piece.where in ("centre", "ceiling"):
+            margin = math.hypot(size[0], size[1]) / 2
+            if 2 * margin > min(self.width, self.depth):
+                return None
+            x = self.rng.uniform(0.35, 0.65) * self.width
+            y = self.rng.uniform(0.35, 0.65) * self.depth
+            turned = self.rng.choice([0.0, math.pi / 2]) + self.rng.normal(0.0, 0.05)
+            z = size[2] / 2 if piece.where == "centre" else _HEIGHT - size[2] / 2
+            return _Box(piece.label, x, y, z, size, float(turned))
+        # The back of the piece, its -y side, is flush with a wall.
+        side = int(self.rng.integers(4))
+        length = self.width if side % 2 == 0 else self.depth
+        if size[0] > length:
+            return None
+        along = self.rng.uniform(size[0] / 2, length - size[0] / 2)
+        x, y = (
+            (along, size[1] / 2),
+            (self.width - size[1] / 2, along),
+            (along, self.depth - size[1] / 2),
+            (size[1] / 2, along),
+        )[side]
+        z = size[2] / 2
+        if piece.where == "hung":
+            z = min(self.rng.uniform(1.5, 1.8), _HEIGHT - 0.05 - size[2] / 2)
+        return _Box(piece.label, x, y, z, size, side * math.pi / 2)
+
+    def _place(self, piece: Piece, box: _Box) -> None:
+        support = len(self.boxes)
+        self.boxes.append(box)
+        for small in piece.carries:
+            for _ in range(small.most):
+                if self.rng.random() < small.chance:
+                    self._put_on(small, support)
+        for beside in piece.beside:
+            self._put_beside(beside, box)
+
+    def _put_on(self, small: Small, support: int) -> None:
+        base = self.boxes[support]
+        size = self._size(small.size)
+        if size[0] > base.size[0] or size[1] > base.size[1]:
+            return
+        for _ in range(_ATTEMPTS):
+            u = self.rng.uniform(-1, 1) * (base.size[0] - size[0]) / 2
+            v = self.rng.uniform(-1, 1) * (base.size[1] - size[1]) / 2
+            x, y = _offset(base, u, v)
+            box = _Box(small.label, x, y, base.top + size[2] / 2, size, base.yaw, support=support)
+            if self._free(box):
+                self.boxes.append(box)
+                return
+
+    def _put_beside(self, beside: Beside, anchor: _Box) -> None:
+        piece = beside.piece
+        sides = ("left", "right", "front", "back") if beside.side == "around" else (beside.side,)
+        for side in sides:
+            if self.rng.random() >= piece.chance:
+                continue
+            size = self._size(piece.size)
+            away = self.rng.uniform(0.03, 0.15)
+            if side in ("left", "right"):
+                u = (anchor.size[0] + size[0]) / 2 + away
+                # At a wall both stand with their backs to it.
+                v = 0.0 if beside.side == "around" else (size[1] - anchor.size[1]) / 2
+                x, y = _offset(anchor, -u if side == "left" else u, v)
+            else:
+                v = (anchor.size[1] + size[1]) / 2 + away
+                x, y = _offset(anchor, 0.0, v if side == "front" else -v)
+            box = _Box(piece.label, x, y, size[2] / 2, size, anchor.yaw)
+            if self._inside(box) and self._free(box):
+                self._place(piece, box)
+
+    def _inside(self, box: _Box) -> bool:
+        x, y = _half_extent(box)
+        return x <= box.x <= self.width - x and y <= box.y <= self.depth - y
+
+    def _free(self, box: _Box) -> bool:
+        """Whether nothing else takes up any of the space of a box."""
+        rivals = [
+            other
+            for other in self.boxes
+            if abs(other.z - box.z) < (other.size[2] + box.size[2]) / 2 - 1e-6
+        ]
+        if not rivals:
+            return True
+        n = len(rivals)
+        _, gap = overlap_and_gap(
+            np.tile([box.x, box.y], (n, 1)), np.tile(box.size[:2], (n, 1)), np.full(n, box.yaw),
+            np.array([[other.x, other.y] for other in rivals]),
+            np.array([other.size[:2] for other in rivals]),
+            np.array([other.yaw for other in rivals]),
+        )  # fmt: skip
+        clearance = 0.0 if box.support is not None else _CLEARANCE
+        return bool((gap > clearance).all())
+
+
+def _offset(box: _Box, u: float, v: float) -> tuple[float, float]:
+    """A point of the room, u along the front of a box and v away from its back."""
+    cos, sin = math.cos(box.yaw), math.sin(box.yaw)
+    return box.x + cos * u - sin * v, box.y + sin * u + cos * v
+
+
+def _half_extent(box: _Box) -> tuple[float, float]:
+    """Half the sides of the upright rectangle of the room around a turned box."""
+    cos, sin = abs(math.cos(box.yaw)), abs(math.sin(box.yaw))
+    x, y = box.size[0] / 2, box.size[1] / 2
+    return cos * x + sin * y, sin * x + cos * y

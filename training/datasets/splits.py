@@ -1,0 +1,131 @@
+"""Training, test and validation parts: 60 / 30 / 10, stratified by room type.
+
+``group`` keeps near-duplicates together: whole groups go to one part, and a group that occurs in
+several sources (a frame and the 3D boxes of the same frame) goes to the same part in all of them.
+``random`` is the protocol of the seed paper: every scene on its own.
+
+The parts depend on the seed and on what is split, not on its order. Sources that share no group do
+not influence each other, so a source split alone splits as it does among others; sources that share
+groups must be split together.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, Literal
+
+from training.datasets.names import curated_names
+from training.datasets.records import AnnotatedScene
+
+Part = Literal["train", "test", "validation"]
+Protocol = Literal["group", "random"]
+
+FRACTIONS: Final[dict[Part, float]] = {"train": 0.6, "test": 0.3, "validation": 0.1}
+
+
+def split(
+    scenes: Sequence[AnnotatedScene], *, seed: int, protocol: Protocol = "group"
+) -> dict[Part, list[AnnotatedScene]]:
+    """The scenes of each part, in their given order.
+
+    Args:
+        scenes: all scenes that are to be split, of all sources.
+        seed: draws another split.
+        protocol: ``group`` or ``random``.
+
+    Raises:
+        ValueError: an unknown protocol, or two scenes of one source with one id.
+    """
+    if protocol not in ("group", "random"):
+        raise ValueError(f"protocol must be 'group' or 'random', not {protocol!r}")
+    if len({(scene.source, scene.scene_id) for scene in scenes}) < len(scenes):
+        raise ValueError("two scenes of one source share one scene_id")
+    units = [_unit(scene, protocol) for scene in scenes]
+    part_of: dict[str, Part] = {}
+    for family in _families(scenes, units):
+        part_of |= _assign(family, seed)
+    parts: dict[Part, list[AnnotatedScene]] = {part: [] for part in FRACTIONS}
+    for scene, unit in zip(scenes, units, strict=True):
+        parts[part_of[unit]].append(scene)
+    return parts
+
+
+def _unit(scene: AnnotatedScene, protocol: Protocol) -> str:
+    """What must not be torn apart."""
+    return scene.group if protocol == "group" else f"{scene.source}/{scene.scene_id}"
+
+
+def _families(
+    scenes: Sequence[AnnotatedScene], units: Sequence[str]
+) -> list[dict[str, Counter[str]]]:
+    """Room types by unit, for each set of sources that share units.
+
+    A unit counts with the scenes of the largest source it occurs in, so that a smaller source that
+    rides along does not move the parts of the larger one.
+    """
+    sources_of: dict[str, set[str]] = defaultdict(set)
+    sizes: Counter[str] = Counter()
+    for scene, unit in zip(scenes, units, strict=True):
+        sources_of[unit].add(scene.source)
+        sizes[scene.source] += 1
+    family_of = _connected(sizes, sources_of.values())
+    leading = {
+        unit: max(sources, key=lambda source: (sizes[source], source))
+        for unit, sources in sources_of.items()
+    }
+    families: dict[str, dict[str, Counter[str]]] = {}
+    names = curated_names()
+    for scene, unit in zip(scenes, units, strict=True):
+        if scene.source == leading[unit]:
+            family = families.setdefault(family_of[scene.source], {})
+            room = names.canonical_room(scene.room_type) or ""
+            family.setdefault(unit, Counter())[room] += 1
+    return list(families.values())
+
+
+def _connected(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, str]:
+    """The least source that each source is connected to through shared units."""
+    family = {source: source for source in sources}
+    for linked in shared:
+        if len(linked) > 1:
+            old = {family[source] for source in linked}
+            new = min(old)
+            family = {source: new if name in old else name for source, name in family.items()}
+    return family
+
+
+def _assign(rooms_of: Mapping[str, Counter[str]], seed: int) -> dict[str, Part]:
+    """Give every unit to the part that lacks most, stratum by stratum.
+
+    The stratum of a unit is its most common room type. Units come in the order of a hash, large
+    strata first; what a part lacks is counted both in the stratum and over all, so that strata of a
+    few units do not all end in training.
+    """
+    strata: dict[str, list[str]] = defaultdict(list)
+    for unit, rooms in rooms_of.items():
+        strata[min(rooms, key=lambda room: (-rooms[room], room))].append(unit)
+    weight = {unit: rooms.total() for unit, rooms in rooms_of.items()}
+    overall: Counter[Part] = Counter()
+    part_of: dict[str, Part] = {}
+    for room in sorted(strata, key=lambda room: (-sum(weight[u] for u in strata[room]), room)):
+        here: Counter[Part] = Counter()
+        for unit in sorted(strata[room], key=lambda unit: _rank(seed, unit)):
+            part = max(
+                FRACTIONS,
+                key=lambda p: _lack(p, here, weight[unit]) + _lack(p, overall, weight[unit]),
+            )
+            part_of[unit] = part
+            here[part] += weight[unit]
+            overall[part] += weight[unit]
+    return part_of
+
+
+def _lack(part: Part, given: Counter[Part], coming: int) -> float:
+    """Scenes that a part is short of its share, once ``coming`` more are given out."""
+    return FRACTIONS[part] * (given.total() + coming) - given[part]
+
+
+def _rank(seed: int, unit: str) -> bytes:
+    return hashlib.sha256(f"{seed}|{unit}".encode()).digest()

@@ -1,0 +1,124 @@
+"""SUN RGB-D 3D boxes (Song, Lichtenberg & Xiao, CVPR 2015): ``SUNRGBDMeta3DBB_v2.mat``.
+
+A struct array ``SUNRGBDMeta``, one frame an element; ``groundtruth3DBB`` is a struct array of
+boxes with ``basis`` (rows are the axes of the box), ``coeffs`` (half extents along them),
+``centroid`` and ``classname``. Axes: x right, y away from the camera, z up, metres; the tilt of the
+camera is taken out already.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
+
+from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
+
+SOURCE = "sunrgbd-mat"
+
+# Frames are listed in the order they were taken: neighbours often show one place.
+_BLOCK = 20
+
+
+def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
+    """Read the frames that have boxes.
+
+    The room type is that of ``<sequenceName>/scene.txt`` where the images lie beside the file.
+    Frames of one SUN3D place share a group; the others are grouped in blocks of 20 consecutive
+    frames of one sensor and collection.
+
+    Raises:
+        DatasetError: the file is not in the official layout.
+    """
+    scenes: list[AnnotatedScene] = []
+    taken: Counter[str] = Counter()
+    for number, frame in enumerate(_structs(_load(path))):
+        where = f"SUNRGBDMeta({number + 1})"
+        name = str(_field(path, where, frame, "sequenceName")).strip("/")
+        collection = "/".join(name.split("/")[:3])
+        if "sun3ddata" in name:
+            group = "sunrgbd-" + "/".join(name.split("/")[:4])
+        else:
+            group = f"sunrgbd-{collection}-{taken[collection] // _BLOCK}"
+        taken[collection] += 1
+        objects = tuple(
+            _box(path, f"{where}.groundtruth3DBB({position + 1})", position, box)
+            for position, box in enumerate(_structs(_field(path, where, frame, "groundtruth3DBB")))
+        )
+        if objects:
+            scenes.append(
+                AnnotatedScene(
+                    scene_id=name,
+                    source=SOURCE,
+                    group=group,
+                    room_type=_room_type(path.parent / name / "scene.txt"),
+                    objects=objects,
+                    viewer_frame=True,
+                )
+            )
+    return scenes
+
+
+def _load(path: Path) -> Any:
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
+        raise DatasetError(path, "", f"is no MATLAB 5 file: {error}") from error
+    if "SUNRGBDMeta" not in content:
+        raise DatasetError(path, "", "holds no variable SUNRGBDMeta")
+    return content["SUNRGBDMeta"]
+
+
+def _structs(value: Any) -> list[Any]:
+    """A struct array as a list: MATLAB gives one struct, several or an empty matrix."""
+    if isinstance(value, dict):
+        return [value]
+    return list(value) if isinstance(value, list) else list(np.atleast_1d(value))
+
+
+def _field(path: Path, where: str, struct: Any, name: str) -> Any:
+    if not isinstance(struct, dict) or name not in struct:
+        raise DatasetError(path, where, f"lacks the field {name}")
+    return struct[name]
+
+
+def _array(path: Path, where: str, struct: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    value = _field(path, where, struct, name)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DatasetError(path, where, f"{name} is not numeric") from error
+    if array.shape != shape or not np.isfinite(array).all():
+        raise DatasetError(path, where, f"{name} must be finite, of shape {shape}, not {value!r}")
+    return array
+
+
+def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
+    basis = _array(path, where, struct, "basis", (3, 3))
+    # Some boxes are listed with negative half extents.
+    half = np.abs(_array(path, where, struct, "coeffs", (3,)))
+    x, y, z = _array(path, where, struct, "centroid", (3,)).tolist()
+    upright = int(np.abs(basis[:, 2]).argmax())
+    ahead, aside = (upright + 1) % 3, (upright + 2) % 3
+    try:
+        return AnnotatedObject(
+            id=str(number),
+            label=str(_field(path, where, struct, "classname")).strip(),
+            # x right, y away to x away, y left.
+            position=(y, -x, z),
+            size=(2 * float(half[ahead]), 2 * float(half[aside]), 2 * float(half[upright])),
+            yaw=math.atan2(-float(basis[ahead, 0]), float(basis[ahead, 1])),
+        )
+    except ValueError as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(path, where, str(error)) from error
+
+
+def _room_type(path: Path) -> str | None:
+    return path.read_text(encoding="utf-8").strip() or None if path.is_file() else None

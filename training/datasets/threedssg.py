@@ -1,0 +1,114 @@
+"""3DSSG scene graphs (Wald et al., CVPR 2020) in their official layout.
+
+Relationships come as ``relationships.json`` (the whole data set; labels in ``objects.json`` beside
+it) or ``relationships_train.json`` and ``relationships_validation.json`` (the subset cut into
+splits of at most nine objects, with labels). ``3RScan.json`` beside them says which scans show one
+room.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from training.datasets.json_file import load_json, take
+from training.datasets.predicates import relation_of
+from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
+
+SOURCE = "3dssg"
+
+
+def read_3dssg(path: Path) -> list[AnnotatedScene]:
+    """Read the scans (or splits of scans) of a relationships file.
+
+    Rescans of a room share its group. The official files say nothing of room types and poses.
+
+    Raises:
+        DatasetError: a file is missing or not in the official layout.
+    """
+    scans = take(path, "", load_json(path), "scans", list)
+    rooms = _rooms(path.with_name("3RScan.json"))
+    labels: dict[str, dict[str, str]] | None = None
+    scenes: list[AnnotatedScene] = []
+    seen: set[str] = set()
+    for number, scan in enumerate(scans):
+        where = f"scans[{number}]"
+        name = take(path, where, scan, "scan", str)
+        if "objects" in scan:
+            objects = take(path, where, scan, "objects", dict)
+        else:
+            if labels is None:
+                labels = _labels(path.with_name("objects.json"))
+            if name not in labels:
+                raise DatasetError(path, where, f"scan {name} is not in objects.json")
+            objects = labels[name]
+        if name not in rooms:
+            raise DatasetError(path, where, f"scan {name} is not in 3RScan.json")
+        scene_id = f"3dssg-{name}-{scan['split']}" if "split" in scan else f"3dssg-{name}"
+        if scene_id in seen:
+            raise DatasetError(path, where, f"scene {scene_id} is listed twice")
+        seen.add(scene_id)
+        try:
+            scenes.append(
+                AnnotatedScene(
+                    scene_id=scene_id,
+                    source=SOURCE,
+                    group=f"3rscan-{rooms[name]}",
+                    room_type=None,
+                    objects=tuple(AnnotatedObject(key, label) for key, label in objects.items()),
+                    relations=_relations(path, where, scan, list(objects)),
+                )
+            )
+        except DatasetError:
+            raise
+        except (TypeError, ValueError) as error:
+            raise DatasetError(path, where, str(error)) from error
+    return scenes
+
+
+def _relations(
+    path: Path, where: str, scan: dict[str, Any], ids: list[str]
+) -> tuple[tuple[int, str, int], ...]:
+    place = {key: position for position, key in enumerate(ids)}
+    found: dict[tuple[int, str, int], None] = {}
+    for number, entry in enumerate(take(path, where, scan, "relationships", list)):
+        here = f"{where}.relationships[{number}]"
+        if not isinstance(entry, list) or len(entry) != 4 or not isinstance(entry[3], str):
+            raise DatasetError(
+                path, here, f"must be [subject, object, predicate id, predicate], not {entry!r}"
+            )
+        subject, anchor = place.get(str(entry[0])), place.get(str(entry[1]))
+        if subject is None or anchor is None:
+            raise DatasetError(path, here, f"{entry!r} names an object that is not in the scan")
+        relation = relation_of(SOURCE, entry[3])
+        if relation is not None and subject != anchor:
+            found[subject, relation, anchor] = None
+    return tuple(found)
+
+
+def _labels(path: Path) -> dict[str, dict[str, str]]:
+    """Labels by object id, by scan, from ``objects.json``."""
+    labels: dict[str, dict[str, str]] = {}
+    for number, scan in enumerate(take(path, "", load_json(path), "scans", list)):
+        where = f"scans[{number}]"
+        found = labels.setdefault(take(path, where, scan, "scan", str), {})
+        for position, thing in enumerate(take(path, where, scan, "objects", list)):
+            here = f"{where}.objects[{position}]"
+            key = str(take(path, here, thing, "id", (str, int)))
+            found[key] = take(path, here, thing, "label", str)
+    return labels
+
+
+def _rooms(path: Path) -> dict[str, str]:
+    """The reference scan of each scan, from ``3RScan.json``."""
+    rooms: dict[str, str] = {}
+    entries = load_json(path)
+    if not isinstance(entries, list):
+        raise DatasetError(path, "", "must be a list of reference scans")
+    for number, entry in enumerate(entries):
+        where = f"[{number}]"
+        reference = take(path, where, entry, "reference", str)
+        rooms[reference] = reference
+        for position, rescan in enumerate(take(path, where, entry, "scans", list)):
+            rooms[take(path, f"{where}.scans[{position}]", rescan, "reference", str)] = reference
+    return rooms

@@ -1,0 +1,137 @@
+"""From a configuration to split, encoded scenes: the same for training, publishing and evaluation."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from app.scene import CANONICAL, Vocabulary
+from training.batches import SceneTensors, scene_tensors
+from training.config import Config, ConfigError, DataConfig
+from training.datasets import (
+    AnnotatedScene,
+    EncodedScene,
+    annotated_classes,
+    encode,
+    generate_rooms,
+    indoor_vocabulary,
+    read_scenes,
+    rooms_vocabulary,
+    source_vocabulary,
+    split,
+    with_typical_sizes,
+)
+from training.trainer import TrainingData
+
+
+@dataclass(frozen=True)
+class SplitScenes:
+    """Encoded scenes of every part, with what they were read from.
+
+    Attributes:
+        vocabulary: class indices of the scenes.
+        parts: per part, its scenes over all sources.
+        counts, digests: per source, scenes read and sha256 of what was read.
+    """
+
+    vocabulary: Vocabulary
+    parts: dict[str, list[EncodedScene]]
+    counts: dict[str, int]
+    digests: dict[str, str]
+
+    def training_data(self) -> TrainingData:
+        """Tensors for the trainer. What a source annotates is learnt from its training part."""
+        by_source: dict[str, list[EncodedScene]] = {}
+        for scene in self.parts["train"]:
+            by_source.setdefault(scene.source, []).append(scene)
+        size = len(self.vocabulary)
+        annotated = {source: annotated_classes(some, size) for source, some in by_source.items()}
+        every = {scene.source for scenes in self.parts.values() for scene in scenes}
+        for source in every - set(annotated):
+            raise ConfigError(f"source {source!r} has no scene in the training part")
+        tensors: dict[str, SceneTensors] = {
+            part: scene_tensors(scenes, annotated, len(self.vocabulary))
+            for part, scenes in self.parts.items()
+        }
+        return TrainingData(
+            train=tensors["train"],
+            validation=tensors["validation"],
+            test=tensors["test"],
+            structure=torch.from_numpy(self.vocabulary.structure.copy()),
+            relations=len(CANONICAL),
+            room_types=len(self.vocabulary.room_types),
+        )
+
+
+def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
+    """The scenes of every source, named by its file `<source>.jsonl.gz` under `root`.
+
+    Raises:
+        ConfigError: there is no such file.
+        DatasetError: a file is malformed.
+    """
+    scenes: dict[str, list[AnnotatedScene]] = {}
+    for source in data.sources:
+        if source == "rooms":
+            found = generate_rooms(data.rooms, seed=data.split_seed)
+        else:
+            path = root / f"{source}.jsonl.gz"
+            if not path.is_file():
+                raise ConfigError(f"there is no {path.name} in {root}: name its folder with --data")
+            found = [replace(scene, source=source) for scene in read_scenes(path)]
+        scenes[source] = found[: data.limit]
+    return scenes
+
+
+def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene]) -> Vocabulary:
+    """The vocabulary a configuration names, with the typical sizes of its scenes.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+    if data.vocabulary == "indoor":
+        vocabulary = indoor_vocabulary()
+    elif data.vocabulary == "source":
+        vocabulary = source_vocabulary(scenes)
+    elif data.vocabulary == "rooms":
+        vocabulary = rooms_vocabulary()
+    else:
+        raise ConfigError(f"unknown vocabulary {data.vocabulary!r}: indoor, source or rooms")
+    return with_typical_sizes(vocabulary, scenes)
+
+
+def split_and_encode(
+    data: DataConfig, scenes: dict[str, list[AnnotatedScene]], vocabulary: Vocabulary | None = None
+) -> SplitScenes:
+    """Split all sources together (groups are shared between them) and encode each part.
+
+    Args:
+        vocabulary: that of a published model; by default the configuration's.
+    """
+    everything = [scene for source in scenes.values() for scene in source]
+    parts = split(everything, seed=data.split_seed, protocol=data.split)
+    if vocabulary is None:
+        vocabulary = build_vocabulary(data, list(parts["train"]))
+    return SplitScenes(
+        vocabulary=vocabulary,
+        parts={part: encode(some, vocabulary) for part, some in parts.items()},
+        counts={source: len(some) for source, some in scenes.items()},
+        digests={source: digest_of(some) for source, some in scenes.items()},
+    )
+
+
+def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
+    """sha256 of the scenes' contents, whatever file format they came in."""
+    sha = hashlib.sha256()
+    for scene in scenes:
+        sha.update(repr(scene).encode())
+    return sha.hexdigest()
+
+
+def prepare(config: Config, root: Path) -> SplitScenes:
+    """Read, split and encode what a configuration names."""
+    return split_and_encode(config.data, read_sources(config.data, root))
