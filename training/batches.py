@@ -122,8 +122,8 @@ def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tens
     scene's relations were annotated at all.
     """
     if isinstance(machine, Triway):
-        edges = machine.edges(batch.classes, batch.counts)
-        return edges, batch.holds.flatten(1), batch.observed.flatten(1)
+        gated = machine.edges(batch.classes, batch.counts)
+        return gated, batch.holds.flatten(1), batch.observed.flatten(1)
     edges = machine.edges(batch.classes)
     pairs = pair_edges(batch.classes, batch.holds.shape[1])
     keys = triple_keys(pairs.relation, pairs.subject, pairs.object, machine.spec.V)

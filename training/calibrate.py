@@ -6,7 +6,8 @@
     relation   an annotator would list this relation for this pair of instances
     misplaced  the relation is false, where one triple in half of the scenes was altered
 
-Temperatures minimise the negative log-likelihood; the others are logistic regressions (Platt scaling).
+Temperatures minimise the negative log-likelihood; the others are logistic regressions (Platt
+scaling).
 
 Sources: Platt, "Probabilistic outputs for support vector machines" (1999); Guo, Pleiss, Sun and
 Weinberger, "On calibration of modern neural networks" (2017).
@@ -88,7 +89,8 @@ def fit_missing(scenes: SceneTensors, structure: torch.Tensor, score: ObjectScor
 
 
 def fit_outlier(scores: IntruderScores, seed: int = 0) -> tuple[CountSlope, float]:
-    """Logistic regression of "is the intruder", half of the scenes clean, and the alarm threshold."""
+    """Logistic regression of "is the intruder", half of the scenes clean, and the alarm
+    threshold."""
     rng = np.random.default_rng(seed)
     clean_scene = rng.random(int(scores.scene.max()) + 1) < 0.5
     used = scores.clean == clean_scene[scores.scene]
@@ -280,5 +282,3 @@ def _logistic(features: NDArray[np.float64], truth: NDArray[np.bool_]) -> list[f
 
 def _sigmoid(x: float) -> float:
     return float(1 / (1 + np.exp(-x)))
-
-

@@ -1,4 +1,5 @@
-"""Training state on disk: written atomically at the end of every epoch, so that any stop can resume."""
+"""Training state on disk: written atomically at the end of every epoch, so that any stop can
+resume."""
 
 from __future__ import annotations
 

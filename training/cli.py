@@ -1,6 +1,7 @@
 """The command line: train, evaluate, publish, list.
 
-Ctrl-C during training leaves a checkpoint of the last finished epoch; the same command goes on from it.
+Ctrl-C during training leaves a checkpoint of the last finished epoch; the same command goes on from
+it.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from torch import Tensor
 
 from app.registry import RegistryError, Store, load_model_set
 from training.baselines.bernoulli_rbm import fit_bernoulli_rbm
+from training.batches import SceneTensors
 from training.checkpoints import CheckpointError
 from training.config import Config, ConfigError, load_config, shipped_configs
 from training.datasets import DatasetError
@@ -155,7 +158,11 @@ def _train(config: Config, scenes: SplitScenes, folder: Path, fresh: bool) -> No
     if trainer.resume():
         console.print(f"resuming after epoch {len(trainer.epochs)}")
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
-    columns = ("[progress.description]{task.description}", BarColumn(), TextColumn("{task.fields[note]}"))
+    columns = (
+        "[progress.description]{task.description}",
+        BarColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
     with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as bar:
         task = bar.add_task(config.name, total=config.training.epochs, note="")
 
@@ -195,7 +202,7 @@ def _publish(
     console.print(f"published {manifest.name}@{manifest.version}, digest {artifact.digest[:12]}")
 
 
-def _baseline(train, test, structure):  # type: ignore[no-untyped-def]
+def _baseline(train: SceneTensors, test: SceneTensors, structure: Tensor) -> list[Row]:
     rows: list[Row] = []
     for source, some in by_source(test):
         index = [k for k, scene in enumerate(train.scenes) if scene.source == source]

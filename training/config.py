@@ -66,7 +66,8 @@ class TrainingConfig(_Section):
     epochs: int = Field(default=30, ge=1)
     batch_size: int = Field(default=64, ge=1)
     weight_decay: float = Field(default=0.0, ge=0)
-    residual_decay: float = Field(default=0.0, ge=0)
+    relation_decay: float = Field(default=0.0, ge=0, description="decay of the relation weights")
+    relation_rate: float = Field(default=1.0, gt=0, description="their share of the learning rate")
     averaging: float = Field(default=0.0, ge=0, lt=1, description="decay of the weight average")
     patience: int | None = Field(default=None, ge=1)
     seed: int = 0

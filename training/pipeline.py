@@ -1,4 +1,4 @@
-"""From a configuration to split, encoded scenes: the same for training, publishing and evaluation."""
+"""From a configuration to split, encoded scenes, for training and evaluation alike."""
 
 from __future__ import annotations
 

@@ -123,5 +123,3 @@ def terms(scenes: SplitScenes) -> str:
     if research:
         return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."
     return "No restriction from the training data beyond its attribution."
-
-

@@ -1,10 +1,10 @@
 """What a finished training run leaves in its folder, and how it is read back.
 
-    config.json        the validated configuration
-    checkpoint.pt      training state, for resuming
-    model.safetensors  the best weights, with the shape in the header
-    curve.csv, .png    reconstruction error per epoch
-    result.json        best epoch, seconds, thread count
+config.json        the validated configuration
+checkpoint.pt      training state, for resuming
+model.safetensors  the best weights, with the shape in the header
+curve.csv, .png    reconstruction error per epoch
+result.json        best epoch, seconds, thread count
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ class Terms:
 
 TERMS: dict[str, Terms] = {
     "sunrgbd": Terms(
-        "SUN RGB-D (Song, Lichtenberg, Xiao, CVPR 2015): object labels and scene types of real RGB-D "
-        "frames; research use",
+        "SUN RGB-D (Song, Lichtenberg, Xiao, CVPR 2015): object labels and scene types of real "
+        "RGB-D frames; research use",
         research_only=True,
     ),
     "sunrgbd_bedrooms_3d": Terms(
@@ -24,8 +24,8 @@ TERMS: dict[str, Terms] = {
         research_only=True,
     ),
     "3dssg": Terms(
-        "3DSSG (Wald, Dhamo, Navab, Tombari, CVPR 2020) on 3RScan: annotated relations of real rooms; "
-        "research use",
+        "3DSSG (Wald, Dhamo, Navab, Tombari, CVPR 2020) on 3RScan: annotated relations of real "
+        "rooms; research use",
         research_only=True,
     ),
     "procthor": Terms(
@@ -36,5 +36,7 @@ TERMS: dict[str, Terms] = {
         "research use",
         research_only=True,
     ),
-    "rooms": Terms("Rooms made by this project's own generator; no restriction", research_only=False),
+    "rooms": Terms(
+        "Rooms made by this project's own generator; no restriction", research_only=False
+    ),
 }

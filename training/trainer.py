@@ -28,6 +28,7 @@ from training.evaluation.relations import rank_relations
 from training.objectives import OBJECTIVES, CompositeLikelihood
 
 _VALIDATION_SCENES = 400
+_OBJECT_PART = frozenset({"b", "c1", "c2", "W", "J", "Q"})
 
 # Called after every update with (epoch, share of the epoch done, mean loss so far).
 Progress = Callable[[int, float, float], None]
@@ -57,7 +58,7 @@ class TrainingResult:
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
-    """A machine at its starting weights: small random matrices, biases at the training frequencies."""
+    """A machine at its start: small random matrices, biases at the training frequencies."""
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
@@ -110,7 +111,9 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
     if isinstance(machine, Triway):
         machine.d.copy_(log_odds_of(held, seen))
     else:
-        machine.get_parameter("d").copy_(log_odds_of(per_unit, torch.full_like(per_unit, annotated)))
+        machine.get_parameter("d").copy_(
+            log_odds_of(per_unit, torch.full_like(per_unit, annotated))
+        )
 
 
 class Trainer:
@@ -142,18 +145,20 @@ class Trainer:
 
     def _optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training
-        matrices, biases, residual = [], [], []
+        matrices: list[Tensor] = []
+        biases: list[Tensor] = []
+        relations: list[Tensor] = []
         for name, parameter in self.machine.named_parameters():
             if name == "kappa":
                 continue
-            group = residual if name == "residual" else biases if parameter.dim() == 1 else matrices
-            group.append(parameter)
+            group = matrices if parameter.dim() > 1 else biases
+            (group if name in _OBJECT_PART else relations).append(parameter)
+        rate = t.learning_rate * t.relation_rate
         groups = [
-            {"params": matrices, "weight_decay": t.weight_decay},
-            {"params": biases, "weight_decay": 0.0},
-            {"params": residual, "weight_decay": t.residual_decay},
+            {"params": matrices, "weight_decay": t.weight_decay, "lr": t.learning_rate},
+            {"params": biases, "weight_decay": 0.0, "lr": t.learning_rate},
+            {"params": relations, "weight_decay": t.relation_decay, "lr": rate},
         ]
-        groups = [group for group in groups if group["params"]]
         if t.optimiser == "sgd":
             return torch.optim.SGD(groups, lr=t.learning_rate)
         return torch.optim.AdamW(groups, lr=t.learning_rate)
@@ -226,7 +231,9 @@ class Trainer:
                 progress(number, (step + 1) / self.steps_per_epoch, total / (step + 1))
         loss = total / self.steps_per_epoch
         if not math.isfinite(loss):
-            raise FloatingPointError(f"the loss of epoch {number} is {loss}: lower the learning rate")
+            raise FloatingPointError(
+                f"the loss of epoch {number} is {loss}: lower the learning rate"
+            )
         self._close_epoch(number, loss, began)
 
     def _update(self, batch: Any) -> float:
@@ -266,10 +273,17 @@ class Trainer:
         self.seconds += seconds
         self.epochs.append(
             Epoch(
-                number, loss, object_train, relation_train, object_val, relation_val, mrr, precision,
-                seconds,
+                epoch=number,
+                loss=loss,
+                object_error_train=object_train,
+                relation_error_train=relation_train,
+                object_error_validation=object_val,
+                relation_error_validation=relation_val,
+                mrr_validation=mrr,
+                r_precision_validation=precision,
+                seconds=seconds,
             )
-        )  # fmt: skip
+        )
 
     def _validate(self) -> tuple[float, float]:
         """(MRR of removed objects, R-precision of relations) on a fixed part of validation."""
@@ -279,9 +293,7 @@ class Trainer:
         result = leave_one_out(sample, self.data.structure, machine_score(self.machine))
         mrr = float(result.reciprocal_rank().mean()) if len(result.target) else float("nan")
         annotated = [
-            k
-            for k, scene in enumerate(self.data.validation.scenes)
-            if scene.evidence.holds.any()
+            k for k, scene in enumerate(self.data.validation.scenes) if scene.evidence.holds.any()
         ][:_VALIDATION_SCENES]
         if not annotated:
             return mrr, float("nan")

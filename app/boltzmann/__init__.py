@@ -1,6 +1,7 @@
 """The Boltzmann machines: energies, conditionals, expectations, samplers. Tensors only.
 
-Symbols are those of the project's model page: v, r, h1, h2; b, c1, c2, W, J; d, s, o, S, O, R, M, U.
+Symbols are those of the project's model page: v, r, h1, h2; b, c1, c2, W, J; d, s, o, S, O, R, M,
+U.
 """
 
 from __future__ import annotations

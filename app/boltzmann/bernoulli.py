@@ -1,8 +1,8 @@
 """Bernoulli draws that spend 8 random bits each, and 53 more where those do not decide.
 
 Random numbers, not matrix products, bound a Gibbs sweep. A probability p is compared as the integer
-part of p·2^8 with 8 random bits; in the tie (1 in 256) the fractional part decides by a float64 draw,
-so the result is a Bernoulli(p) draw to the precision of p.
+part of p·2^8 with 8 random bits; in the tie (1 in 256) the fractional part decides by a float64
+draw, so the result is a Bernoulli(p) draw to the precision of p.
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
-"""Weighted draws of h1 from p(h1 | evidence): the estimator behind every answer without a closed form.
+"""Weighted draws of h1 from p(h1 | evidence): the estimator behind every answer without a closed
+form.
 
 Given h1, unobserved relations sum out and observed ones multiply, unit by unit. So with a factorial
 proposal q (the mean-field fixed point) each draw h carries the weight
 
     log w = h·x + sum_e term_e(ℓ_e(h)) - log q(h),   x = c1 + v'W + J h2,
 
-and any expectation over p(h1 | evidence) is a weighted mean. The uniforms behind the draws are fixed
-(a scrambled Sobol sequence), so the same evidence always gives the same answer. With two layers h2 is
-held at its mean-field value.
+and any expectation over p(h1 | evidence) is a weighted mean. The uniforms behind the draws are
+fixed (a scrambled Sobol sequence), so the same evidence always gives the same answer. With two
+layers h2 is held at its mean-field value.
 
 Source: self-normalised importance sampling; Rao–Blackwellised, since only h1 is ever drawn.
 """
@@ -21,8 +22,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from app.boltzmann.mean_field import Evidence, MeanField, mean_field
 from app.boltzmann.machine import BoltzmannMachine
+from app.boltzmann.mean_field import Evidence, MeanField, mean_field
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,8 @@ class Edges:
         shape = (*v.shape[:-1], self.valid.shape[-1])
         subject = v.gather(-1, self.subject.expand(shape))
         object_ = v.gather(-1, self.object.expand(shape))
-        return subject * object_ * self.valid
+        present: Tensor = subject * object_ * self.valid
+        return present
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,8 @@ class PairEdges(Edges):
 
     def unflatten(self, values: Tensor) -> Tensor:
         """(..., E) to (..., A, n, m)."""
-        return values.unflatten(
-            -1, (self.relations, self.subjects.shape[-1], self.objects.shape[-1])
-        )
+        shape = (self.relations, self.subjects.shape[-1], self.objects.shape[-1])
+        return values.reshape(*values.shape[:-1], *shape)
 
 
 def pair_edges(

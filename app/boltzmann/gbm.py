@@ -1,6 +1,7 @@
 """The general Boltzmann machine of the seed paper: two layers and two-way object–relation edges.
 
-    E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_t r_t (d_t + g_t v_i + g'_t v_j + U_t·h1)
+    E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2
+                   - sum_t r_t (d_t + g_t v_i + g'_t v_j + U_t·h1)
 
 for t = (a,i,j) among the triples seen in training.
 """

@@ -2,16 +2,17 @@
 
 One step draws, in turn,
 
-    h1 | v, r, h2      factorial in the seed form. In the local form unobserved relations drop out; observed
-                       ones are met by Metropolis–Hastings, proposing blocks of h1 from p(h1 | v, h2)
-    h2 | h1            factorial
-    v  | h1            RBM, GBM: given r, factorial. Triway: with every unobserved relation summed out,
-                       factorial in the local form and object after object in the seed form
-    r  | v, h1         factorial
+    h1 | v, r, h2   factorial in the seed form. In the local form unobserved relations drop out and
+                    observed ones are met by Metropolis–Hastings, proposing blocks of h1 from
+                    p(h1 | v, h2)
+    h2 | h1         factorial
+    v  | h1         RBM, GBM: given r, factorial. Triway: with every unobserved relation summed out,
+                    factorial in the local form and object after object in the seed form
+    r  | v, h1      factorial
 
-A plain block sampler freezes the gated seed form: while a relation of i is on, p(v_i = 1) = 1. Hence v
-is drawn with R_i summed out (`collapsed`, the default); the plain kernel stays for contrastive
-divergence, whose one step need not mix.
+A plain block sampler freezes the gated seed form: while a relation of i is on, p(v_i = 1) = 1.
+Hence v is drawn with R_i summed out (`collapsed`, the default); the plain kernel stays for
+contrastive divergence, whose one step need not mix.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class Clamp:
 
     Attributes:
         v, h1, h2: bool masks broadcastable to the blocks; None clamps nothing.
-        edges, r, observed: observed relations, as in `Evidence`. In a Triway machine both ends of an
-            observed unit must be clamped present: the relations of an absent object are off anyway.
+        edges, r, observed: observed relations, as in `Evidence`. In a Triway machine both ends of
+            an observed unit must be clamped present: an absent object has no relations to observe.
         room: (B,) int64 room types.
     """
 
@@ -172,7 +173,7 @@ def sample_v(
     collapsed: bool = True,
 ) -> Tensor:
     """v | h1, with unobserved relations summed out where `collapsed`, else v | h1, r; (B, V)."""
-    # addmm: the bias enters with the product, and sigmoid_ overwrites: memory is what a sweep waits for.
+    # addmm: the bias enters with the product; memory is what a sweep waits for.
     logits = torch.addmm(machine.b, state.h1, machine.W.T)
     if isinstance(machine, GBM):
         logits = logits + machine.relation_input(state.edges, state.r)

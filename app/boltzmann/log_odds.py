@@ -52,7 +52,8 @@ class _ContextGain(torch.autograd.Function):
 
 def context_gain(x: Tensor, W: Tensor) -> Tensor:
     """sum_k [softplus(x + W_ik) - softplus(x)] for hidden logits x (B, H1) and all i, (B, V)."""
-    return torch.as_tensor(_ContextGain.apply(x, W))
+    gain: Tensor = _ContextGain.apply(x, W)  # type: ignore[no-untyped-call]
+    return gain
 
 
 def object_log_odds(
@@ -98,8 +99,8 @@ def object_log_odds_estimate(
 
         log E_{h1 | rest}[ exp(b_i + W_i·h1 + attraction_i(h1)) ]
 
-    an identity (`model.md`: Rao–Blackwell estimate), so the only error is that of the draws and, with
-    a second layer, of holding h2 at its mean-field value.
+    an identity (`model.md`: Rao–Blackwell estimate), so the only error is that of the draws and,
+    with a second layer, of holding h2 at its mean-field value.
 
     Returns:
         (B, N) log-odds and (B, N) standard errors.

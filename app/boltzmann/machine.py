@@ -2,18 +2,18 @@
 
     E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_e r_e ℓ_e(v,h1)
 
-with the sum over the variant's relation units e = (a,i,j). A variant says which units exist, when one
-may be on (its gate) and what its logit ℓ_e is; everything else is here. With a room type t given, c1
-stands for c1 + Q[t]: the room type is a condition, not a unit of the model.
+with the sum over the variant's relation units e = (a,i,j). A variant says which units exist, when
+one may be on (its gate) and what its logit ℓ_e is; everything else is here. With a room type t
+given, c1 stands for c1 + Q[t]: the room type is a condition, not a unit of the model.
 
 Two forms of the relation part (Triway only; see `Form`):
 
     seed    - r_e ℓ_e - κ_a         for every active unit
     local   - r_e ℓ_e + log(1 + exp ℓ_e)
 
-The local form leaves p(r | v, h1) as it is and makes unobserved relations drop out of everything else.
-The seed form keeps the paper's energy; its κ (0 in the paper) compensates the attraction that a
-summed-out relation exerts on its two ends.
+The local form leaves p(r | v, h1) as it is and makes unobserved relations drop out of everything
+else. The seed form keeps the paper's energy; its κ (0 in the paper) compensates the attraction that
+a summed-out relation exerts on its two ends.
 
 Shapes: leading sample dimensions first, then scenes B, then units. Energies have the leading shape.
 """
@@ -48,7 +48,9 @@ class BoltzmannMachine(nn.Module, ABC):
         self.Q = nn.Parameter(torch.zeros(spec.C, spec.H1))
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         self.triples: Tensor
-        self.register_load_state_dict_post_hook(lambda module, _: module.index_triples())
+        self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
+            lambda module, _: module.index_triples()
+        )
         self.triple_keys = torch.zeros(spec.T, dtype=torch.int64)
 
     # -- construction ---------------------------------------------------------------------------
@@ -59,7 +61,8 @@ class BoltzmannMachine(nn.Module, ABC):
         limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V])
         if bool((table < 0).any()) or bool((table >= limits).any()):
             raise ValueError("triples must hold (a, i, j) within (A, V, V)")
-        keys = triple_keys(*table.unbind(1), self.spec.V)
+        relation, subject, object_ = table.unbind(1)
+        keys = triple_keys(relation, subject, object_, self.spec.V)
         if bool((keys[1:] <= keys[:-1]).any()):
             raise ValueError("triples must be distinct and sorted by (a, i, j)")
         self.triple_keys = keys

@@ -1,12 +1,13 @@
 """log Z by annealed importance sampling, from below and from above.
 
-The path runs over machines of the same family, from independent objects at beta = 0, whose log Z is a
-sum, to the machine itself at beta = 1 (`BoltzmannMachine.scaled`). Forward runs give a stochastic lower
-bound in expectation, E[log w] ≤ log Z; reverse runs, started from samples of the machine, an upper one.
+The path runs over machines of the same family, from independent objects at beta = 0, whose log Z is
+a sum, to the machine itself at beta = 1 (`BoltzmannMachine.scaled`). Forward runs give a stochastic
+lower bound in expectation, E[log w] ≤ log Z; reverse runs, started from samples of the machine, an
+upper one.
 
 Sources: Neal, "Annealed importance sampling" (2001); Salakhutdinov and Murray, "On the quantitative
-analysis of deep belief networks" (2008); Burda, Grosse and Salakhutdinov, "Accurate and conservative
-estimates of MRF log-likelihood using reverse annealing" (2015).
+analysis of deep belief networks" (2008); Burda, Grosse and Salakhutdinov, "Accurate and
+conservative estimates of MRF log-likelihood using reverse annealing" (2015).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -34,7 +36,8 @@ class LogPartition:
     Attributes:
         log_z: log of the mean weight (forward), or minus that of the inverse weights (reverse).
         standard_error: of log_z, by the delta method over chains.
-        bound: mean of log w over chains: below log Z in expectation (forward) or above it (reverse).
+        bound: mean of log w over chains: below log Z in expectation (forward) or above it
+        (reverse).
     """
 
     log_z: float
@@ -81,7 +84,7 @@ def ais(
     v = bernoulli(base.b.sigmoid().expand(chains, -1), generator)
     state = initial_state(start, v, generator)
     log_weight = torch.zeros(chains, dtype=torch.float64)
-    for previous, beta in zip(betas[:-1], betas[1:], strict=True):
+    for previous, beta in pairwise(betas):
         cold = machine.scaled(beta, base)
         warm = machine.scaled(previous, base)
         log_weight += (_free_energy(warm, state) - _free_energy(cold, state)).double()
@@ -125,6 +128,6 @@ def _summary(base: float, log_weight: Tensor, sign: int) -> LogPartition:
 
 
 def _check(betas: Sequence[float]) -> None:
-    rising = all(x < y for x, y in zip(betas[:-1], betas[1:], strict=True))
+    rising = all(x < y for x, y in pairwise(betas))
     if len(betas) < 2 or betas[0] != 0 or betas[-1] != 1 or not rising:
         raise ValueError("betas must rise strictly from 0 to 1")

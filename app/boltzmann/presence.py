@@ -1,7 +1,7 @@
 """v'W for binary v: the sum of the few rows of W that v names.
 
-A scene holds a dozen of some hundred classes, so for a block of chains most of a dense product would
-multiply by zero.
+A scene holds a dozen of some hundred classes, so for a block of chains most of a dense product
+would multiply by zero.
 """
 
 from __future__ import annotations

@@ -23,7 +23,8 @@ class MachineSpec:
         K: rank of the shared tri-way and relation-context weights (Triway).
         T: relation units with a weight of their own: all units of the RBM and GBM, the sparse
             residual of the Triway.
-        form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations, Triway).
+        form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations,
+        Triway).
     """
 
     variant: Variant

@@ -6,10 +6,11 @@
     U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]
 
 What differs from the published code, which gates w by v_i v_j but not the relation–context weight:
-here the state space is {r_e ≤ v_i v_j}, so a relation can be on only between objects that are present,
-and the weights are shared through the factors S, O, R, M instead of one free weight per (a,i,j). The
-residual w' exists for triples seen in training; n lets relations see how many instances n_i, n_j of the
-two classes there are, since a class-level relation is the OR over instance pairs.
+here the state space is {r_e ≤ v_i v_j}, so a relation can be on only between objects that are
+present, and the weights are shared through the factors S, O, R, M instead of one free weight per
+(a,i,j). The residual w' exists for triples seen in training; n lets relations see how many
+instances n_i, n_j of the two classes there are, since a class-level relation is the OR over
+instance pairs.
 
 Forms: `seed` is the energy above (with a compensating offset κ_a per active unit, 0 in the paper);
 `local` adds softplus(ℓ_e) for every active unit.
@@ -145,9 +146,7 @@ class Triway(BoltzmannMachine):
             return logits
         axis = torch.arange(self.spec.A, device=candidates.device)
         ends = candidates.unsqueeze(-1)
-        position, found = find_triples(
-            self.triple_keys, triple_keys(axis, ends, ends, self.spec.V)
-        )
+        position, found = find_triples(self.triple_keys, triple_keys(axis, ends, ends, self.spec.V))
         return logits + self.residual[position] * found
 
     @staticmethod
@@ -168,8 +167,8 @@ class Triway(BoltzmannMachine):
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
         """beta scales every weight.
 
-        With a base, b leads to b_base and κ to -log 2: at beta = 0 the two states of a relation unit
-        weigh 1/2 each, so that relations sum out to one and objects are independent.
+        With a base, b leads to b_base and κ to -log 2: at beta = 0 the two states of a relation
+        unit weigh 1/2 each, so that relations sum out to one and objects are independent.
         """
         return scale(self, beta, base, keep=("b", "kappa"), fixed=("S", "O"))
 

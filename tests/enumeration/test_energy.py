@@ -124,11 +124,9 @@ def test_free_energy_refuses_what_has_no_closed_form(name):
     edges = full_frame(machine)
     r = torch.zeros(1, edges.shape[-1]).double()
     h2 = torch.zeros(1, machine.spec.H2).double() if machine.spec.H2 else None
+    given = (v, r, edges, h2) if machine.spec.form == "local" else (v, None, None, h2)
     with pytest.raises(ValueError, match="no closed form"):
-        if machine.spec.form == "local":
-            machine.free_energy(v, r, edges, h2)
-        else:
-            machine.free_energy(v, h2=h2)
+        machine.free_energy(*given)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -200,9 +198,7 @@ def test_attraction_is_what_summing_relations_adds(name):
                 exact = joint.log_odds(joint.v[:, i] > 0, given)
                 absent = v.clone()
                 absent[i] = 0
-                gain = machine.attraction(
-                    absent[None], h1[None], joint.edges, torch.tensor([[i]])
-                )
+                gain = machine.attraction(absent[None], h1[None], joint.edges, torch.tensor([[i]]))
                 ours = machine.object_logits(h1[None])[0, i] + gain[0, 0]
                 assert float(ours) == pytest.approx(exact, abs=1e-9)
 

@@ -1,8 +1,9 @@
 """The Gibbs kernels leave p stationary, and a fully related object can leave the chain.
 
-Draw states exactly from the enumerated joint, run the kernel once, and compare the histogram with p. The
-yardstick is the total variation of as many exact draws (the Monte-Carlo floor), which separates a
-wrong kernel from slow mixing: a stationary kernel stays at the floor however slowly it mixes.
+Draw states exactly from the enumerated joint, run the kernel once, and compare the histogram with
+p. The yardstick is the total variation of as many exact draws (the Monte-Carlo floor), which
+separates a wrong kernel from slow mixing: a stationary kernel stays at the floor however slowly it
+mixes.
 """
 
 from __future__ import annotations

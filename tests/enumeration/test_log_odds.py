@@ -1,4 +1,5 @@
-"""Every line of the table "observed, unobserved, and what is exact" against the enumerated joint."""
+"""Every line of the table "observed, unobserved, and what is exact" against the enumerated
+joint."""
 
 from __future__ import annotations
 

@@ -15,10 +15,10 @@ from app.scene.evidence import ClassEvidence
 from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
-from training.objectives import OBJECTIVES
-from training.objectives.composite import mask_one_class
 from training.evaluation.missing import machine_score
 from training.evaluation.relations import machine_score as relation_score
+from training.objectives import OBJECTIVES
+from training.objectives.composite import mask_one_class
 from training.objectives.contrastive import centre_gradients, energy_difference, energy_of
 
 SAMPLES = 200_000
@@ -46,7 +46,8 @@ def samples(joint, generator, given=None):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_energy_difference_estimates_the_exact_gradient(name):
-    """Data and model terms from exact samples: each entry within 6 standard errors (< 1e-6 by chance)."""
+    """Data and model terms from exact samples: each entry within 6 standard errors (< 1e-6 by
+    chance)."""
     machine = small_machine(name).requires_grad_(True)
     if machine.spec.variant == "triway":
         machine.kappa.requires_grad_(False)

@@ -1,7 +1,7 @@
 """scikit-learn's `BernoulliRBM` on objects alone, scored by its exact log-odds.
 
-The trained weights are put into our own machine without relation units, whose energy is the same, so
-that both models are scored by one piece of code.
+The trained weights are put into our own machine without relation units, whose energy is the same,
+so that both models are scored by one piece of code.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Scenes from files and from the room generator, and what a model sees of them."""
 
-from training.datasets.encode import EncodedScene, annotated_classes, encode
+from training.datasets.encoding import EncodedScene, annotated_classes, encode
 from training.datasets.names import Names, curated_names
 from training.datasets.readers import READERS, Reader, read_all, read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError

@@ -60,10 +60,13 @@ class Names:
 
     @cached_property
     def _by_key(self) -> dict[str, str]:
-        keys = {label_key(name): name for name in (*self.base, *self.structure)}
-        for name, others in self.aliases.items():
-            for other in (name, *others):
-                keys.setdefault(label_key(other), name)
+        keys = {
+            label_key(other): name
+            for name, others in self.aliases.items()
+            for other in (name, *others)
+        }
+        for name in (*self.base, *self.structure):
+            keys.setdefault(label_key(name), name)
         return keys
 
     @cached_property

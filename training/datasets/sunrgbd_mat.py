@@ -39,7 +39,7 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
     taken: Counter[str] = Counter()
     for number, frame in enumerate(_structs(_load(path))):
         where = f"SUNRGBDMeta({number + 1})"
-        name = str(_field(path, where, frame, "sequenceName")).strip("/")
+        name = _text(path, where, frame, "sequenceName").strip("/")
         collection = "/".join(name.split("/")[:3])
         if "sun3ddata" in name:
             group = "sunrgbd-" + "/".join(name.split("/")[:4])
@@ -87,6 +87,13 @@ def _field(path: Path, where: str, struct: Any, name: str) -> Any:
     return struct[name]
 
 
+def _text(path: Path, where: str, struct: Any, name: str) -> str:
+    value = _field(path, where, struct, name)
+    if not isinstance(value, str) or not value.strip():
+        raise DatasetError(path, where, f"{name} must be a non-empty string, not {value!r}")
+    return value.strip()
+
+
 def _array(path: Path, where: str, struct: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
     value = _field(path, where, struct, name)
     try:
@@ -108,7 +115,7 @@ def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
     try:
         return AnnotatedObject(
             id=str(number),
-            label=str(_field(path, where, struct, "classname")).strip(),
+            label=_text(path, where, struct, "classname"),
             # x right, y away to x away, y left.
             position=(y, -x, z),
             size=(2 * float(half[ahead]), 2 * float(half[aside]), 2 * float(half[upright])),

@@ -1,8 +1,9 @@
 """T2: one class left out with all its instances and relations, ranked among all absent classes.
 
-Every relation is unobserved, so nothing of the removed object can leak. Ties score their expectation
-under random order. Structure classes are neither removed nor candidates; scenes with fewer than two
-other classes are skipped. A mention outside the vocabulary would score 0 (`with_unknown`).
+Every relation is unobserved, so nothing of the removed object can leak. Ties score their
+expectation under random order. Structure classes are neither removed nor candidates; scenes with
+fewer than two other classes are skipped. A mention outside the vocabulary would score 0
+(`with_unknown`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine, Triway
+from app.boltzmann.edges import Edges
 from app.boltzmann.log_odds import object_log_odds
 from app.boltzmann.mean_field import Evidence
 from training.batches import SceneTensors
@@ -63,8 +65,8 @@ class LeaveOneOut:
     def figure(self, values: NDArray[np.float64]) -> Figure:
         """Mean of per-object values with a bootstrap interval over scenes."""
         top = np.bincount(self.scene, weights=values, minlength=self.scenes)
-        count = np.bincount(self.scene, minlength=self.scenes).astype(np.float64)
-        return ratio_figure(top, count)
+        count = np.bincount(self.scene, minlength=self.scenes)
+        return ratio_figure(top.astype(np.float64), count.astype(np.float64))
 
 
 def machine_score(machine: BoltzmannMachine) -> ObjectScore:
@@ -74,7 +76,7 @@ def machine_score(machine: BoltzmannMachine) -> ObjectScore:
     """
 
     def score(v: Tensor) -> Tensor:
-        edges = None
+        edges: Edges | None = None
         if machine.spec.form == "seed":
             if isinstance(machine, Triway):
                 n = int(v.sum(1).max())
@@ -129,7 +131,7 @@ def with_unknown(result: LeaveOneOut, unknown: NDArray[np.int64]) -> Figure:
     """
     top = np.bincount(result.scene, weights=result.reciprocal_rank(), minlength=result.scenes)
     count = np.bincount(result.scene, minlength=result.scenes) + unknown
-    return ratio_figure(top, count.astype(np.float64))
+    return ratio_figure(top.astype(np.float64), count.astype(np.float64))
 
 
 def missing_figures(result: LeaveOneOut) -> dict[str, Figure]:

@@ -1,7 +1,7 @@
 """T3: one absent class added to a scene; is it the one that fits least?
 
-Every relation is unobserved. Scenes under three classes are skipped. The intruder is drawn uniformly
-from the absent, non-structure classes.
+Every relation is unobserved. Scenes under three classes are skipped. The intruder is drawn
+uniformly from the absent, non-structure classes.
 """
 
 from __future__ import annotations
@@ -89,5 +89,9 @@ def intruder_scores(
             size = (v > 0).sum(1)[row]
             flag = torch.full_like(bad, is_clean)
             parts.append((index[row], odds.double(), bad, size, flag))
-    columns = [torch.cat(column).numpy() for column in zip(*parts, strict=True)]
-    return IntruderScores(*columns, skipped=len(scenes) - len(kept))
+    placed, log_odds, intruder, sizes, untouched = (
+        torch.cat(column).numpy() for column in zip(*parts, strict=True)
+    )
+    return IntruderScores(
+        placed, log_odds, intruder, sizes, untouched, skipped=len(scenes) - len(kept)
+    )

@@ -1,8 +1,8 @@
 """Reconstruction error of objects and of relations, separately: the seed paper's training curve.
 
-One deterministic up–down pass: the context's mean given the scene (relations observed where annotated),
-then p(v | h1) and p(r | v, h1). The error is the mean absolute difference per class, and per observed
-relation unit that may be on.
+One deterministic up–down pass: the context's mean given the scene (relations observed where
+annotated), then p(v | h1) and p(r | v, h1). The error is the mean absolute difference per class,
+and per observed relation unit that may be on.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from training.batches import Batch, SceneTensors, relation_units
 def reconstruction_error(
     machine: BoltzmannMachine, scenes: SceneTensors, *, limit: int = 512, block: int = 64
 ) -> tuple[float, float]:
-    """(object error, relation error) over `limit` random scenes; nan where nothing was annotated."""
+    """(object error, relation error) over `limit` random scenes; nan where nothing was
+    annotated."""
     object_sum = relation_sum = 0.0
     objects = relations = 0
     chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:limit]

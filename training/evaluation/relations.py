@@ -1,8 +1,9 @@
 """T1a: the annotated relations of a scene, given its classes alone.
 
-R-precision over all ordered pairs i ≠ j of present classes × canonical relations: as many predictions
-as there are annotated triples. Unlisted is counted as wrong although annotators list only a few
-relations a scene. Structure classes are no ends. Scenes without annotated triples are skipped.
+R-precision over all ordered pairs i ≠ j of present classes × canonical relations: as many
+predictions as there are annotated triples. Unlisted is counted as wrong although annotators list
+only a few relations a scene. Structure classes are no ends. Scenes without annotated triples are
+skipped.
 """
 
 from __future__ import annotations

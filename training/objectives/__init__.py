@@ -1,7 +1,7 @@
 """Training objectives, by name: one entry here is trained, tested and documented like the others.
 
-An objective is called with the machine, a batch and a generator, and returns a loss whose gradient is
-that of the objective (`Objective`). It may keep state between calls (persistent chains), which a
+An objective is called with the machine, a batch and a generator, and returns a loss whose gradient
+is that of the objective (`Objective`). It may keep state between calls (persistent chains), which a
 checkpoint stores.
 """
 
@@ -21,4 +21,10 @@ OBJECTIVES: dict[str, Callable[[ObjectiveConfig, BoltzmannMachine], Objective]] 
     "composite": CompositeLikelihood,
 }
 
-__all__ = ["OBJECTIVES", "CompositeLikelihood", "ContrastiveDivergence", "Objective", "PersistentCD"]
+__all__ = [
+    "OBJECTIVES",
+    "CompositeLikelihood",
+    "ContrastiveDivergence",
+    "Objective",
+    "PersistentCD",
+]

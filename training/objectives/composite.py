@@ -5,19 +5,20 @@ For each scene one present class i is taken out, with all its instances and rela
     ranking    - log softmax over absent candidates of the log-odds, at i
     presence   n·softplus(-log-odds_i) + sum over the other absent classes of softplus(log-odds)
 
-where n, the number of classes that could have been taken out, makes the second an unbiased estimate of
-the pseudo-likelihood's balance of present and absent units. The ranking alone leaves log-odds that are
-not comparable between objects.
+where n, the number of classes that could have been taken out, makes the second an unbiased estimate
+of the pseudo-likelihood's balance of present and absent units. The ranking alone leaves log-odds
+that are not comparable between objects.
 
 For scenes with annotated relations:
 
     relations  - sum over observed units of log p(r_e | v, E[h1 | v])
 
-a plug-in of the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)), with the mean in
-place of draws. Relations nobody annotated are summed out; scenes without any teach the object part only.
+a plug-in of the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)), with the mean
+in place of draws. Relations nobody annotated are summed out; scenes without any teach the object
+part only.
 
-Sources: Besag, "Statistical analysis of non-lattice data" (1975); Varin, Reid and Firth, "An overview of
-composite likelihood methods" (2011).
+Sources: Besag, "Statistical analysis of non-lattice data" (1975); Varin, Reid and Firth, "An
+overview of composite likelihood methods" (2011).
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 """Contrastive divergence, plain and persistent, by differences of the energy.
 
 The gradient of the negative log-likelihood is <dE>_data - <dE>_model. Both terms are energies of
-sampled states, so autograd turns any variant's energy into its update; h1 enters by its mean given the
-rest (Rao–Blackwell), which is exact because the seed form's energy is linear in it.
+sampled states, so autograd turns any variant's energy into its update; h1 enters by its mean given
+the rest (Rao–Blackwell), which is exact because the seed form's energy is linear in it.
 
-In the local form relations sum to one given (v, h1), so their model term has mean zero and is left out:
-what remains is the machine of (v, h1, h2) and log p(r | v, h1) on the data.
+In the local form relations sum to one given (v, h1), so their model term has mean zero and is left
+out: what remains is the machine of (v, h1, h2) and log p(r | v, h1) on the data.
 
-Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002); Tieleman,
-"Training RBMs using approximations to the likelihood gradient" (2008); Montavon and Müller, "Deep
-Boltzmann machines and the centering trick" (2012); Melchior, Fischer and Wiskott, "How to center deep
-Boltzmann machines" (2016).
+Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002);
+Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008); Montavon and
+Müller, "Deep Boltzmann machines and the centering trick" (2012); Melchior, Fischer and Wiskott,
+"How to center deep Boltzmann machines" (2016).
 """
 
 from __future__ import annotations
@@ -79,9 +79,7 @@ def energy_difference(
     """mean E(data) - mean E(model), plus -log p(r | v, h1) in the local form."""
     if machine.spec.form == "local":
         positive = object_energy(machine, data.v, data.h1, data.h2, room)
-        positive = positive + relation_nll(
-            machine, data.edges, data.v, data.h1, data.r, observed
-        )
+        positive = positive + relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
         return positive.mean() - object_energy(machine, model.v, model.h1, model.h2, room).mean()
     return energy_of(machine, data, room).mean() - energy_of(machine, model, room).mean()
 

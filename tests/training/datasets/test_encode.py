@@ -1,0 +1,212 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.scene import ObjectClass, Viewpoint, Vocabulary
+from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+from training.datasets import AnnotatedObject, AnnotatedScene, annotated_classes, encode
+from training.datasets.viewpoints import room_viewpoint
+
+VOCABULARY = Vocabulary(
+    [
+        ObjectClass("desk"),
+        ObjectClass("monitor", ("screen",)),
+        ObjectClass("pencil"),
+        ObjectClass("wall", structure=True),
+        ObjectClass("floor", structure=True),
+    ],
+    ["bathroom", "office"],
+)
+DESK, MONITOR, PENCIL, WALL, FLOOR = range(5)
+DESK_BOX: dict[str, Any] = {"position": (2.0, 0.0, 0.4), "size": (0.8, 1.6, 0.8)}
+MONITOR_BOX: dict[str, Any] = {"position": (2.0, 0.3, 1.0), "size": (0.1, 0.5, 0.4)}
+
+
+def things(*labels: str, **fields: Any) -> tuple[AnnotatedObject, ...]:
+    return tuple(AnnotatedObject(str(i), label, **fields) for i, label in enumerate(labels))
+
+
+def encoded(objects: tuple[AnnotatedObject, ...], **fields: Any) -> Any:
+    scene = AnnotatedScene(
+        **{"scene_id": "s", "source": "t", "group": "g", "room_type": None, "objects": objects}
+        | fields
+    )
+    (found,) = encode([scene], VOCABULARY)
+    return found
+
+
+def triples(found: Any) -> set[tuple[int, int, int]]:
+    """Relations between classes."""
+    names = found.evidence.classes
+    return {(int(a), int(names[x]), int(names[y])) for a, x, y in np.argwhere(found.evidence.holds)}
+
+
+def test_classes_counts_and_unknown_labels() -> None:
+    found = encoded(things("Screens", "desk", "goblet", "monitor", "wall"), room_type="Toilet")
+    assert found.instance_classes.tolist() == [MONITOR, DESK, MONITOR, WALL]
+    assert found.evidence.classes.tolist() == [DESK, MONITOR, WALL]
+    assert found.evidence.counts.tolist() == [1, 2, 1]
+    assert found.evidence.confidence.tolist() == [1.0, 1.0, 1.0]
+    assert found.unknown == 1
+    assert found.room_type == found.evidence.room_type == 0  # a toilet is a bathroom
+    assert not found.evidence.observed.any()
+
+
+@pytest.mark.parametrize("room_type", [None, "unknown", "attic"])
+def test_rooms_without_a_type(room_type: str | None) -> None:
+    found = encoded(things("desk"), room_type=room_type)
+    assert found.room_type == -1
+    assert found.evidence.room_type is None
+
+
+def test_what_people_annotate_is_complete() -> None:
+    found = encoded(
+        things("desk", "monitor", "monitor", "pencil"),
+        relations=((1, "on-top", 0), (0, "under", 1), (2, "behind", 1)),
+    )
+    assert triples(found) == {(ON_TOP, MONITOR, DESK), (FRONT, MONITOR, MONITOR)}
+    assert found.instance_holds.sum() == 2
+    off_diagonal = ~np.eye(4, dtype=bool)
+    assert (found.instance_observed == off_diagonal).all()
+    # A class with one instance has no pair with itself.
+    single = found.evidence.counts == 1
+    assert (found.evidence.observed == ~np.diag(single)).all()
+
+
+def test_relations_of_structure_are_neither_on_nor_off() -> None:
+    found = encoded(
+        things("desk", "floor", "monitor"), relations=((0, "on-top", 1), (2, "on-top", 0))
+    )
+    assert triples(found) == {(ON_TOP, MONITOR, DESK)}
+    floor = list(found.evidence.classes).index(FLOOR)
+    assert not found.evidence.observed[:, floor].any()
+    assert not found.evidence.observed[:, :, floor].any()
+    assert not found.instance_observed[:, 1].any()
+    assert found.evidence.observed[:, 0, 1].all()
+
+
+def test_labels_that_a_source_annotates_incompletely_are_left_out() -> None:
+    found = encoded(things("wall", "desk", "floor"), source="sunrgbd")
+    assert found.evidence.classes.tolist() == [DESK]
+    assert found.unknown == 0
+    assert not annotated_classes([found], 5)[[WALL, FLOOR]].any()
+    assert encoded(things("wall", "desk")).evidence.classes.tolist() == [DESK, WALL]
+
+
+def test_poses_in_viewer_axes() -> None:
+    objects = (
+        AnnotatedObject("d", "desk", **DESK_BOX),
+        AnnotatedObject("m", "monitor", **MONITOR_BOX),
+        AnnotatedObject("p", "pencil", position=(1.4, 0.1, 0.8), size=(0.1, 0.1, 0.1)),
+        AnnotatedObject("w", "wall"),
+    )
+    found = encoded(objects, viewer_frame=True)
+    assert triples(found) == {
+        (ON_TOP, MONITOR, DESK),
+        (FRONT, PENCIL, DESK),
+        (FRONT, PENCIL, MONITOR),
+    }
+    assert found.evidence.observed[:, :3, :3][:, ~np.eye(3, dtype=bool)].all()
+    assert not found.evidence.observed[:, 3].any()
+
+
+def test_without_sizes_nothing_vertical_is_observed() -> None:
+    objects = (
+        AnnotatedObject("d", "desk", position=(2.0, 0.0, 0.4)),
+        AnnotatedObject("m", "monitor", position=(2.0, 0.3, 1.0)),
+    )
+    found = encoded(objects, viewer_frame=True)
+    assert triples(found) == {(LEFT, MONITOR, DESK)}
+    assert not found.evidence.observed[[ON_TOP, ABOVE]].any()
+
+
+def test_what_lies_in_a_drawer_is_on_its_desk() -> None:
+    objects = (
+        AnnotatedObject("d", "desk", **DESK_BOX),
+        # Inside the desk: by the boxes alone the pencil would be left of it.
+        AnnotatedObject("p", "pencil", position=(2.0, 0.5, 0.3), size=(0.01, 0.1, 0.01)),
+    )
+    assert triples(encoded(objects, viewer_frame=True)) == {(LEFT, PENCIL, DESK)}
+    linked = (objects[0], AnnotatedObject("p", "pencil", objects[1].position, objects[1].size,
+                                          supported_by="d"))  # fmt: skip
+    found = encoded(linked, viewer_frame=True)
+    assert triples(found) == {(ON_TOP, PENCIL, DESK)}
+    assert found.evidence.observed[:, 0, 1].all()
+    assert found.evidence.observed[:, 1, 0].all()
+
+
+def test_support_links_alone_say_only_that() -> None:
+    objects = (AnnotatedObject("d", "desk"), AnnotatedObject("m", "monitor", supported_by="d"),
+               AnnotatedObject("p", "pencil"))  # fmt: skip
+    found = encoded(objects)
+    assert triples(found) == {(ON_TOP, MONITOR, DESK)}
+    assert not found.evidence.observed[:, 2].any()
+
+
+def test_boxes_in_an_image() -> None:
+    objects = (
+        AnnotatedObject("d", "desk", box2d=(0, 50, 60, 90)),
+        AnnotatedObject("m", "monitor", box2d=(20, 10, 50, 48)),
+    )
+    found = encoded(objects)
+    assert triples(found) == {(ABOVE, MONITOR, DESK)}
+    assert not found.evidence.observed[[FRONT, ON_TOP]].any()
+
+
+@given(st.text(min_size=1, max_size=8))
+def test_rooms_without_axes_are_seen_from_one_of_their_sides(scene_id: str) -> None:
+    positions = np.array([[1.0, 2.0, 0.0], [5.0, 8.0, 1.0], [math.nan] * 3, [2.0, 3.0, 9.0]])
+    viewpoint = room_viewpoint(scene_id, positions)
+    assert viewpoint in (
+        Viewpoint(1.0, 5.0, 0.0),
+        Viewpoint(5.0, 5.0, math.pi),
+        Viewpoint(3.0, 2.0, math.pi / 2),
+        Viewpoint(3.0, 8.0, -math.pi / 2),
+    )
+    assert viewpoint == room_viewpoint(scene_id, positions[::-1])
+
+
+def test_every_side_is_taken() -> None:
+    positions = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 0.0]])
+    sides = [room_viewpoint(f"scene-{k}", positions) for k in range(400)]
+    # 100 expected a side; under 60 or over 140 has a probability below 1e-5.
+    for side in set(sides):
+        assert 60 < sides.count(side) < 140
+    assert len(set(sides)) == 4
+    with pytest.raises(ValueError, match="no object with a position"):
+        room_viewpoint("s", np.full((2, 3), math.nan))
+
+
+def test_world_axes_are_left_for_the_viewpoint() -> None:
+    objects = (
+        AnnotatedObject("d", "desk", position=(0.0, 0.0, 0.4), size=(0.5, 0.5, 0.8)),
+        AnnotatedObject("m", "monitor", position=(1.0, 0.0, 0.4), size=(0.5, 0.5, 0.8)),
+    )
+    seen = {frozenset(triples(encoded(objects, scene_id=f"scene-{k}"))) for k in range(40)}
+    # From the four sides of the room: in front, behind, left and right.
+    assert seen == {
+        frozenset({(FRONT, DESK, MONITOR)}),
+        frozenset({(FRONT, MONITOR, DESK)}),
+        frozenset({(LEFT, DESK, MONITOR)}),
+        frozenset({(LEFT, MONITOR, DESK)}),
+    }
+
+
+def test_scenes_of_nothing() -> None:
+    found = encoded(things("goblet"), relations=())
+    assert found.unknown == 1
+    assert found.evidence.classes.shape == (0,)
+    assert found.evidence.holds.shape == (4, 0, 0)
+    assert encode([], VOCABULARY) == []
+
+
+def test_annotated_classes() -> None:
+    first, second = encoded(things("desk")), encoded(things("screen", "wall"))
+    assert annotated_classes([first, second], 5).tolist() == [True, True, False, True, False]
+    assert not annotated_classes([], 5).any()

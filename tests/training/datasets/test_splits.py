@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import random
+from collections import Counter, defaultdict
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from training.datasets import FRACTIONS, AnnotatedScene, split
+from training.datasets.splits import Protocol
+
+ROOMS = ("bedroom", "kitchen", "office", None)
+
+
+def collection(
+    source: str, groups: int, seed: int = 0, prefix: str | None = None
+) -> list[AnnotatedScene]:
+    """Groups of one to six scenes, most of one room type."""
+    rng = random.Random(f"{source}{seed}")
+    return [
+        AnnotatedScene(f"{source}-{g}-{k}", source, f"{prefix or source}-{g}", room, ())
+        for g in range(groups)
+        for room in [rng.choices(ROOMS, (5, 3, 2, 1))[0]]
+        for k in range(rng.randint(1, 6))
+    ]
+
+
+def parts_of(scenes: list[AnnotatedScene], **options: object) -> dict[str, str]:
+    return {
+        scene.scene_id: part
+        for part, members in split(scenes, **options).items()  # type: ignore[arg-type]
+        for scene in members
+    }
+
+
+@given(st.integers(0, 40), st.integers(0, 5), st.sampled_from(["group", "random"]))
+def test_every_scene_has_one_part_whatever_the_order(
+    groups: int, seed: int, protocol: Protocol
+) -> None:
+    scenes = collection("a", groups)
+    found = parts_of(scenes, seed=seed, protocol=protocol)
+    assert set(found) == {scene.scene_id for scene in scenes}
+    shuffled = random.Random(seed).sample(scenes, len(scenes))
+    assert parts_of(shuffled, seed=seed, protocol=protocol) == found
+    assert sum(map(len, split(scenes, seed=seed, protocol=protocol).values())) == len(scenes)
+
+
+@given(st.integers(1, 60), st.integers(0, 5))
+def test_groups_stay_whole_across_sources(groups: int, seed: int) -> None:
+    frames = collection("frames", groups, prefix="place")
+    boxes = collection("boxes", groups // 2, seed=1, prefix="place")
+    found = parts_of([*frames, *boxes], seed=seed)
+    parts = defaultdict(set)
+    for scene in (*frames, *boxes):
+        parts[scene.group].add(found[scene.scene_id])
+    assert all(len(of) == 1 for of in parts.values())
+
+
+def test_a_source_splits_alone_as_it_does_among_others() -> None:
+    frames = collection("frames", 80, prefix="place")
+    boxes = collection("boxes", 20, seed=1, prefix="place")
+    other = collection("other", 50)
+    together = parts_of([*other, *frames, *boxes], seed=3)
+    alone = parts_of(frames, seed=3) | parts_of(other, seed=3)
+    assert {key: part for key, part in together.items() if key in alone} == alone
+
+
+@pytest.mark.parametrize("protocol", ["group", "random"])
+def test_shares_hold_over_all_and_within_room_types(protocol: Protocol) -> None:
+    scenes = collection("a", 400)
+    parts = split(scenes, seed=1, protocol=protocol)
+    assert list(parts) == ["train", "test", "validation"]
+    room_size = Counter(scene.room_type for scene in scenes)
+    for part, fraction in FRACTIONS.items():
+        # A part is off by at most the scenes of a group in each stratum.
+        assert len(parts[part]) == pytest.approx(fraction * len(scenes), abs=8)
+        here = Counter(scene.room_type for scene in parts[part])
+        for room, size in room_size.items():
+            assert here[room] == pytest.approx(fraction * size, abs=8)
+
+
+def test_seeds_draw_different_splits() -> None:
+    scenes = collection("a", 100)
+    assert parts_of(scenes, seed=0) == parts_of(scenes, seed=0)
+    assert parts_of(scenes, seed=0) != parts_of(scenes, seed=1)
+
+
+def test_the_seed_protocol_tears_groups_apart() -> None:
+    scenes = collection("a", 60)
+    found = parts_of(scenes, seed=0, protocol="random")
+    parts = defaultdict(set)
+    for scene in scenes:
+        parts[scene.group].add(found[scene.scene_id])
+    assert any(len(of) > 1 for of in parts.values())
+
+
+def test_bad_requests_are_refused() -> None:
+    scenes = collection("a", 3)
+    with pytest.raises(ValueError, match="protocol must be"):
+        split(scenes, seed=0, protocol="house")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="share one scene_id"):
+        split([*scenes, scenes[0]], seed=0)

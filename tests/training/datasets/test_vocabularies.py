@@ -1,0 +1,226 @@
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.datasets import (
+    AnnotatedObject,
+    AnnotatedScene,
+    Names,
+    build_vocabulary,
+    coverage,
+    curated_names,
+    encode,
+    indoor_vocabulary,
+    read_scenes,
+    source_vocabulary,
+    with_typical_sizes,
+    write_indoor_vocabulary,
+)
+from training.datasets.vocabulary import MINIMUM_MENTIONS
+
+NAMES = Names(
+    base=("chair", "throne"),
+    structure=("wall",),
+    not_objects=("space",),
+    outdoor=("sky",),
+    aliases={"sofa": ("couch",), "wall": ("partition wall",)},
+    rooms={"bathroom": ("toilet",), "": ("room",)},
+)
+
+
+def scenes(*labels: str, room: str | None = None, times: int = 1) -> list[AnnotatedScene]:
+    things = tuple(AnnotatedObject(str(i), label) for i, label in enumerate(labels))
+    return [AnnotatedScene(f"s{k}", "t", "g", room, things) for k in range(times)]
+
+
+def test_labels_are_pooled_under_their_curated_names() -> None:
+    found = build_vocabulary(
+        scenes("couch", "Sofas", "tea_pot", "Teapot", "teapot", "lamp"), NAMES, minimum=2
+    )
+    assert found.labels == ("teapot", "sofa", "chair", "throne")
+    assert found.index("COUCH") == found.index("sofa") == 1
+    assert found.index("lamp") is None
+
+
+def test_some_labels_become_no_class() -> None:
+    given = scenes("space", "sky", "wall", "walls", "partition wall")
+    found = build_vocabulary(given, NAMES, minimum=1)
+    assert found.labels == ("wall", "chair", "throne")
+    assert found.structure.tolist() == [True, False, False]
+    assert build_vocabulary(given, NAMES, minimum=1, outdoor=True).index("sky") is not None
+
+
+def test_rooms_have_one_spelling() -> None:
+    given = [
+        *scenes("chair", room="bed_room"),
+        *scenes("chair", room="Bed Room"),
+        *scenes("chair", room="toilet"),
+        *scenes("chair", room="bathroom"),
+        *scenes("chair", room="attic"),
+        *scenes("chair", room="room", times=3),
+        *scenes("chair", times=3),
+    ]
+    assert build_vocabulary(given, NAMES, minimum=2).room_types == ("bathroom", "bed room")
+
+
+def test_names_that_mean_two_things_are_refused() -> None:
+    with pytest.raises(ValueError, match="aliases: 'Couches' names both 'sofa' and 'bench'"):
+        Names(aliases={"sofa": ("couch",), "bench": ("Couches",)})
+    with pytest.raises(ValueError, match="base class 'couch' is an alias of 'sofa'"):
+        Names(base=("couch",), aliases={"sofa": ("couch",)})
+
+
+def test_sources_have_a_vocabulary_of_their_own() -> None:
+    found = source_vocabulary(scenes("television", "sky", "wall", times=MINIMUM_MENTIONS))
+    assert sorted(found.labels) == ["sky", "tv", "wall"]
+    assert found.index("TV") is not None
+    assert found.structure[found.index("wall")]
+
+
+def test_typical_sizes_are_medians_of_square_footprints() -> None:
+    vocabulary = build_vocabulary(scenes("chair", "lamp"), Names(), minimum=1)
+    boxes = [
+        AnnotatedScene(
+            f"s{k}", "t", "g", None,
+            (
+                AnnotatedObject("0", "Chairs", size=(0.2 * k, 0.8 * k, 1.0 * k)),
+                AnnotatedObject("1", "throne", size=(9.0, 9.0, 9.0)),
+                AnnotatedObject("2", "lamp"),
+            ),
+        )
+        for k in range(1, 6)
+    ]  # fmt: skip
+    found = with_typical_sizes(vocabulary, boxes)
+    assert found.objects[0].size == pytest.approx((1.2, 1.2, 3.0))
+    assert found.objects[1].size is None
+    assert np.isnan(found.sizes[1]).all()
+    # Too few boxes say nothing.
+    assert with_typical_sizes(vocabulary, boxes[:4]) == vocabulary
+
+
+def test_coverage_counts_mentions() -> None:
+    vocabulary = build_vocabulary(scenes("chair", "wall"), NAMES, minimum=1)
+    given = scenes("chairs", "chair", "wall", "sky")
+    assert coverage(vocabulary, given) == 0.75
+    assert coverage(vocabulary, given, structure=False) == pytest.approx(2 / 3)
+    with pytest.raises(ValueError, match="mention no object"):
+        coverage(vocabulary, scenes())
+
+
+# ------------------------------------------------------------------------- the committed files
+
+
+def test_the_committed_vocabulary_follows_the_curated_names() -> None:
+    names, vocabulary = curated_names(), indoor_vocabulary()
+    assert 400 < len(vocabulary) <= 700
+    for label in names.base:
+        index = vocabulary.index(label)
+        assert index is not None
+        assert vocabulary.labels[index] == label
+    for label, aliases in names.aliases.items():
+        if (index := vocabulary.index(label)) is not None:
+            assert all(vocabulary.index(alias) == index for alias in aliases), label
+    structure = {vocabulary.labels[i] for i in np.flatnonzero(vocabulary.structure)}
+    assert structure == set(names.structure)
+    for label in (*names.not_objects, *names.outdoor):
+        assert vocabulary.index(label) is None
+    assert all(entry.size is None for entry in vocabulary.objects)
+    assert all(names.canonical_room(room) == room for room in vocabulary.room_types)
+
+
+@pytest.mark.parametrize(
+    ("spelling", "label"),
+    [
+        ("television", "tv"),
+        ("TVs", "tv"),
+        ("tvstand", "tv stand"),
+        ("arm chair", "armchair"),
+        ("cell_phone", "cell phone"),
+        ("HousePlant", "plant"),
+        ("garbage can", "garbage bin"),
+        ("Trash Cans", "garbage bin"),
+        ("remote", "remote control"),
+        ("counter top", "counter"),
+        ("night_stand", "nightstand"),
+        ("books", "book"),
+        ("couch", "sofa"),
+        ("glasses", "glasses"),
+        ("glass", "glass"),
+        ("dining table", "dining table"),
+        ("stairs", "stairs"),
+        ("dishes", "dish"),
+    ],
+)
+def test_one_thing_has_one_class(spelling: str, label: str) -> None:
+    vocabulary = indoor_vocabulary()
+    index = vocabulary.index(spelling)
+    assert index is not None
+    assert vocabulary.labels[index] == label
+
+
+@pytest.fixture(scope="module")
+def real(repository: Path) -> dict[str, list[AnnotatedScene]]:
+    folder = repository.parent / "shared" / "data"
+    paths = sorted(folder.glob("*.jsonl.gz"))
+    if not paths:
+        pytest.skip("the real scenes of ../shared/data are not here")
+    return {path.name.removesuffix(".jsonl.gz"): read_scenes(path) for path in paths}
+
+
+def test_the_committed_vocabulary_is_what_the_data_give(
+    real: dict[str, list[AnnotatedScene]], tmp_path: Path
+) -> None:
+    everything = [scene for source in real.values() for scene in source]
+    path = tmp_path / "indoor.json"
+    written = write_indoor_vocabulary(everything, path)
+    assert written == indoor_vocabulary(path) == indoor_vocabulary()
+    mentions = Counter(
+        index
+        for scene in everything
+        for thing in scene.objects
+        if (index := written.index(thing.label)) is not None
+    )
+    assert all(mentions[i] >= MINIMUM_MENTIONS for i in range(len(written)))
+
+
+def test_coverage_of_the_real_scenes(real: dict[str, list[AnnotatedScene]]) -> None:
+    vocabulary = indoor_vocabulary()
+    for source, least in (
+        ("sunrgbd", 0.93),
+        ("sunrgbd_bedrooms_3d", 0.98),
+        ("3dssg", 0.98),
+        ("procthor", 0.98),
+    ):
+        assert coverage(vocabulary, real[source]) >= least
+        assert coverage(vocabulary, real[source], structure=False) >= least
+
+
+def test_the_417_most_frequent_labels_are_known(repository: Path) -> None:
+    path = repository.parent / "shared" / "design" / "vocabulary.json"
+    if not path.is_file():
+        pytest.skip("the list of ../shared/design is not here")
+    vocabulary = indoor_vocabulary()
+    entries = json.loads(path.read_text())["objects"]
+    assert len(entries) == 417
+    for entry in entries:
+        index = vocabulary.index(entry["label"])
+        assert index is not None
+        assert all(vocabulary.index(alias) == index for alias in entry["aliases"])
+
+
+def test_real_scenes_encode(real: dict[str, list[AnnotatedScene]]) -> None:
+    vocabulary = indoor_vocabulary()
+    bedrooms = encode(real["sunrgbd_bedrooms_3d"], vocabulary)
+    assert sum(scene.evidence.holds[:2].sum() for scene in bedrooms) > 1000
+    # No sizes: nothing is known of what stands on what.
+    assert not any(scene.evidence.observed[2:].any() for scene in bedrooms)
+    wall, floor = vocabulary.index("wall"), vocabulary.index("floor")
+    for scene in encode(real["sunrgbd"], vocabulary):
+        assert wall not in scene.evidence.classes
+        assert floor not in scene.evidence.classes
+        assert not scene.evidence.observed.any()
