@@ -1,0 +1,116 @@
+"""The service in process and as a process of its own, over stores of small random machines."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from app.main import create_app
+from app.settings import Settings
+from tests.http.stores import make_store
+
+ADMIN_KEY = "correct-horse-battery-staple"
+
+Serve = Callable[..., AbstractAsyncContextManager[httpx.AsyncClient]]
+
+
+@asynccontextmanager
+async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient]:
+    """A client of the application over a store, inside its lifespan."""
+    app = create_app(Settings(store=store, admin_key=ADMIN_KEY, **settings))
+    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(transport=transport, base_url="http://service") as client,
+    ):
+        client.app = app  # type: ignore[attr-defined]
+        yield client
+
+
+@pytest.fixture(scope="session")
+def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store that no test changes."""
+    return make_store(tmp_path_factory.mktemp("store"))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """A store of the test's own."""
+    return make_store(tmp_path / "store")
+
+
+@pytest.fixture(scope="session")
+async def client(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
+    """A client of the service in process."""
+    async with serve(shared_store) as client:
+        yield client
+
+
+@pytest.fixture
+def admin() -> dict[str, str]:
+    """The headers of an administrator."""
+    return {"X-Admin-Key": ADMIN_KEY}
+
+
+@dataclass
+class LiveService:
+    """A running ``python -m app``."""
+
+    process: subprocess.Popen[str]
+    client: httpx.Client
+    port: int
+    log: Path
+
+
+def launch(store: Path, log: Path, **variables: str) -> LiveService:
+    """Start ``python -m app`` on a free port and wait until it answers."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
+    }
+    environment |= {
+        "SCENE_STORE": str(store),
+        "SCENE_PORT": str(port),
+        "SCENE_ADMIN_KEY": ADMIN_KEY,
+        **variables,
+    }
+    with log.open("w") as stream:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "app"], env=environment, stderr=stream, text=True
+        )
+    client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        try:
+            client.get("/health/live")
+        except httpx.ConnectError:
+            if process.poll() is not None:
+                break
+            time.sleep(0.02)
+        else:
+            return LiveService(process, client, port, log)
+    process.kill()
+    raise AssertionError(f"the service did not start:\n{log.read_text()}")
+
+
+@pytest.fixture(scope="session")
+def live(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    """The service as a process of its own."""
+    service = launch(shared_store, tmp_path_factory.mktemp("live") / "log")
+    yield service
+    service.client.close()
+    service.process.terminate()
+    service.process.wait(timeout=30)

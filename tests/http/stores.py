@@ -1,0 +1,118 @@
+"""Stores of small untrained machines with random weights: real artifacts, read as any other."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import torch
+
+from app.boltzmann import BoltzmannMachine, MachineSpec, build
+from app.registry import (
+    Calibration,
+    DataSource,
+    Description,
+    Metric,
+    Store,
+    VocabularyEntry,
+)
+from app.scene.relations import CANONICAL
+from app.scene.vocabulary import ObjectClass, Vocabulary
+
+VOCABULARY = Vocabulary(
+    [
+        ObjectClass("bed"),
+        ObjectClass("nightstand", ("bedside table",)),
+        ObjectClass("lamp", size=(0.2, 0.2, 0.4)),
+        ObjectClass("chair"),
+        ObjectClass("table", ("desk table",)),
+        ObjectClass("desk", size=(0.7, 1.4, 0.8)),
+        ObjectClass("television", ("tv",)),
+        ObjectClass("keyboard"),
+        ObjectClass("garbage bin", ("trash can", "waste basket")),
+        ObjectClass("sofa", ("couch",)),
+        ObjectClass("sink"),
+        ObjectClass("toilet"),
+        ObjectClass("book"),
+        ObjectClass("pillow"),
+        ObjectClass("floor", structure=True),
+        ObjectClass("object", structure=True),
+    ],
+    ("bedroom", "bathroom", "office"),
+)
+V, A, C = len(VOCABULARY), len(CANONICAL), len(VOCABULARY.room_types)
+TRIPLES = torch.tensor([(0, 0, 1), (0, 1, 0), (1, 3, 5), (2, 2, 1), (2, 7, 5), (3, 2, 0)])
+SPECS = {
+    "triway": MachineSpec("triway", V=V, A=A, H1=6, C=C, K=3, T=len(TRIPLES), form="local"),
+    "gbm": MachineSpec("gbm", V=V, A=A, H1=6, H2=4, C=C, T=len(TRIPLES)),
+    "rbm": MachineSpec("rbm", V=V, A=A, H1=6, C=C, T=len(TRIPLES)),
+}
+
+
+def random_machine(variant: str, seed: int = 0) -> BoltzmannMachine:
+    """A machine whose every weight is drawn from N(0, 0.5²)."""
+    generator = torch.Generator().manual_seed(seed)
+    machine = build(SPECS[variant]).set_triples(TRIPLES)
+    with torch.no_grad():
+        for parameter in machine.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
+    return machine.requires_grad_(False)
+
+
+def publish(
+    root: Path,
+    name: str,
+    version: str,
+    *,
+    variant: str = "triway",
+    seed: int = 0,
+    alias: str | None = None,
+) -> None:
+    """Publish a random machine."""
+    Store(root).publish(
+        Description(
+            name=name,
+            version=version,
+            created=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
+            spec=SPECS[variant].to_dict(),
+            vocabulary=VocabularyEntry.of(VOCABULARY),
+            calibration=Calibration.neutral(A),
+            training={"objective": "none: random weights", "seed": seed},
+            data=(
+                DataSource(
+                    source="made up",
+                    scenes=0,
+                    digest="0" * 64,
+                    terms="none",
+                    research_only=False,
+                ),
+            ),
+            metrics=(
+                Metric(
+                    task="T2", source="made up", metric="MRR", value=0.5, low=0.4, high=0.6, n=10
+                ),
+            ),
+            terms="public domain",
+            libraries={"torch": torch.__version__},
+        ),
+        random_machine(variant, seed).state_dict(),
+        alias=alias,
+    )
+
+
+def make_store(root: Path) -> Path:
+    """home 1.0.0 (the default) and 1.1.0 (candidate), and an RBM and a GBM beside them."""
+    publish(root, "home", "1.0.0", alias="default")
+    publish(root, "home", "1.1.0", seed=1, alias="candidate")
+    publish(root, "plain", "1.0.0", variant="rbm")
+    publish(root, "deep", "0.1.0", variant="gbm")
+    return root
+
+
+def corrupt(root: Path, name: str, version: str) -> None:
+    """Change one byte of the weights."""
+    weights = root / name / version / "model.safetensors"
+    data = bytearray(weights.read_bytes())
+    data[-1] ^= 0x40
+    weights.chmod(0o644)
+    weights.write_bytes(bytes(data))

@@ -1,0 +1,94 @@
+"""Batches: one entry a scene, in order, each as if it had come alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import pytest
+
+pytestmark = pytest.mark.anyio
+
+ENTRIES: list[Any] = [
+    {"objects": ["bed", "lamp"]},
+    {"objects": ["bed", "droid"]},
+    "no scene at all",
+    {"objects": ["bed", {"label": "lamp", "confidence": 3}]},
+    {"objects": ["bed", "lamp"], "model": "nobody"},
+    {"objects": []},
+    {"objects": ["bed", "chair"], "model": "plain"},
+]
+QUESTIONS = ["relations", "missing", "outliers"]
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+async def test_every_entry_gets_its_own_result_or_problem(
+    client: httpx.AsyncClient, question: str
+) -> None:
+    response = await client.post(f"/{question}/batch", json={"scenes": ENTRIES})
+    assert response.status_code == 200
+    answer = response.json()
+    assert answer["request_id"] == response.headers["x-request-id"]
+    assert [entry["status"] for entry in answer["results"]] == [200, 422, 422, 422, 404, 422, 200]
+    for entry in answer["results"]:
+        assert ("result" in entry) == (entry["status"] == 200)
+        assert ("problem" in entry) == (entry["status"] != 200)
+    unknown = answer["results"][1]["problem"]
+    assert unknown["type"] == "/problems/unknown-labels"
+    assert unknown["errors"][0]["pointer"] == "#/scenes/1/objects/1"
+    assert answer["results"][2]["problem"]["errors"][0]["pointer"] == "#/scenes/2"
+    pointer = answer["results"][3]["problem"]["errors"][0]["pointer"]
+    assert pointer == "#/scenes/3/objects/1/confidence"
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+async def test_results_are_those_of_single_requests(
+    client: httpx.AsyncClient, question: str
+) -> None:
+    headers = {"X-Request-Id": "one"}
+    batch = await client.post(f"/{question}/batch", json={"scenes": ENTRIES}, headers=headers)
+    for entry, scene in zip(batch.json()["results"], ENTRIES, strict=True):
+        alone = await client.post(f"/{question}", json=scene, headers=headers)
+        assert alone.status_code == entry["status"]
+        if entry["status"] == 200:
+            assert alone.json() == entry["result"]
+        else:
+            assert alone.json()["type"] == entry["problem"]["type"]
+
+
+@pytest.mark.parametrize("scenes", [[], [{"objects": ["bed"]}] * 257, {}, None])
+async def test_a_batch_holds_1_to_256_scenes(client: httpx.AsyncClient, scenes: Any) -> None:
+    response = await client.post("/relations/batch", json={"scenes": scenes})
+    assert response.status_code == 422
+    assert response.json()["errors"][0]["pointer"] == "#/scenes"
+
+
+async def test_256_scenes_are_answered(client: httpx.AsyncClient) -> None:
+    scenes = [{"objects": ["bed", "lamp", "chair"], "seed": i} for i in range(256)]
+    response = await client.post("/missing/batch", json={"scenes": scenes})
+    assert {entry["status"] for entry in response.json()["results"]} == {200}
+    assert len(response.json()["results"]) == 256
+
+
+async def test_there_is_no_batch_of_drawings(client: httpx.AsyncClient) -> None:
+    assert (await client.post("/generate/batch", json={"scenes": []})).status_code == 404
+
+
+async def test_a_defect_spoils_one_entry_only(
+    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from app.serving import questions
+
+    real = questions.reasoning.outliers
+
+    def fail_on_sofas(artifact: Any, scene: Any, **parameters: Any) -> Any:
+        if any(thing.label == "sofa" for thing in scene.objects):
+            raise ZeroDivisionError("secret detail")
+        return real(artifact, scene, **parameters)
+
+    monkeypatch.setattr(questions.reasoning, "outliers", fail_on_sofas)
+    scenes = [{"objects": ["bed"]}, {"objects": ["sofa"]}, {"objects": ["lamp"]}]
+    response = await client.post("/outliers/batch", json={"scenes": scenes})
+    assert [entry["status"] for entry in response.json()["results"]] == [200, 500, 200]
+    assert response.json()["results"][1]["problem"]["type"] == "/problems/internal-error"
+    assert "secret" not in response.text

@@ -1,0 +1,125 @@
+"""Liveness, readiness, and what a service says whose models are broken."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import httpx
+import pytest
+
+from app.main import create_app
+from app.settings import Settings
+from tests.http.conftest import serve
+from tests.http.stores import corrupt
+from tests.http.test_problems import problem
+
+pytestmark = pytest.mark.anyio
+
+READY = ["/health/ready", "/v2/health/ready", "/v2/models/default/ready"]
+
+
+async def test_a_ready_service_says_so(client: httpx.AsyncClient) -> None:
+    answers = {
+        "/health/live": {"status": "live"},
+        "/health/ready": {"status": "ready"},
+        "/v2/health/live": {"live": True},
+        "/v2/health/ready": {"ready": True},
+        "/v2/models/candidate/ready": {"name": "home", "ready": True},
+    }
+    for path, expected in answers.items():
+        response = await client.get(path)
+        assert (response.status_code, response.json()) == (200, expected)
+
+
+async def test_protocol_metadata(client: httpx.AsyncClient) -> None:
+    server = (await client.get("/v2")).json()
+    assert set(server) == {"name", "version", "extensions"}
+    model = (await client.get("/v2/models/default")).json()
+    assert model["name"] == "home"
+    assert model["versions"] == ["1.0.0", "1.1.0"]
+    assert model["platform"] == "torch_triway"
+
+
+async def test_before_its_start_a_service_is_live_and_not_ready(shared_store: Path) -> None:
+    app = create_app(Settings(store=shared_store))
+    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+        assert (await client.get("/health/live")).status_code == 200
+        for path in (*READY, "/models"):
+            problem(await client.get(path), 503, "not-ready")
+        problem(await client.post("/relations", json={"objects": ["bed"]}), 503, "not-ready")
+        problem(await client.post("/missing/batch", json={"scenes": [{}]}), 503, "not-ready")
+
+
+async def test_a_broken_default_keeps_the_service_not_ready(store: Path) -> None:
+    corrupt(store, "home", "1.0.0")
+    async with serve(store, retry_after=7) as client:
+        assert (await client.get("/health/live")).status_code == 200
+        for path in READY:
+            response = await client.get(path)
+            problem(response, 503, "not-ready")
+            assert response.headers["retry-after"] == "7"
+        problem(await client.post("/relations", json={"objects": ["bed"]}), 503, "not-ready")
+        # No older or newer version stands in for it, and what is whole answers by its own name.
+        body = {"objects": ["bed"], "model": "home@1.1.0"}
+        assert (await client.post("/relations", json=body)).status_code == 200
+        failures = {
+            entry["subject"]: entry for entry in (await client.get("/models")).json()["failures"]
+        }
+        assert set(failures) == {"home@1.0.0", "default"}
+        assert failures["home@1.0.0"]["reason"] == "checksum_mismatch"
+        assert str(store) not in str(failures)
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate", "no weights", "no manifest", "extra"])
+async def test_another_broken_version_is_listed_as_refused(store: Path, damage: str) -> None:
+    folder = store / "plain" / "1.0.0"
+    weights = folder / "model.safetensors"
+    if damage == "flip":
+        corrupt(store, "plain", "1.0.0")
+    elif damage == "truncate":
+        weights.write_bytes(weights.read_bytes()[:-10])
+    elif damage == "no weights":
+        weights.unlink()
+    elif damage == "no manifest":
+        (folder / "manifest.json").unlink()
+    else:
+        (folder / "code.py").write_text("print()")
+    async with serve(store) as client:
+        for path in READY:
+            assert (await client.get(path)).status_code == 200
+        (version,) = (await client.get("/models/plain")).json()["versions"]
+        assert version["status"] == "refused"
+        assert version["reason"]
+        assert version["detail"]
+        details = (await client.get("/models/plain/versions/1.0.0")).json()
+        assert details["status"] == "refused"
+        assert "card" not in details
+        body = {"objects": ["bed"], "model": "plain"}
+        problem(await client.post("/relations", json=body), 503, "model-unavailable")
+        for path in (
+            "/models/plain/vocabulary",
+            "/models/plain/contexts",
+            "/v2/models/plain/ready",
+        ):
+            problem(await client.get(path), 503, "model-unavailable")
+
+
+async def test_an_empty_store_is_not_ready(tmp_path: Path, admin: dict[str, str]) -> None:
+    async with serve(tmp_path) as client:
+        problem(await client.get("/health/ready"), 503, "not-ready")
+        assert (await client.get("/models")).json()["models"] == []
+        problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
+
+
+async def test_a_repaired_store_is_taken_over_by_a_refresh(
+    store: Path, tmp_path: Path, admin: dict[str, str]
+) -> None:
+    folder = store / "home" / "1.0.0"
+    shutil.move(folder, tmp_path / "aside")
+    async with serve(store) as client:
+        problem(await client.get("/health/ready"), 503, "not-ready")
+        shutil.move(tmp_path / "aside", folder)
+        assert (await client.post("/models/refresh", headers=admin)).status_code == 200
+        assert (await client.get("/health/ready")).status_code == 200

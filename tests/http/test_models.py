@@ -1,0 +1,474 @@
+"""Listing, refreshing and promoting models."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import shutil
+import weakref
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.http.conftest import ADMIN_KEY, serve
+from tests.http.stores import VOCABULARY, corrupt, publish
+from tests.http.test_problems import problem
+
+pytestmark = pytest.mark.anyio
+
+
+async def default(client: httpx.AsyncClient) -> str:
+    response = await client.post("/relations", json={"objects": ["bed", "lamp"]})
+    assert response.status_code == 200, response.text
+    model = response.json()["model"]
+    return f"{model['name']}@{model['version']}"
+
+
+# ----------------------------------------------------------------------------------- reading
+
+
+async def test_models_versions_and_aliases_are_listed(client: httpx.AsyncClient) -> None:
+    listing = (await client.get("/models")).json()
+    assert listing["aliases"] == {"candidate": "home@1.1.0", "default": "home@1.0.0"}
+    assert listing["failures"] == []
+    models = {model["name"]: model["versions"] for model in listing["models"]}
+    assert set(models) == {"home", "plain", "deep"}
+    assert [version["version"] for version in models["home"]] == ["1.1.0", "1.0.0"]
+    assert [version["aliases"] for version in models["home"]] == [["candidate"], ["default"]]
+    assert {version["status"] for versions in models.values() for version in versions} == {"ready"}
+    assert models["plain"][0]["variant"] == "rbm"
+
+
+@pytest.mark.parametrize("name", ["home", "default", "candidate"])
+async def test_a_model_is_found_by_name_and_alias(client: httpx.AsyncClient, name: str) -> None:
+    model = (await client.get(f"/models/{name}")).json()
+    assert model["name"] == "home"
+    assert len(model["versions"]) == 2
+
+
+async def test_a_version_tells_everything(client: httpx.AsyncClient) -> None:
+    version = (await client.get("/models/home/versions/1.0.0")).json()
+    assert version["status"] == "ready"
+    assert version["aliases"] == ["default"]
+    assert version["metrics"][0] | {"low": 0.4, "high": 0.6} == version["metrics"][0]
+    assert version["data"][0]["source"] == "made up"
+    assert version["terms"] == "public domain"
+    assert version["card"].startswith("#")
+    assert version["parameters"] > 0
+    answer = await client.post("/relations", json={"objects": ["bed"], "model": "home@1.0.0"})
+    assert answer.json()["model"]["digest"] == version["digest"]
+
+
+async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> None:
+    words = (await client.get("/models/default/vocabulary")).json()
+    assert [entry["label"] for entry in words["objects"]] == list(VOCABULARY.labels)
+    assert words["objects"][8]["aliases"] == ["trash can", "waste basket"]
+    assert [entry["label"] for entry in words["objects"] if entry["structure"]] == [
+        "floor",
+        "object",
+    ]
+    assert words["room_types"] == list(VOCABULARY.room_types)
+    assert len(set(words["relations"])) == 8
+    assert words["model"]["version"] == "1.0.0"
+
+
+@pytest.mark.parametrize(("name", "layers"), [("home", {"h1": 6}), ("deep", {"h1": 6, "h2": 4})])
+async def test_contexts_name_every_hidden_unit(
+    client: httpx.AsyncClient, name: str, layers: dict[str, int]
+) -> None:
+    contexts = (await client.get(f"/models/{name}/contexts")).json()["layers"]
+    assert {layer: len(units) for layer, units in contexts.items()} == layers
+    for units in contexts.values():
+        assert [unit["unit"] for unit in units] == list(range(len(units)))
+        for unit in units:
+            assert unit["objects"]
+            assert {entry["label"] for entry in unit["objects"]} <= set(VOCABULARY.labels)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/models/nobody",
+        "/models/nobody/versions/1.0.0",
+        "/models/home/versions/9.9.9",
+        "/models/home/versions/nonsense",
+        "/models/nobody/vocabulary",
+        "/models/home@9.9.9/contexts",
+        "/v2/models/nobody",
+        "/v2/models/nobody/ready",
+    ],
+)
+async def test_unknown_models_are_not_found(client: httpx.AsyncClient, path: str) -> None:
+    problem(await client.get(path), 404, "model-not-found")
+
+
+# --------------------------------------------------------------------------------- admin key
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"X-Admin-Key": "wrong"},
+        {"X-Admin-Key": ADMIN_KEY[:-1]},
+        {"X-Admin-Key": ADMIN_KEY + "x"},
+        {"X-Admin-Key": "é".encode()},
+        {"Authorization": ADMIN_KEY},
+        {"Authorization": f"Basic {ADMIN_KEY}"},
+        {"Authorization": "Bearer "},
+    ],
+)
+async def test_admin_routes_need_the_key(client: httpx.AsyncClient, headers: Any) -> None:
+    for method, path, body in (
+        ("POST", "/models/refresh", None),
+        ("PUT", "/models/aliases/default", b'{"model": "plain"}'),
+        # What a stranger sends is not even read.
+        ("PUT", "/models/aliases/default", b"{not json"),
+    ):
+        response = await client.request(method, path, content=body, headers=headers)
+        problem(response, 401, "unauthorized")
+        assert response.headers["www-authenticate"] == "Bearer"
+
+
+async def test_without_a_configured_key_admin_routes_are_off(store: Path) -> None:
+    from app.main import create_app
+    from app.settings import Settings
+
+    app = create_app(Settings(store=store))
+    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(transport=transport, base_url="http://service") as client,
+    ):
+        for headers in ({}, {"X-Admin-Key": ""}, {"X-Admin-Key": ADMIN_KEY}):
+            response = await client.post("/models/refresh", headers=headers)
+            problem(response, 401, "unauthorized")
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"X-Admin-Key": ADMIN_KEY},
+        {"Authorization": f"Bearer {ADMIN_KEY}"},
+        {"Authorization": f"bearer {ADMIN_KEY}"},
+    ],
+)
+async def test_the_key_opens_in_either_header(store: Path, headers: dict[str, str]) -> None:
+    async with serve(store) as client:
+        assert (await client.post("/models/refresh", headers=headers)).status_code == 200
+
+
+# ----------------------------------------------------------------------------------- refresh
+
+
+async def test_a_refresh_takes_over_new_versions(store: Path, admin: dict[str, str]) -> None:
+    async with serve(store) as client:
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        shutil.rmtree(store / "deep")
+        assert await default(client) == "home@1.0.0"
+        response = await client.post("/models/refresh", headers=admin)
+        assert response.status_code == 200
+        answer = response.json()
+        assert answer["added"] == ["home@2.0.0"]
+        assert answer["removed"] == ["deep@0.1.0"]
+        assert answer["default"]["version"] == "2.0.0"
+        assert answer["request_id"] == response.headers["x-request-id"]
+        assert await default(client) == "home@2.0.0"
+        problem(await client.get("/models/deep"), 404, "model-not-found")
+        again = (await client.post("/models/refresh", headers=admin)).json()
+        assert (again["added"], again["removed"]) == ([], [])
+
+
+async def test_a_broken_new_version_changes_nothing(store: Path, admin: dict[str, str]) -> None:
+    async with serve(store) as client:
+        before = (await client.get("/models")).json()
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        corrupt(store, "home", "2.0.0")
+        document = problem(
+            await client.post("/models/refresh", headers=admin), 409, "refresh-refused"
+        )
+        failures = {failure["subject"]: failure["reason"] for failure in document["failures"]}
+        assert failures["home@2.0.0"] == "checksum_mismatch"
+        assert failures["default"] == "checksum_mismatch"
+        assert (await client.get("/models")).json() == before
+        assert await default(client) == "home@1.0.0"
+        assert (await client.get("/health/ready")).status_code == 200
+
+
+async def test_a_served_version_that_rots_on_disk_goes_on_answering(
+    store: Path, admin: dict[str, str]
+) -> None:
+    async with serve(store) as client:
+        corrupt(store, "plain", "1.0.0")
+        document = problem(
+            await client.post("/models/refresh", headers=admin), 409, "refresh-refused"
+        )
+        assert [failure["subject"] for failure in document["failures"]] == ["plain@1.0.0"]
+        body = {"objects": ["bed"], "model": "plain"}
+        assert (await client.post("/relations", json=body)).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "contents", ['{"default": {"name": "nobody", "version": null}}', "{", "[]"]
+)
+async def test_broken_aliases_change_nothing(
+    store: Path, admin: dict[str, str], contents: str
+) -> None:
+    async with serve(store) as client:
+        (store / "aliases.json").write_text(contents)
+        problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
+        assert await default(client) == "home@1.0.0"
+
+
+async def test_a_failure_known_before_does_not_stop_a_refresh(
+    store: Path, admin: dict[str, str]
+) -> None:
+    corrupt(store, "plain", "1.0.0")
+    async with serve(store) as client:
+        publish(store, "home", "2.0.0", seed=2)
+        response = await client.post("/models/refresh", headers=admin)
+        assert response.status_code == 200
+        assert response.json()["added"] == ["home@2.0.0"]
+        assert [entry["subject"] for entry in response.json()["failures"]] == ["plain@1.0.0"]
+
+
+async def test_a_version_that_cannot_answer_is_refused(
+    store: Path, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from app.serving import warm_up
+
+    real = warm_up.reasoning.outliers
+
+    def fails(artifact: Any, scene: Any, **parameters: Any) -> Any:
+        if artifact.manifest.version == "2.0.0":
+            raise RuntimeError("secret detail")
+        return real(artifact, scene, **parameters)
+
+    monkeypatch.setattr(warm_up.reasoning, "outliers", fails)
+    async with serve(store) as client:
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        response = await client.post("/models/refresh", headers=admin)
+        document = problem(response, 409, "refresh-refused")
+        reasons = {failure["subject"]: failure["reason"] for failure in document["failures"]}
+        assert reasons == {"home@2.0.0": "warm_up_failed", "default": "warm_up_failed"}
+        assert "secret" not in response.text
+        assert await default(client) == "home@1.0.0"
+
+
+async def test_a_model_whose_answers_are_not_finite_is_refused(
+    store: Path, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import dataclasses
+
+    from app.serving import warm_up
+
+    real = warm_up.reasoning.missing
+
+    def not_finite(artifact: Any, scene: Any, **parameters: Any) -> Any:
+        found = real(artifact, scene, **parameters)
+        if artifact.manifest.version != "2.0.0":
+            return found
+        return tuple(dataclasses.replace(entry, log_odds=float("inf")) for entry in found)
+
+    monkeypatch.setattr(warm_up.reasoning, "missing", not_finite)
+    async with serve(store) as client:
+        publish(store, "home", "2.0.0", seed=2)
+        problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
+
+
+async def test_requests_are_answered_while_the_store_is_read(
+    store: Path, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import threading
+
+    from app.serving import runtime
+
+    started, go_on = threading.Event(), threading.Event()
+    real = runtime.load_model_set
+
+    def slow(*args: Any) -> Any:
+        started.set()
+        assert go_on.wait(30)
+        return real(*args)
+
+    async with serve(store) as client:
+        monkeypatch.setattr(runtime, "load_model_set", slow)
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        refresh = asyncio.create_task(client.post("/models/refresh", headers=admin))
+        assert await asyncio.to_thread(started.wait, 30)
+        assert await default(client) == "home@1.0.0"
+        assert (await client.get("/health/ready")).status_code == 200
+        assert not refresh.done()
+        go_on.set()
+        assert (await refresh).status_code == 200
+        assert await default(client) == "home@2.0.0"
+
+
+async def test_a_request_keeps_the_models_it_started_with(store: Path) -> None:
+    async with serve(store) as client:
+        runtime = client.app.state.runtime  # type: ignore[attr-defined]
+        session = runtime.session("x")
+        publish(store, "home", "2.0.0", seed=2, alias="default")
+        await runtime.refresh("y")
+        assert session.models.resolve("default").reference.version == "1.0.0"
+        assert runtime.session("z").models.resolve("default").reference.version == "2.0.0"
+
+
+async def test_replaced_models_are_freed(store: Path, admin: dict[str, str]) -> None:
+    async with serve(store) as client:
+        runtime = client.app.state.runtime  # type: ignore[attr-defined]
+        replaced = weakref.ref(runtime.models.resolve("deep").artifact.machine)
+        kept = weakref.ref(runtime.models.resolve("home").artifact.machine)
+        shutil.rmtree(store / "deep")
+        await client.post("/models/refresh", headers=admin)
+        await client.post("/models/refresh", headers=admin)
+        assert replaced() is None
+        # An unchanged artifact is verified again and not loaded twice.
+        assert runtime.models.resolve("home").artifact.machine is kept()
+        assert gc.get_freeze_count() > 0
+
+
+# ----------------------------------------------------------------------------------- aliases
+
+
+async def put(client: httpx.AsyncClient, alias: str, **body: Any) -> httpx.Response:
+    headers = {"X-Admin-Key": ADMIN_KEY}
+    return await client.put(f"/models/aliases/{alias}", json=body, headers=headers)
+
+
+def stored(store: Path) -> dict[str, Any]:
+    aliases: dict[str, Any] = json.loads((store / "aliases.json").read_text())
+    return aliases
+
+
+async def test_an_alias_is_promoted_and_rolled_back(store: Path) -> None:
+    async with serve(store) as client:
+        response = await put(client, "default", model="home@1.1.0", expected="home@1.0.0")
+        assert response.status_code == 200, response.text
+        assert response.json() == {
+            "request_id": response.headers["x-request-id"],
+            "alias": "default",
+            "model": "home@1.1.0",
+            "previous": "home@1.0.0",
+        }
+        assert await default(client) == "home@1.1.0"
+        assert stored(store)["default"] == {"name": "home", "version": "1.1.0"}
+        await put(client, "default", model="home@1.0.0")
+        assert await default(client) == "home@1.0.0"
+    async with serve(store) as client:
+        assert await default(client) == "home@1.0.0"
+
+
+async def test_an_alias_may_follow_the_newest_version(store: Path, admin: dict[str, str]) -> None:
+    async with serve(store) as client:
+        assert (await put(client, "default", model="home")).json()["model"] == "home"
+        assert await default(client) == "home@1.1.0"
+        publish(store, "home", "2.0.0", seed=2)
+        await client.post("/models/refresh", headers=admin)
+        assert await default(client) == "home@2.0.0"
+
+
+async def test_an_alias_given_as_the_model_is_followed_once(store: Path) -> None:
+    async with serve(store) as client:
+        response = await put(client, "default", model="candidate")
+        assert response.json()["model"] == "home@1.1.0"
+
+
+async def test_a_new_alias_is_made(store: Path) -> None:
+    async with serve(store) as client:
+        response = await put(client, "kitchen", model="plain@1.0.0", expected=None)
+        assert response.status_code == 200
+        assert "previous" not in response.json()
+        body = {"objects": ["bed"], "model": "kitchen"}
+        answer = await client.post("/relations", json=body)
+        assert answer.json()["model"]["name"] == "plain"
+
+
+@pytest.mark.parametrize("expected", [None, "home@1.1.0", "home", "plain@1.0.0", "no such thing"])
+async def test_an_alias_that_leads_elsewhere_is_a_conflict(
+    store: Path, expected: str | None
+) -> None:
+    async with serve(store) as client:
+        response = await put(client, "default", model="plain@1.0.0", expected=expected)
+        problem(response, 409, "alias-conflict")
+        assert await default(client) == "home@1.0.0"
+        assert stored(store)["default"]["version"] == "1.0.0"
+
+
+async def test_of_two_that_expect_the_same_one_wins(store: Path) -> None:
+    async with serve(store) as client:
+        responses = await asyncio.gather(
+            put(client, "default", model="home@1.1.0", expected="home@1.0.0"),
+            put(client, "default", model="plain@1.0.0", expected="home@1.0.0"),
+        )
+        assert sorted(response.status_code for response in responses) == [200, 409]
+
+
+async def test_an_alias_cannot_have_a_models_name(store: Path) -> None:
+    async with serve(store) as client:
+        problem(await put(client, "plain", model="home"), 409, "alias-conflict")
+
+
+@pytest.mark.parametrize("alias", ["UPPER", "-x", "x" * 65, "a b", "a%2e"])
+async def test_an_alias_is_spelt_as_a_name(store: Path, alias: str) -> None:
+    async with serve(store) as client:
+        problem(await put(client, alias, model="home"), 422, "invalid-request")
+
+
+async def test_an_alias_cannot_lead_to_nothing(store: Path) -> None:
+    async with serve(store) as client:
+        for model in ("nobody", "home@9.9.9", "HOME"):
+            problem(await put(client, "default", model=model), 404, "model-not-found")
+        problem(await put(client, "default"), 422, "invalid-request")
+
+
+async def test_an_alias_cannot_lead_to_a_refused_version(store: Path) -> None:
+    corrupt(store, "plain", "1.0.0")
+    async with serve(store) as client:
+        problem(await put(client, "default", model="plain"), 409, "model-unusable")
+
+
+async def test_a_version_gone_from_the_store_takes_no_alias(store: Path) -> None:
+    async with serve(store) as client:
+        shutil.rmtree(store / "plain")
+        problem(await put(client, "default", model="plain@1.0.0"), 404, "model-not-found")
+
+
+async def test_a_store_that_cannot_be_written_is_said_so(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import errno
+    import os
+
+    real = os.open
+
+    def read_only(path: Any, flags: int, *args: Any, **keywords: Any) -> int:
+        # As a root user the tests could write anywhere; a read-only mount refuses even root.
+        if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT) and str(store) in str(path):
+            raise OSError(errno.EROFS, "Read-only file system", str(path))
+        return real(path, flags, *args, **keywords)
+
+    async with serve(store) as client:
+        monkeypatch.setattr(os, "open", read_only)
+        response = await put(client, "default", model="plain@1.0.0")
+        problem(response, 409, "store-not-writable")
+        assert str(store) not in response.text
+        assert await default(client) == "home@1.0.0"
+
+
+async def test_a_store_in_use_asks_to_come_back(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from app.registry import StoreError
+
+    async with serve(store) as client:
+        runtime = client.app.state.runtime  # type: ignore[attr-defined]
+
+        def locked(*_: Any, **__: Any) -> None:
+            raise StoreError("locked", "another process is writing")
+
+        monkeypatch.setattr(runtime._store, "set_alias", locked)
+        problem(await put(client, "default", model="plain@1.0.0"), 503, "store-busy")

@@ -1,0 +1,584 @@
+"""Every failure is a problem document that tells what is wrong and nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+import uuid
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from app.api.catalogue import PROBLEM_TYPES
+from app.schemas import (
+    Detection,
+    GenerateRequest,
+    MissingRequest,
+    OutliersRequest,
+    Position,
+    Problem,
+    Quaternion,
+    Relation,
+    RelationsRequest,
+    Stamp,
+    Viewpoint,
+)
+from tests.http.conftest import serve
+
+pytestmark = pytest.mark.anyio
+
+QUESTIONS = ["relations", "missing", "outliers", "generate"]
+MARKER = "Zq7-marker"
+
+
+def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
+    """The problem of a response, checked for everything that every problem must be."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    document: dict[str, Any] = response.json()
+    Problem.model_validate(document, extra="forbid")
+    assert document["type"] == f"/problems/{slug}"
+    assert document["status"] == status == PROBLEM_TYPES[slug].status
+    assert document["title"] == PROBLEM_TYPES[slug].title
+    assert document["request_id"] == response.headers["x-request-id"]
+    assert document["instance"] == f"/problems/{slug}#{document['request_id']}"
+    assert ("retry-after" in response.headers) == (status == 503)
+    for leak in ("Traceback", ".py", "site-packages", str(Path.cwd()), MARKER):
+        assert leak not in response.text
+    return document
+
+
+async def post(client: httpx.AsyncClient, body: bytes | str, path: str = "/relations") -> Any:
+    headers = {"Content-Type": "application/json"}
+    return await client.post(path, content=body, headers=headers)
+
+
+# -------------------------------------------------------------------------------------- JSON
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b" ",
+        b"{",
+        b"{'objects': ['bed']}",
+        b'{"objects": ["bed"],}',
+        b'{"objects": ["bed"]} {"objects": ["bed"]}',
+        b'{"objects": [{"label": "bed", "confidence": NaN}]}',
+        b'{"objects": [{"label": "bed", "confidence": Infinity}]}',
+        b'{"objects": [{"label": "bed", "confidence": -Infinity}]}',
+        b'{"objects": ["\\ud800"]}',
+        b'{"objects": ["\\udc00"]}',
+        b'{"\\ud800": 1}',
+        b'{"objects": ["\xff\xfe"]}',
+        b'{"objects": ["\xed\xa0\x80"]}',
+        b'\xef\xbb\xbf{"objects": ["bed"]}',
+        '{"objects": ["bed"]}'.encode("utf-16"),
+        b'{"objects": ["bed"], "objects": ["lamp"]}',
+        b'{"objects": [{"label": "bed", "label": "lamp"}]}',
+        b'{"objects": ["be\nd"]}',
+        b'{"objects": ["bed"], "seed": ' + b"9" * 5000 + b"}",
+        b"[" * 100_000 + b"]" * 100_000,
+        b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
+        b'{"objects": ' + b"[" * 300 + b"]" * 300 + b"}",
+    ],
+    ids=lambda body: repr(body[:24]),
+)
+async def test_what_is_not_strict_json_is_refused(
+    client: httpx.AsyncClient, question: str, body: bytes
+) -> None:
+    problem(await post(client, body, f"/{question}"), 400, "not-json")
+
+
+@pytest.mark.parametrize(
+    "content_type",
+    [None, "text/plain", "application/x-www-form-urlencoded", "application/xml", "json", "", "*/*"],
+)
+async def test_what_is_not_declared_as_json_is_refused(
+    client: httpx.AsyncClient, content_type: str | None
+) -> None:
+    headers = {} if content_type is None else {"Content-Type": content_type}
+    response = await client.post("/relations", content=b'{"objects": ["bed"]}', headers=headers)
+    problem(response, 415, "unsupported-media-type")
+
+
+@pytest.mark.parametrize(
+    "content_type",
+    [
+        "application/json",
+        "application/json; charset=utf-8",
+        "Application/JSON",
+        "application/a+json",
+    ],
+)
+async def test_json_media_types_are_accepted(client: httpx.AsyncClient, content_type: str) -> None:
+    headers = {"Content-Type": content_type}
+    response = await client.post("/relations", content=b'{"objects": ["bed"]}', headers=headers)
+    assert response.status_code == 200
+
+
+async def test_escaped_characters_are_read(client: httpx.AsyncClient) -> None:
+    body = b'{"objects": [{"id": "\\ud83d\\ude00", "label": "b\\u0065d"}, "lamp"]}'
+    response = await post(client, body, "/outliers")
+    assert {entry["object"] for entry in response.json()["outliers"]} == {"😀", "lamp"}
+
+
+# -------------------------------------------------------------------------------------- form
+
+
+@pytest.mark.parametrize(
+    ("question", "body", "pointer"),
+    [
+        ("relations", "[]", "#"),
+        ("relations", "null", "#"),
+        ("relations", '"bed"', "#"),
+        ("relations", "{}", "#/objects"),
+        ("relations", '{"objects": null}', "#/objects"),
+        ("relations", '{"objects": []}', "#/objects"),
+        ("missing", '{"objects": []}', "#/objects"),
+        ("outliers", '{"objects": []}', "#/objects"),
+        ("relations", '{"objects": {"bed": 1}}', "#/objects"),
+        ("relations", '{"objects": [1]}', "#/objects/0"),
+        ("relations", '{"objects": [null]}', "#/objects/0"),
+        ("relations", '{"objects": [["bed"]]}', "#/objects/0"),
+        ("relations", '{"objects": [""]}', "#/objects/0"),
+        ("relations", '{"objects": ["  "]}', "#/objects/0"),
+        ("relations", '{"objects": ["be\\u0000d"]}', "#/objects/0"),
+        ("relations", '{"objects": ["be\\nd"]}', "#/objects/0"),
+        ("relations", json.dumps({"objects": ["x" * 101]}), "#/objects/0"),
+        ("relations", json.dumps({"objects": ["x" * 1_000_000]}), "#/objects/0"),
+        ("relations", json.dumps({"objects": ["bed"] * 257}), "#/objects"),
+        ("generate", json.dumps({"objects": ["bed"] * 257}), "#/objects"),
+        ("relations", '{"objects": [{}]}', "#/objects/0/label"),
+        ("relations", '{"objects": [{"label": 1}]}', "#/objects/0/label"),
+        ("relations", '{"objects": [{"label": "bed", "id": ""}]}', "#/objects/0/id"),
+        ("relations", '{"objects": [{"label": "bed", "confidence": 0}]}', "#/objects/0/confidence"),
+        ("relations", '{"objects": [{"label": "bed", "confidence": 2}]}', "#/objects/0/confidence"),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "confidence": 1e999}]}',
+            "#/objects/0/confidence",
+        ),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "confidence": "1"}]}',
+            "#/objects/0/confidence",
+        ),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "confidence": true}]}',
+            "#/objects/0/confidence",
+        ),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "position": {"x": 1, "y": 2}}]}',
+            "#/objects/0/position/z",
+        ),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "position": {"x": 1e999, "y": 2, "z": 0}}]}',
+            "#/objects/0/position/x",
+        ),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "position": {"x": 1'
+            + "0" * 400
+            + ', "y": 2, "z": 0}}]}',
+            "#/objects/0/position/x",
+        ),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "size": {"x": 0, "y": 2, "z": 1}}]}',
+            "#/objects/0/size/x",
+        ),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "orientation": {"x": 0, "y": 0, "z": 0, "w": 0}}]}',
+            "#/objects/0/orientation",
+        ),
+        (
+            "relations",
+            '{"objects": [{"label": "bed", "orientation": {"x": 1e200, "y": 0, "z": 0, "w": 0}}]}',
+            "#/objects/0/orientation",
+        ),
+        ("relations", '{"objects": ["bed"], "relations": [{}]}', "#/relations/0/subject"),
+        (
+            "relations",
+            '{"objects": ["bed", "lamp"],'
+            ' "relations": [{"subject": "bed", "relation": "near", "object": "lamp"}]}',
+            "#/relations/0/relation",
+        ),
+        ("relations", '{"objects": ["bed"], "top_k": 0}', "#/top_k"),
+        ("relations", '{"objects": ["bed"], "top_k": 4097}', "#/top_k"),
+        ("relations", '{"objects": ["bed"], "top_k": 1.5}', "#/top_k"),
+        ("relations", '{"objects": ["bed"], "top_k": true}', "#/top_k"),
+        ("relations", '{"objects": ["bed"], "min_probability": 1.1}', "#/min_probability"),
+        ("relations", '{"objects": ["bed"], "pairs": []}', "#/pairs"),
+        (
+            "relations",
+            '{"objects": ["bed", "lamp"], "pairs": [{"subject": "bed", "object": "bed"}]}',
+            "#/pairs/0",
+        ),
+        (
+            "relations",
+            '{"objects": ["bed", "lamp"], "pairs": [{"subject": "bed", "object": "sofa"}]}',
+            "#/pairs/0/object",
+        ),
+        ("missing", '{"objects": ["bed"], "top_k": 17}', "#/top_k"),
+        ("missing", '{"objects": ["bed"], "candidates": []}', "#/candidates"),
+        (
+            "missing",
+            '{"objects": ["bed"], "at": {"relation": "on-top", "object": "desk"}}',
+            "#/at/object",
+        ),
+        ("missing", '{"objects": ["bed"], "at": {"relation": "on"}}', "#/at/relation"),
+        ("outliers", '{"objects": ["bed"], "threshold": -0.1}', "#/threshold"),
+        ("outliers", '{"objects": ["bed"], "threshold": 1e999}', "#/threshold"),
+        ("generate", '{"count": 0}', "#/count"),
+        ("generate", '{"count": 65}', "#/count"),
+        ("generate", '{"steps": 0}', "#/steps"),
+        ("generate", '{"temperature": 0}', "#/temperature"),
+        ("generate", '{"temperature": 1e999}', "#/temperature"),
+        ("generate", '{"seed": -1}', "#/seed"),
+        ("generate", '{"seed": 1.0}', "#/seed"),
+        ("generate", '{"seed": 9223372036854775808}', "#/seed"),
+        ("generate", '{"context": {"h9": [0]}}', "#/context/h9"),
+        ("generate", '{"context": {"h1": [6]}}', "#/context/h1/0"),
+        ("generate", '{"context": {"h1": [-1]}}', "#/context/h1/0"),
+        ("relations", '{"objects": ["bed"], "relations_complete": true}', "#/relations_complete"),
+        (
+            "relations",
+            '{"objects": ["bed"], "stamp": {"sec": 1, "nanosec": -1}}',
+            "#/stamp/nanosec",
+        ),
+        ("relations", '{"objects": ["bed"], "viewpoint": {"x": 0, "y": 0}}', "#/viewpoint/yaw"),
+        ("relations", '{"objects": ["bed"], "unknown_labels": "maybe"}', "#/unknown_labels"),
+        ("relations", '{"objects": ["bed"], "model": 3}', "#/model"),
+        (
+            "relations",
+            '{"objects": [{"id": "a", "label": "bed"}, {"id": "a", "label": "lamp"}]}',
+            "#/objects/1/id",
+        ),
+        (
+            "relations",
+            '{"objects": ["bed", "bed", "lamp"],'
+            ' "relations": [{"subject": "bed", "relation": "left", "object": "lamp"}]}',
+            "#/relations/0/subject",
+        ),
+    ],
+)
+async def test_what_does_not_fit_is_pointed_at(
+    client: httpx.AsyncClient, question: str, body: str, pointer: str
+) -> None:
+    document = problem(await post(client, body, f"/{question}"), 422, "invalid-request")
+    assert pointer in [error["pointer"] for error in document["errors"]]
+    assert all(error["message"] for error in document["errors"])
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+async def test_contradictions_are_refused(client: httpx.AsyncClient, question: str) -> None:
+    for second in (("bed", "right", "lamp"), ("lamp", "left", "bed"), ("bed", "front", "bed")):
+        triples = [("bed", "left", "lamp"), second]
+        body = {
+            "objects": ["bed", "lamp"],
+            "relations": [{"subject": s, "relation": r, "object": o} for s, r, o in triples],
+        }
+        response = await client.post(f"/{question}", json=body)
+        document = problem(response, 422, "contradictory-evidence")
+        assert [error["pointer"] for error in document["errors"]] == ["#/relations/1"]
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+async def test_unknown_labels_are_named_with_suggestions(
+    client: httpx.AsyncClient, question: str
+) -> None:
+    body: dict[str, Any] = {
+        "objects": ["nigthstand", "bed", {"label": MARKER}],
+        "room_type": "bedrom",
+    }
+    if question == "missing":
+        body["candidates"] = ["sofa", "sofe"]
+    document = problem(await client.post(f"/{question}", json=body), 422, "unknown-labels")
+    errors = {error["pointer"]: error["suggestions"] for error in document["errors"]}
+    assert errors["#/objects/0"][0] == "nightstand"
+    assert errors["#/objects/2/label"] == []
+    assert errors["#/room_type"] == ["bedroom"]
+
+
+async def test_unknown_candidates_are_named(client: httpx.AsyncClient) -> None:
+    body = {"objects": ["bed"], "candidates": ["sofa", "sofe"]}
+    document = problem(await client.post("/missing", json=body), 422, "unknown-labels")
+    assert document["errors"] == [
+        {
+            "pointer": "#/candidates/1",
+            "message": "the model does not know this label",
+            "suggestions": ["sofa"],
+        }
+    ]
+
+
+async def test_misspelt_fields_are_pointed_at_with_suggestions(client: httpx.AsyncClient) -> None:
+    body = {"objects": [{"label": "bed", "confidense": 1}], "topk": 3}
+    document = problem(await client.post("/relations", json=body), 422, "invalid-request")
+    found = {error["pointer"]: error["suggestions"] for error in document["errors"]}
+    assert found["#/topk"][0] == "top_k"
+    assert found["#/objects/0/confidense"][0] == "confidence"
+
+
+@pytest.mark.parametrize(
+    "key", ["<script>" + MARKER, MARKER + " x", MARKER * 20, MARKER + "\u202e"]
+)
+async def test_pointers_do_not_repeat_what_is_no_plain_name(
+    client: httpx.AsyncClient, key: str
+) -> None:
+    document = problem(
+        await client.post("/relations", json={"objects": ["bed"], key: 1}), 422, "invalid-request"
+    )
+    assert [error["pointer"] for error in document["errors"]] == ["#"]
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+async def test_values_are_never_repeated(client: httpx.AsyncClient, question: str) -> None:
+    for body in (
+        {"objects": [MARKER]},
+        {"objects": [{"id": MARKER, "label": "bed"}, {"id": MARKER, "label": "bed"}]},
+        {"objects": ["bed"], "unknown_labels": MARKER},
+        {"objects": ["bed"], "room_type": MARKER},
+        {"objects": ["bed"], "model": MARKER, "seed": MARKER},
+        {
+            "objects": ["bed"],
+            "relations": [{"subject": MARKER, "relation": MARKER, "object": MARKER}],
+        },
+        {"objects": ["bed"], "stamp": MARKER, "viewpoint": [MARKER]},
+    ):
+        response = await client.post(f"/{question}", json=body)
+        assert response.status_code == 422
+        assert MARKER not in response.text
+
+
+async def test_at_most_100_faults_are_listed(client: httpx.AsyncClient) -> None:
+    document = problem(
+        await client.post("/relations", json={"objects": [1] * 256}), 422, "invalid-request"
+    )
+    assert len(document["errors"]) == 100
+
+
+# ----------------------------------------------------------------------------- models, routes
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize("model", ["nobody", "home@9.9.9", "home@", "@", "../x", "home@1", "HOME"])
+async def test_unknown_models_are_not_found(
+    client: httpx.AsyncClient, question: str, model: str
+) -> None:
+    body = {"objects": ["bed"], "model": model}
+    problem(await client.post(f"/{question}", json=body), 404, "model-not-found")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        f"/{MARKER}",
+        "/relations/",
+        "/relations/batch/",
+        "/relations/x",
+        "/models/",
+        "/static/nothing.js",
+        "/static/../settings.py",
+        "/static/%2e%2e/settings.py",
+        "/docs/nothing",
+        "/redoc/%00",
+        "/problems/nothing",
+        "/v3",
+        "/%F0%9F%98%80",
+        "/%ff%fe",
+    ],
+)
+async def test_unknown_routes_are_not_found(client: httpx.AsyncClient, path: str) -> None:
+    problem(await client.get(path), 404, "not-found")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "allowed"),
+    [
+        ("GET", "/relations", {"POST"}),
+        ("DELETE", "/missing", {"POST"}),
+        ("POST", "/models", {"GET"}),
+        ("POST", "/health/ready", {"GET"}),
+        ("PATCH", "/models/aliases/x", {"PUT"}),
+        ("BREW", "/generate", {"POST"}),
+    ],
+)
+async def test_other_methods_are_not_allowed(
+    client: httpx.AsyncClient, method: str, path: str, allowed: set[str]
+) -> None:
+    response = await client.request(method, path)
+    problem(response, 405, "method-not-allowed")
+    assert set(response.headers["allow"].split(", ")) == allowed
+
+
+# ---------------------------------------------------------------------------------- too large
+
+
+async def test_declared_bodies_over_the_limit_are_refused(shared_store: Path) -> None:
+    async with serve(shared_store, max_body_bytes=2048) as client:
+        problem(await post(client, b" " * 2049), 413, "body-too-large")
+        assert (await post(client, b'{"objects": ["bed"]}'.ljust(2048))).status_code == 200
+
+
+async def test_chunked_bodies_over_the_limit_are_refused(shared_store: Path) -> None:
+    async def chunks(size: int) -> AsyncIterator[bytes]:
+        yield b'{"objects": ["bed"]}'
+        for _ in range(size - 20):
+            yield b" "
+
+    headers = {"Content-Type": "application/json"}
+    async with serve(shared_store, max_body_bytes=2048) as client:
+        for path in ("/relations", "/generate", "/missing/batch"):
+            response = await client.post(path, content=chunks(2049), headers=headers)
+            problem(response, 413, "body-too-large")
+        response = await client.post("/relations", content=chunks(2048), headers=headers)
+        assert response.status_code == 200
+
+
+# --------------------------------------------------------------------------------- request ids
+
+
+@pytest.mark.parametrize("given", ["abc", "A-1_2.3~4:5", "x" * 128, str(uuid.uuid4())])
+async def test_valid_request_ids_are_kept(client: httpx.AsyncClient, given: str) -> None:
+    response = await client.post(
+        "/relations", json={"objects": ["bed"]}, headers={"X-Request-Id": given}
+    )
+    assert response.headers["x-request-id"] == given == response.json()["request_id"]
+
+
+@pytest.mark.parametrize("given", ["", "x" * 129, "a b", "<script>", "é".encode(), b"a\xff"])
+async def test_other_request_ids_are_replaced(
+    client: httpx.AsyncClient, given: str | bytes
+) -> None:
+    for path in ("/relations", "/nowhere"):
+        response = await client.post(
+            path, json={"objects": ["bed"]}, headers=[(b"X-Request-Id", given)]
+        )
+        drawn = response.headers["x-request-id"]
+        assert uuid.UUID(drawn).version == 4
+        assert response.json()["request_id"] == drawn
+
+
+async def test_request_ids_differ(client: httpx.AsyncClient) -> None:
+    drawn = {(await client.get("/health/live")).headers["x-request-id"] for _ in range(20)}
+    assert len(drawn) == 20
+
+
+# ----------------------------------------------------------------------------------- defects
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+async def test_a_defect_is_a_problem_without_details(
+    client: httpx.AsyncClient,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    question: str,
+) -> None:
+    from app.serving import questions
+
+    def fail(*_: Any, **__: Any) -> Any:
+        raise ZeroDivisionError(MARKER)
+
+    monkeypatch.setattr(questions.reasoning, question, fail)
+    response = await client.post(f"/{question}", json={"objects": ["bed"]})
+    document = problem(response, 500, "internal-error")
+    # The log has what the client is not told, under the same id.
+    (record,) = [record for record in caplog.records if record.name == "app.api"]
+    assert record.exc_info is not None
+    assert record.request_id == document["request_id"]
+
+
+async def test_an_answer_that_is_not_finite_is_a_defect(
+    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import dataclasses
+
+    from app.serving import questions
+
+    real = questions.reasoning.missing
+
+    def not_finite(*args: Any, **parameters: Any) -> Any:
+        return tuple(
+            dataclasses.replace(entry, log_odds=float("nan")) for entry in real(*args, **parameters)
+        )
+
+    monkeypatch.setattr(questions.reasoning, "missing", not_finite)
+    response = await client.post("/missing", json={"objects": ["bed"]})
+    problem(response, 500, "internal-error")
+    batch = await client.post("/missing/batch", json={"scenes": [{"objects": ["bed"]}]})
+    assert batch.json()["results"][0]["problem"]["type"] == "/problems/internal-error"
+
+
+# ------------------------------------------------------------------------------------- pages
+
+
+async def test_every_problem_type_has_a_page(client: httpx.AsyncClient) -> None:
+    index = (await client.get("/problems")).text
+    for slug, kind in PROBLEM_TYPES.items():
+        page = await client.get(f"/problems/{slug}")
+        assert page.status_code == 200
+        assert page.headers["content-type"].startswith("text/html")
+        assert re.escape(str(kind.status)) in page.text
+        assert f'href="problems/{slug}"' in index
+
+
+# --------------------------------------------------------------------------------- any input
+
+SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(10**30), 10**30),
+    st.floats(),
+    st.text(max_size=8),
+    st.sampled_from(["bed", "chair", "lamp", "left", "on-top", "map", "ignore", "plain"]),
+)
+REQUESTS = (RelationsRequest, MissingRequest, OutliersRequest, GenerateRequest)
+PARTS = (Detection, Position, Quaternion, Relation, Stamp, Viewpoint)
+FIELDS = st.sampled_from(sorted({name for kind in REQUESTS + PARTS for name in kind.model_fields}))
+ANYTHING = st.recursive(
+    SCALARS,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4),
+        st.dictionaries(FIELDS | st.text(max_size=3), inner, max_size=6),
+    ),
+    max_leaves=20,
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
+@given(
+    question=st.sampled_from(QUESTIONS),
+    body=st.one_of(
+        ANYTHING,
+        st.dictionaries(FIELDS, ANYTHING, max_size=4).map(
+            lambda extra: {"objects": ["bed", {"id": "x", "label": "chair"}], **extra}
+        ),
+    ),
+)
+async def test_no_json_breaks_the_service(
+    client: httpx.AsyncClient, question: str, body: Any
+) -> None:
+    response = await post(client, json.dumps(body), f"/{question}")
+    assert response.status_code in {200, 400, 404, 422}
+    if response.status_code != 200:
+        assert response.headers["content-type"] == "application/problem+json"
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
+@given(body=st.binary(max_size=64))
+async def test_no_bytes_break_the_service(client: httpx.AsyncClient, body: bytes) -> None:
+    response = await post(client, body)
+    assert response.status_code in {400, 422}

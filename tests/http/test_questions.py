@@ -1,0 +1,298 @@
+"""The four questions, answered by real artifacts of every variant."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import httpx
+import pytest
+
+from app.schemas import (
+    GenerateAnswer,
+    GenerateRequest,
+    MissingAnswer,
+    MissingRequest,
+    OutliersAnswer,
+    OutliersRequest,
+    RelationsAnswer,
+    RelationsRequest,
+)
+from tests.http.stores import VOCABULARY
+
+pytestmark = pytest.mark.anyio
+
+ANSWERS: dict[str, Any] = {
+    "relations": RelationsAnswer,
+    "missing": MissingAnswer,
+    "outliers": OutliersAnswer,
+    "generate": GenerateAnswer,
+}
+SCENE: dict[str, Any] = {
+    "objects": ["bed", "chair", "chair", {"id": "l", "label": "lamp", "confidence": 0.5}],
+    "relations": [{"subject": "l", "relation": "on-top", "object": "bed"}],
+    "room_type": "bedroom",
+}
+MODELS = ["home", "home@1.1.0", "candidate", "plain", "deep@0.1.0"]
+
+
+async def ask(client: httpx.AsyncClient, question: str, **request: Any) -> dict[str, Any]:
+    """The answer, which must be one, validated against its schema and free of anything else."""
+    response = await client.post(f"/{question}", json=request)
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "application/json"
+    answer: dict[str, Any] = json.loads(response.content, parse_constant=pytest.fail)
+    validated = ANSWERS[question].model_validate(answer, extra="forbid")
+    assert json.loads(validated.model_dump_json(exclude_none=True)) == answer
+    return answer
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("question", ANSWERS)
+async def test_every_model_answers_every_question(
+    client: httpx.AsyncClient, question: str, model: str
+) -> None:
+    stamp = {"sec": 12, "nanosec": 5}
+    answer = await ask(client, question, **SCENE, model=model, frame_id="map", stamp=stamp)
+    name = {"home": "home@1.1.0", "candidate": "home@1.1.0", "plain": "plain@1.0.0"}.get(model)
+    used = answer["model"]
+    assert f"{used['name']}@{used['version']}" == (name or model)
+    assert len(used["digest"]) == 64
+    assert answer["frame_id"] == "map"
+    assert answer["stamp"] == stamp
+    assert answer["ignored"] == []
+
+
+@pytest.mark.parametrize("question", ANSWERS)
+async def test_the_same_request_gives_the_same_bytes(
+    client: httpx.AsyncClient, question: str
+) -> None:
+    headers = {"X-Request-Id": "same"}
+    request = {**SCENE, "seed": 11}
+    first = await client.post(f"/{question}", json=request, headers=headers)
+    await client.post("/generate", json={"count": 3})
+    second = await client.post(f"/{question}", json=request, headers=headers)
+    assert first.content == second.content
+
+
+@pytest.mark.parametrize("question", ["relations", "missing", "outliers"])
+async def test_seeds_do_not_matter_to_scores(client: httpx.AsyncClient, question: str) -> None:
+    first = await ask(client, question, **SCENE, seed=1)
+    second = await ask(client, question, **SCENE, seed=2)
+    assert first[question] == second[question]
+
+
+@pytest.mark.parametrize("question", ANSWERS)
+async def test_unknown_objects_are_left_out_on_request(
+    client: httpx.AsyncClient, question: str
+) -> None:
+    answer = await ask(client, question, objects=["bed", "droid", "chair"], unknown_labels="ignore")
+    assert answer["ignored"] == ["droid"]
+    assert "droid" not in json.dumps(answer[question if question != "generate" else "scenes"])
+
+
+@pytest.mark.parametrize("question", ANSWERS)
+async def test_observed_relations_are_returned(client: httpx.AsyncClient, question: str) -> None:
+    objects = [
+        {
+            "id": "d",
+            "label": "desk",
+            "position": {"x": 2, "y": 0, "z": 0.4},
+            "size": {"x": 0.7, "y": 1.4, "z": 0.8},
+        },
+        {
+            "id": "l",
+            "label": "lamp",
+            "position": {"x": 2, "y": 0.5, "z": 1},
+            "size": {"x": 0.2, "y": 0.2, "z": 0.4},
+        },
+    ]
+    answer = await ask(client, question, objects=objects)
+    assert answer["observed_relations"] == [{"subject": "l", "relation": "on-top", "object": "d"}]
+    assert "observed_relations" not in await ask(client, question, objects=["desk", "lamp"])
+
+
+# --------------------------------------------------------------------------------- relations
+
+
+async def test_relations_name_objects_by_id_best_first(client: httpx.AsyncClient) -> None:
+    found = (await ask(client, "relations", **SCENE, top_k=4096))["relations"]
+    assert {entry["subject"] for entry in found} == {"bed", "chair_1", "chair_2", "l"}
+    assert all(entry["subject"] != entry["object"] for entry in found)
+    probabilities = [entry["probability"] for entry in found]
+    assert probabilities == sorted(probabilities, reverse=True)
+
+
+async def test_left_and_right_of_a_pair_do_not_exceed_one(client: httpx.AsyncClient) -> None:
+    found = (await ask(client, "relations", objects=SCENE["objects"], top_k=4096))["relations"]
+    known = {(e["subject"], e["relation"], e["object"]): e["probability"] for e in found}
+    pairs = [key for key in known if key[1] == "left"]
+    assert len(pairs) == 12
+    for subject, name, other in pairs:
+        assert known[subject, name, other] + known[other, name, subject] <= 1 + 1e-9
+
+
+async def test_relations_can_be_limited(client: httpx.AsyncClient) -> None:
+    assert len((await ask(client, "relations", **SCENE, top_k=3))["relations"]) == 3
+    everything = (await ask(client, "relations", **SCENE, top_k=4096))["relations"]
+    bound = everything[len(everything) // 2]["probability"]
+    likely = await ask(client, "relations", **SCENE, top_k=4096, min_probability=bound)
+    assert likely["relations"] == [e for e in everything if e["probability"] >= bound]
+
+
+async def test_relations_of_chosen_pairs(client: httpx.AsyncClient) -> None:
+    pairs = [{"subject": "chair_2", "object": "lamp"}, {"subject": "bed", "object": "chair_1"}]
+    found = (await ask(client, "relations", **SCENE, pairs=pairs, top_k=4096))["relations"]
+    ends = {(entry["subject"], entry["object"]) for entry in found}
+    assert ends == {("chair_2", "l"), ("bed", "chair_1")}
+
+
+async def test_opposites_are_reported_on_request(client: httpx.AsyncClient) -> None:
+    plain = (await ask(client, "relations", **SCENE, top_k=4096))["relations"]
+    both = (await ask(client, "relations", **SCENE, top_k=4096, include_opposites=True))[
+        "relations"
+    ]
+    assert {entry["relation"] for entry in plain} == {"left", "front", "on-top", "above"}
+    assert {entry["relation"] for entry in both} >= {"right", "behind", "under", "below"}
+
+
+async def test_one_object_has_no_relations(client: httpx.AsyncClient) -> None:
+    assert (await ask(client, "relations", objects=["bed"]))["relations"] == []
+
+
+# ----------------------------------------------------------------------------------- missing
+
+
+async def test_missing_objects_are_absent_ones_and_no_structure(client: httpx.AsyncClient) -> None:
+    found = (await ask(client, "missing", **SCENE, top_k=len(VOCABULARY)))["missing"]
+    labels = [entry["label"] for entry in found]
+    assert set(labels).isdisjoint({"bed", "chair", "lamp", "floor", "object"})
+    assert len(set(labels)) == len(labels) == len(VOCABULARY) - 5
+    assert sum(entry["probability"] for entry in found) == pytest.approx(1, abs=1e-6)
+
+
+async def test_placements_name_objects_of_the_scene(client: httpx.AsyncClient) -> None:
+    found = (await ask(client, "missing", **SCENE))["missing"]
+    anchors = {place["object"] for entry in found for place in entry["placements"]}
+    assert anchors <= {"bed", "chair_1", "chair_2", "l"}
+    assert anchors
+
+
+async def test_missing_candidates(client: httpx.AsyncClient) -> None:
+    answer = await ask(
+        client,
+        "missing",
+        **SCENE,
+        candidates=["TV", "waste baskets", "droid"],
+        unknown_labels="ignore",
+    )
+    assert {entry["label"] for entry in answer["missing"]} == {"television", "garbage bin"}
+    assert answer["ignored"] == ["droid"]
+
+
+async def test_missing_at_a_place(client: httpx.AsyncClient) -> None:
+    anywhere = await ask(client, "missing", **SCENE)
+    there = await ask(client, "missing", **SCENE, at={"relation": "on-top", "object": "bed"})
+    assert there["missing"] != anywhere["missing"]
+    below = await ask(client, "missing", **SCENE, at={"relation": "under", "object": "chair_1"})
+    assert below["missing"] != there["missing"]
+
+
+# ---------------------------------------------------------------------------------- outliers
+
+
+async def test_outliers_score_every_object_least_fitting_first(client: httpx.AsyncClient) -> None:
+    found = (await ask(client, "outliers", **SCENE))["outliers"]
+    assert sorted(entry["object"] for entry in found) == ["bed", "chair_1", "chair_2", "l"]
+    probabilities = [entry["probability"] for entry in found]
+    assert probabilities == sorted(probabilities, reverse=True)
+    chairs = [entry for entry in found if entry["object"].startswith("chair")]
+    assert chairs[0]["probability"] == chairs[1]["probability"]
+
+
+async def test_the_threshold_decides_what_is_an_outlier(client: httpx.AsyncClient) -> None:
+    for threshold, expected in ((0.0, True), (1.0, False)):
+        found = (await ask(client, "outliers", **SCENE, threshold=threshold))["outliers"]
+        assert {entry["is_outlier"] for entry in found} == {expected}
+
+
+async def test_misplaced_judges_the_given_relations(client: httpx.AsyncClient) -> None:
+    relations = [
+        {"subject": "l", "relation": "under", "object": "bed"},
+        {"subject": "chair_1", "relation": "left", "object": "bed"},
+    ]
+    answer = await ask(client, "outliers", objects=SCENE["objects"], relations=relations)
+    ends = {frozenset((e["subject"], e["object"])) for e in answer["misplaced"]}
+    assert ends == {frozenset(("l", "bed")), frozenset(("chair_1", "bed"))}
+    assert (await ask(client, "outliers", objects=["bed", "lamp"]))["misplaced"] == []
+
+
+# ---------------------------------------------------------------------------------- generate
+
+
+async def test_the_seed_decides_what_is_drawn(client: httpx.AsyncClient) -> None:
+    request = {"objects": ["bed"], "count": 4}
+    first = await ask(client, "generate", **request, seed=5)
+    again = await ask(client, "generate", **request, seed=5)
+    other = await ask(client, "generate", **request, seed=6)
+    assert first["scenes"] == again["scenes"]
+    assert first["scenes"] != other["scenes"]
+    assert first["seed"] == 5
+
+
+async def test_a_drawn_seed_is_reported_and_draws_the_same_again(client: httpx.AsyncClient) -> None:
+    first = await ask(client, "generate", count=3)
+    assert 0 <= first["seed"] < 2**53
+    again = await ask(client, "generate", count=3, seed=first["seed"])
+    assert first["scenes"] == again["scenes"]
+    assert (await ask(client, "generate", count=3))["seed"] != first["seed"]
+
+
+async def test_generated_scenes_contain_the_evidence(client: httpx.AsyncClient) -> None:
+    answer = await ask(
+        client,
+        "generate",
+        objects=["bed", "lamp"],
+        relations=[{"subject": "lamp", "relation": "on-top", "object": "bed"}],
+        count=8,
+        steps=20,
+        seed=1,
+    )
+    assert len(answer["scenes"]) == 8
+    for scene in answer["scenes"]:
+        assert {"bed", "lamp"} <= set(scene["objects"])
+        assert {"subject": "lamp", "relation": "on-top", "object": "bed"} in scene["relations"]
+        for entry in scene["relations"]:
+            assert {entry["subject"], entry["object"]} <= set(scene["objects"])
+
+
+async def test_a_scene_can_be_drawn_from_nothing(client: httpx.AsyncClient) -> None:
+    for request in ({}, {"objects": []}):
+        assert len((await ask(client, "generate", **request))["scenes"]) == 1
+
+
+async def test_context_can_be_given(client: httpx.AsyncClient) -> None:
+    answer = await ask(client, "generate", context={"h1": [0, 2]}, count=2, seed=3)
+    for scene in answer["scenes"]:
+        assert {0, 2} <= set(scene["context"]["h1"])
+
+
+# ---------------------------------------------------------------------------------- examples
+
+
+@pytest.mark.parametrize(
+    ("question", "model"),
+    [
+        ("relations", RelationsRequest),
+        ("missing", MissingRequest),
+        ("outliers", OutliersRequest),
+        ("generate", GenerateRequest),
+    ],
+)
+async def test_the_documented_examples_work(
+    client: httpx.AsyncClient, question: str, model: Any
+) -> None:
+    examples = model.model_config["json_schema_extra"]["examples"]
+    assert examples
+    for example in examples:
+        await ask(client, question, **example)

@@ -1,0 +1,115 @@
+"""Settings: safe by default, and nonsense is refused in words an operator understands."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from app.serving.logs import JSONFormatter, log_config
+from app.settings import Settings
+
+
+@pytest.fixture(autouse=True)
+def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in os.environ:
+        if name.startswith("SCENE_"):
+            monkeypatch.delenv(name)
+
+
+def test_the_defaults_are_safe(tmp_path: Path) -> None:
+    settings = Settings(store=tmp_path)
+    assert settings.host == "127.0.0.1"
+    assert settings.admin_key is None
+    assert settings.max_objects == 256
+
+
+def test_settings_come_from_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCENE_STORE", str(tmp_path))
+    monkeypatch.setenv("SCENE_PORT", "9000")
+    monkeypatch.setenv("SCENE_ADMIN_KEY", "0123456789abcdef")
+    monkeypatch.setenv("SCENE_LOG_LEVEL", "DEBUG")
+    settings = Settings()
+    assert settings.store == tmp_path
+    assert settings.port == 9000
+    assert settings.log_level == "debug"
+    assert "0123456789abcdef" not in repr(settings)
+    monkeypatch.setenv("SCENE_ADMIN_KEY", "")
+    assert Settings().admin_key is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("host", ""),
+        ("port", -1),
+        ("port", 65536),
+        ("port", "tcp://10.0.0.1:80"),
+        ("store", "no/such/directory"),
+        ("admin_key", "too-short"),
+        ("admin_key", "has spaces in between"),
+        ("admin_key", "sixteen-chars-é-no"),
+        ("max_body_bytes", 0),
+        ("max_body_bytes", 2**40),
+        ("max_objects", 0),
+        ("max_objects", 257),
+        ("max_relations", -1),
+        ("retry_after", 0),
+        ("root_path", "api/"),
+        ("root_path", "/api/"),
+        ("log_level", "loud"),
+        ("log_format", "xml"),
+        ("docs", "maybe"),
+    ],
+)
+def test_nonsense_is_refused(tmp_path: Path, name: str, value: object) -> None:
+    with pytest.raises(ValidationError) as error:
+        Settings(**{"store": tmp_path, name: value})
+    (fault,) = error.value.errors()
+    assert fault["loc"] == (name,)
+    if name == "admin_key":
+        assert str(value) not in str(error.value)
+
+
+def test_a_store_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(ValidationError, match="must be an existing directory"):
+        Settings(store=file)
+
+
+def test_a_misconfigured_service_says_which_variable_and_exits(tmp_path: Path) -> None:
+    environment = {**os.environ, "SCENE_STORE": str(tmp_path / "none"), "SCENE_PORT": "many"}
+    run = subprocess.run(
+        [sys.executable, "-m", "app"], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert run.returncode == 2
+    lines = run.stderr.strip().splitlines()
+    assert len(lines) == 2
+    assert any(line.startswith("SCENE_PORT: ") for line in lines)
+    assert any(line.startswith("SCENE_STORE: ") for line in lines)
+
+
+def test_log_lines_are_json() -> None:
+    record = logging.LogRecord("app.api", logging.ERROR, "file", 1, "a %s", ("line\n",), None)
+    record.request_id = "abc"
+    line = JSONFormatter().format(record)
+    assert "\n" not in line
+    entry = json.loads(line)
+    assert entry["message"] == "a line\n"
+    assert (entry["level"], entry["logger"], entry["request_id"]) == ("error", "app.api", "abc")
+
+
+@pytest.mark.parametrize("style", ["json", "plain"])
+def test_the_log_configuration_is_one(style: str) -> None:
+    config = log_config("info", style)  # type: ignore[arg-type]
+    assert config["handlers"]["stderr"]["formatter"] == style
+    assert config["root"]["level"] == "INFO"

@@ -1,0 +1,110 @@
+"""Small machines, described well enough to be published, and ways to spoil what was written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.registry import Calibration, Description, Manifest, VocabularyEntry
+from app.registry.manifest import MANIFEST
+from app.scene.vocabulary import ObjectClass, Vocabulary
+
+VOCABULARY = Vocabulary(
+    [
+        ObjectClass("bed", ("cot",), size=(2.0, 1.5, 0.5)),
+        ObjectClass("lamp", ("table lamp", "desk lamp")),
+        ObjectClass("floor", structure=True),
+    ],
+    ("bedroom", "office"),
+)
+
+# One of each variant; a new one is put through the round trip by an entry here.
+SPECS: dict[str, dict[str, Any]] = {
+    "rbm": {"variant": "rbm", "V": 3, "A": 4, "H1": 5, "C": 2, "T": 2},
+    "gbm": {"variant": "gbm", "V": 3, "A": 4, "H1": 5, "H2": 2, "T": 2},
+    "triway": {"variant": "triway", "V": 3, "A": 4, "H1": 5, "K": 2, "T": 2, "form": "local"},
+}
+
+
+def description(
+    name: str = "tiny", version: str = "1.0.0", variant: str = "rbm", **changes: Any
+) -> Description:
+    """What would be said of a machine of `SPECS`; `changes` replace fields."""
+    return Description.model_validate(
+        {
+            "name": name,
+            "version": version,
+            "created": "2020-02-02T20:20:20+00:00",
+            "spec": SPECS[variant],
+            "vocabulary": VocabularyEntry.of(VOCABULARY),
+            "calibration": Calibration.neutral(4),
+            "training": {"objective": "pcd", "seed": 7, "rate": 0.1},
+            "data": [
+                {
+                    "source": "generated",
+                    "scenes": 12,
+                    "digest": "0" * 64,
+                    "terms": "Apache-2.0",
+                    "research_only": False,
+                }
+            ],
+            "metrics": [
+                {
+                    "task": "missing",
+                    "source": "generated",
+                    "metric": "MRR",
+                    "value": 0.5,
+                    "low": 0.4,
+                    "high": 0.6,
+                    "n": 34,
+                }
+            ],
+            "terms": "Apache-2.0",
+            "libraries": {"torch": "2.0"},
+            **changes,
+        }
+    )
+
+
+def state(variant: str = "rbm", seed: int = 0) -> dict[str, np.ndarray]:
+    """Random weights of a machine of `SPECS`, as its `state_dict` would hold them."""
+    from app.boltzmann import MachineSpec, build
+
+    generator = np.random.default_rng(seed)
+    tensors = {}
+    for name, tensor in build(MachineSpec.from_dict(SPECS[variant])).state_dict().items():
+        drawn = generator.normal(size=tuple(tensor.shape)).astype(np.float32)
+        tensors[name] = drawn if tensor.is_floating_point() else tensor.numpy().copy()
+    tensors["triples"][:] = [(0, 0, 1), (2, 1, 0)]
+    return tensors
+
+
+def resign(body: bytes) -> bytes:
+    """A manifest with a true checksum; body is its JSON without one."""
+    body = body.rstrip().removesuffix(b"}").rstrip()
+    return body + b',\n"checksum": "' + hashlib.sha256(body).hexdigest().encode() + b'"\n}\n'
+
+
+def rewrite_manifest(directory: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change the manifest and give it a true checksum, as somebody with a purpose would."""
+    members = json.loads((directory / MANIFEST).read_bytes())
+    del members["checksum"]
+    change(members)
+    (directory / MANIFEST).write_bytes(resign(json.dumps(members).encode()))
+
+
+def replace_file(directory: Path, name: str, data: bytes) -> None:
+    """Exchange a file and let the manifest vouch for the new one."""
+    (directory / name).write_bytes(data)
+    entry = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+    rewrite_manifest(directory, lambda members: members["files"].update({name: entry}))
+
+
+def read_manifest(directory: Path) -> Manifest:
+    """The manifest of a directory."""
+    return Manifest.from_bytes((directory / MANIFEST).read_bytes())

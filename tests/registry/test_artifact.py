@@ -1,0 +1,448 @@
+"""One artifact: what is written comes back, and whatever was done to it is noticed."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save
+
+from app.boltzmann import BoltzmannMachine, MachineSpec, build
+from app.registry import ArtifactError, Calibration, load_artifact, write_artifact
+from app.registry.description import VocabularyEntry
+from app.registry.manifest import CARD, MANIFEST, WEIGHTS
+from app.scene.vocabulary import ObjectClass, Vocabulary
+from tests.registry.small_artifacts import (
+    SPECS,
+    VOCABULARY,
+    description,
+    read_manifest,
+    replace_file,
+    rewrite_manifest,
+    state,
+)
+
+FILES = (WEIGHTS, MANIFEST, CARD)
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    directory = tmp_path / "artifact"
+    write_artifact(directory, description(), state())
+    return directory
+
+
+def refusal(directory: Path) -> ArtifactError:
+    with pytest.raises(ArtifactError) as refused:
+        load_artifact(directory)
+    assert str(directory.parent) not in str(refused.value), "a reason shows no path"
+    return refused.value
+
+
+# -- what is written comes back -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", SPECS)
+def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
+    weights = state(variant)
+    saying = description(variant=variant)
+    manifest = write_artifact(tmp_path / "a", saying, weights)
+    artifact = load_artifact(tmp_path / "a")
+    assert artifact.manifest == manifest
+    assert type(artifact.machine) is type(build(MachineSpec.from_dict(SPECS[variant])))
+    assert artifact.machine.spec == MachineSpec.from_dict(SPECS[variant])
+    assert artifact.vocabulary == VOCABULARY
+    assert artifact.calibration == saying.calibration
+    assert artifact.card == (tmp_path / "a" / CARD).read_text()
+    assert artifact.path == tmp_path / "a"
+    assert not artifact.machine.training
+    assert not any(p.requires_grad for p in artifact.machine.parameters())
+    loaded = artifact.machine.state_dict()
+    assert loaded.keys() == weights.keys()
+    for name, array in weights.items():
+        assert loaded[name].device.type == "cpu"
+        assert np.array_equal(loaded[name].numpy(), array), name
+        assert loaded[name].numpy().dtype == array.dtype, name
+
+
+def test_a_loaded_machine_computes(tmp_path: Path) -> None:
+    weights = state("triway")
+    write_artifact(tmp_path / "a", description(variant="triway"), weights)
+    loaded = load_artifact(tmp_path / "a").machine
+    original = build(MachineSpec.from_dict(SPECS["triway"]))
+    original.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
+    v = torch.tensor([[1.0, 0.0, 1.0]])
+    assert torch.equal(loaded.free_energy(v), original.free_energy(v))
+    edges = loaded.edges(torch.tensor([[0, 2]]))
+    h = torch.ones(1, 5)
+    assert torch.equal(loaded.relation_logits(edges, v, h), original.relation_logits(edges, v, h))
+
+
+def test_accepts_the_state_of_a_machine_itself(tmp_path: Path) -> None:
+    machine = build(MachineSpec.from_dict(SPECS["rbm"]))
+    machine.set_triples(torch.tensor([(0, 0, 1), (2, 1, 0)]))
+    machine.initialise(torch.Generator().manual_seed(0))
+    write_artifact(tmp_path / "a", description(), machine.state_dict())
+    loaded = load_artifact(tmp_path / "a").machine
+    for name, tensor in machine.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], tensor), name
+
+
+def test_half_precision_keeps_biases_and_integers_whole(tmp_path: Path) -> None:
+    weights = state()
+    manifest = write_artifact(tmp_path / "a", description(), weights, storage_dtype="float16")
+    loaded = load_artifact(tmp_path / "a").machine.state_dict()
+    for name, array in weights.items():
+        stored = manifest.tensors[name].dtype
+        if array.dtype == np.float32 and array.ndim > 1:
+            assert stored == "float16"
+            assert loaded[name].dtype == torch.float32
+            assert np.array_equal(loaded[name].numpy(), array.astype(np.float16)), name
+        else:
+            assert stored == array.dtype.name
+            assert np.array_equal(loaded[name].numpy(), array), name
+
+
+def test_scalars_and_views_are_stored_as_they_are() -> None:
+    from app.registry.tensors import pack, unpack
+
+    matrix = np.arange(6.0, dtype=np.float32).reshape(2, 3)
+    given = {"scalar": np.float32(2.5), "transposed": matrix.T, "flag": np.array([True])}
+    data, entries = pack(given, "float32")
+    assert entries["scalar"].shape == ()
+    found = unpack(data, entries)
+    assert all(np.array_equal(found[name], given[name]) for name in given)
+
+
+def test_the_same_content_is_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_artifact(tmp_path / name, description(), dict(reversed(state().items())))
+    for file in FILES:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    assert load_artifact(tmp_path / "a").digest == load_artifact(tmp_path / "b").digest
+
+
+def test_the_digest_tells_versions_apart(tmp_path: Path) -> None:
+    write_artifact(tmp_path / "a", description(), state())
+    write_artifact(tmp_path / "b", description(), state(seed=1))
+    assert load_artifact(tmp_path / "a").digest != load_artifact(tmp_path / "b").digest
+
+
+def test_previous_is_reused_only_while_the_files_are_the_same(written: Path) -> None:
+    first = load_artifact(written)
+    assert load_artifact(written, first) is first
+    assert load_artifact(written) is not first
+    rewrite_manifest(written, lambda members: members.update(terms="others"))
+    second = load_artifact(written, first)
+    assert second is not first
+    assert second.manifest.terms == "others"
+    (written / WEIGHTS).write_bytes(b"")
+    with pytest.raises(ArtifactError):
+        load_artifact(written, second)
+
+
+def test_loads_at_the_size_of_the_paper_well_under_a_second(tmp_path: Path) -> None:
+    spec = MachineSpec("triway", V=417, A=4, H1=200, H2=100, C=44, K=32, T=2000, form="local")
+    machine = build(spec).initialise(torch.Generator().manual_seed(0))
+    table = torch.cartesian_prod(torch.arange(4), torch.arange(20), torch.arange(25))
+    machine.set_triples(table)
+    words = Vocabulary(
+        [ObjectClass(f"class q{i}", (f"alias q{i}",)) for i in range(417)],
+        [f"room q{i}" for i in range(44)],
+    )
+    saying = description(
+        spec=spec.to_dict(),
+        vocabulary=VocabularyEntry.of(words),
+        calibration=Calibration.neutral(4),
+    )
+    write_artifact(tmp_path / "a", saying, machine.state_dict(), storage_dtype="float16")
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        load_artifact(tmp_path / "a")
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.5
+
+
+# -- what cannot be written ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_refuses_to_write_what_is_not_finite(value: float, tmp_path: Path) -> None:
+    weights = state()
+    weights["W"][1, 2] = value
+    with pytest.raises(ArtifactError, match="'W'") as refused:
+        write_artifact(tmp_path / "a", description(), weights)
+    assert refused.value.code == "not_finite"
+    assert not (tmp_path / "a").exists()
+
+
+def test_refuses_to_write_what_overflows_half_precision(tmp_path: Path) -> None:
+    weights = state()
+    weights["W"][0, 0] = 70_000.0
+    with pytest.raises(ArtifactError, match=r"'W'.*float16") as refused:
+        write_artifact(tmp_path / "a", description(), weights, storage_dtype="float16")
+    assert refused.value.code == "not_finite"
+    write_artifact(tmp_path / "a", description(), weights)
+
+
+@pytest.mark.parametrize("dtype", [np.complex64, np.uint8, object])
+def test_refuses_to_write_other_dtypes(dtype: Any, tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match="'b'") as refused:
+        write_artifact(tmp_path / "a", description(), {**state(), "b": np.zeros(3, dtype)})
+    assert refused.value.code == "invalid_tensor"
+
+
+def test_never_writes_over_a_directory(written: Path) -> None:
+    before = {file: (written / file).read_bytes() for file in FILES}
+    with pytest.raises(FileExistsError):
+        write_artifact(written, description(), state(seed=1))
+    assert before == {file: (written / file).read_bytes() for file in FILES}
+
+
+# -- what was damaged ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_refuses_a_truncated_file(file: str, written: Path) -> None:
+    whole = (written / file).read_bytes()
+    lengths = {0, 1, 7, 8, 9, len(whole) // 2, len(whole) - 2, len(whole) - 1}
+    for length in sorted(lengths):
+        (written / file).write_bytes(whole[:length])
+        error = refusal(written)
+        # A manifest without its last newline is whole JSON: it is told by the missing trailer.
+        last = file == MANIFEST and length == len(whole) - 1
+        assert error.code == ("invalid_manifest" if last else "truncated"), length
+        assert file in error.reason
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_refuses_a_longer_file(file: str, written: Path) -> None:
+    with (written / file).open("ab") as handle:
+        handle.write(b"\n")
+    assert refusal(written).code in {"checksum_mismatch", "invalid_manifest"}
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_refuses_a_flipped_byte(file: str, written: Path) -> None:
+    whole = (written / file).read_bytes()
+    generator = random.Random(0)
+    offsets = {0, 7, 8, len(whole) - 1} | set(generator.sample(range(len(whole)), 60))
+    for offset in sorted(offsets):
+        spoilt = bytearray(whole)
+        spoilt[offset] ^= 1 << generator.randrange(8)
+        (written / file).write_bytes(spoilt)
+        error = refusal(written)
+        expected = {"checksum_mismatch"}
+        if file == MANIFEST and offset >= len(whole) - 82:  # within its checksum's own line
+            expected |= {"truncated", "invalid_manifest"}
+        assert error.code in expected, offset
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_refuses_a_missing_file(file: str, written: Path) -> None:
+    (written / file).unlink()
+    error = refusal(written)
+    assert (error.code, file in error.reason) == ("missing_file", True)
+
+
+def test_refuses_a_missing_directory(tmp_path: Path) -> None:
+    assert refusal(tmp_path / "nowhere").code == "missing_file"
+
+
+@pytest.mark.parametrize("name", ["model.pt", "weights.pkl", ".hidden", "model.safetensors.bak"])
+def test_refuses_an_unexpected_file(name: str, written: Path) -> None:
+    (written / name).write_bytes(pickle.dumps({"b": [0.0]}))
+    error = refusal(written)
+    assert (error.code, name in error.reason) == ("unexpected_file", True)
+
+
+def test_refuses_what_is_no_regular_file(written: Path, tmp_path: Path) -> None:
+    (written / CARD).rename(tmp_path / "moved.md")
+    for make in (
+        lambda place: place.symlink_to(tmp_path / "moved.md"),
+        lambda place: place.mkdir(),
+        os.mkfifo,
+    ):
+        make(written / CARD)
+        assert refusal(written).code == "unreadable"
+        (written / CARD).rmdir() if (written / CARD).is_dir() else (written / CARD).unlink()
+
+
+def test_refuses_a_link_to_an_artifact(written: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(written)
+    assert refusal(tmp_path / "link").code == "unreadable"
+    (tmp_path / "plain").write_text("")
+    assert refusal(tmp_path / "plain").code == "unreadable"
+
+
+# -- what was exchanged, with checksums that vouch for it ---------------------------------------
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        pickle.dumps({"b": [0.0, 0.0, 0.0]}),
+        b"",
+        b"\0" * 64,
+        (2**63).to_bytes(8, "little") + b"{}",
+        (10**9).to_bytes(8, "little") + b"{}",
+        save({"b": np.zeros(3, np.float32)})[:-1],
+        save({"b": np.zeros(3, np.float32)}) + b"\0",
+    ],
+)
+def test_refuses_what_is_not_safetensors(data: bytes, written: Path) -> None:
+    replace_file(written, WEIGHTS, data)
+    assert refusal(written).code == "not_safetensors"
+
+
+def test_refuses_a_torch_pickle(written: Path, tmp_path: Path) -> None:
+    torch.save({"b": torch.zeros(3)}, tmp_path / "model.pt")
+    replace_file(written, WEIGHTS, (tmp_path / "model.pt").read_bytes())
+    assert refusal(written).code == "not_safetensors"
+
+
+def spoil(written: Path, change: Callable[[dict[str, Any]], object]) -> ArtifactError:
+    """Store other tensors, and let manifest and checksums agree with them."""
+    weights: dict[str, Any] = state()
+    change(weights)
+    replace_file(written, WEIGHTS, save(weights))
+    entries = {
+        name: {"dtype": array.dtype.name, "shape": list(array.shape)}
+        for name, array in weights.items()
+    }
+    rewrite_manifest(written, lambda members: members.update(tensors=entries))
+    return refusal(written)
+
+
+@pytest.mark.parametrize(
+    ("change", "tensor"),
+    [
+        (lambda t: t.update(b=np.zeros(4, np.float32)), "b"),
+        (lambda t: t.update(W=t["W"].T.copy()), "W"),
+        (lambda t: t.update(extra=np.zeros(1, np.float32)), "extra"),
+        (lambda t: t.pop("c1"), "c1"),
+        (lambda t: t.update(triples=t["triples"].astype(np.int64)), "triples"),
+        (lambda t: t.update(triples=t["triples"].astype(np.float32)), "triples"),
+        (lambda t: t.update(b=np.zeros(3, np.int32)), "b"),
+        (lambda t: t.update(b=np.zeros(3, bool)), "b"),
+    ],
+)
+def test_refuses_tensors_that_do_not_fit_the_spec(
+    change: Callable[[dict[str, Any]], object], tensor: str, written: Path
+) -> None:
+    error = spoil(written, change)
+    assert (error.code, f"'{tensor}'" in error.reason) == ("wrong_shape", True)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda t: t.update(b={"dtype": "float32", "shape": [4]}),
+        lambda t: t.update(b={"dtype": "float16", "shape": [3]}),
+        lambda t: t.pop("b"),
+        lambda t: t.update(extra={"dtype": "float32", "shape": []}),
+    ],
+)
+def test_refuses_tensors_that_the_manifest_does_not_promise(
+    change: Callable[[dict[str, Any]], object], written: Path
+) -> None:
+    rewrite_manifest(written, lambda members: change(members["tensors"]))
+    assert refusal(written).code == "wrong_shape"
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.uint8])
+def test_refuses_dtypes_that_artifacts_do_not_hold(dtype: Any, written: Path) -> None:
+    replace_file(written, WEIGHTS, save({**state(), "b": np.zeros(3, dtype)}))
+    assert refusal(written).code == "wrong_shape"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("tensor", ["b", "U"])
+def test_refuses_weights_that_are_not_finite(value: float, tensor: str, written: Path) -> None:
+    error = spoil(written, lambda tensors: tensors[tensor].__setitem__(-1, value))
+    assert (error.code, f"'{tensor}'" in error.reason) == ("not_finite", True)
+
+
+@pytest.mark.parametrize("row", [(4, 0, 0), (0, 3, 0), (0, 0, -1), (0, 0, 1)])
+def test_refuses_triples_out_of_range_or_repeated(row: tuple[int, ...], written: Path) -> None:
+    error = spoil(written, lambda tensors: tensors["triples"].__setitem__(1, row))
+    assert error.code == "invalid_tensor"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"variant": "transformer"},
+        {"variant": ["rbm"]},
+        {"surplus": 1},
+        {"H1": "5"},
+        {"H1": 5.5},
+        {"H1": -5},
+        {"H2": 1},  # an RBM has none
+        {"H1": 10**15},  # beyond any memory: must be refused before it is allocated
+        {"H1": 10**30},
+        {"T": 10**18},
+    ],
+)
+def test_refuses_a_spec_that_no_machine_has(change: dict[str, Any], written: Path) -> None:
+    rewrite_manifest(written, lambda members: members["spec"].update(change))
+    assert refusal(written).code in {"invalid_manifest", "wrong_shape"}
+
+
+def test_allocates_nothing_for_a_spec_before_the_tensors_fit_it(
+    written: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    devices = set()
+
+    def watched_build(spec: MachineSpec) -> BoltzmannMachine:
+        machine = build(spec)
+        devices.update(tensor.device.type for tensor in machine.state_dict().values())
+        return machine
+
+    monkeypatch.setattr("app.boltzmann.build", watched_build)
+    load_artifact(written)
+    assert devices == {"meta"}
+
+
+def test_refuses_another_variant_of_the_same_size(written: Path) -> None:
+    rewrite_manifest(written, lambda members: members["spec"].update(variant="gbm"))
+    assert refusal(written).code == "wrong_shape"
+
+
+def test_refuses_a_size_that_no_file_has(written: Path) -> None:
+    rewrite_manifest(written, lambda members: members["files"][CARD].update(bytes=10**18))
+    assert refusal(written).code == "truncated"
+
+
+def test_the_manifest_describes_the_files(written: Path) -> None:
+    manifest = read_manifest(written)
+    for name, entry in manifest.files.items():
+        assert (written / name).stat().st_size == entry.bytes
+
+
+def test_uses_the_bytes_that_it_checked(
+    written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exchange the weights right after they were read: what was checked is what is used."""
+    import app.registry.artifact as module
+
+    original = module.read_verified
+
+    def read_then_exchange(directory: Path) -> object:
+        files = original(directory)
+        (directory / WEIGHTS).write_bytes(b"exchanged")
+        return files
+
+    monkeypatch.setattr(module, "read_verified", read_then_exchange)
+    loaded = load_artifact(written).machine.state_dict()
+    assert np.array_equal(loaded["W"].numpy(), state()["W"])
+    assert refusal(written).code == "truncated"

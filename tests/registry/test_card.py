@@ -1,0 +1,61 @@
+"""The model card: whatever decides over its use is on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from app.registry.card import render_card
+from app.registry.manifest import TensorEntry
+from tests.registry.small_artifacts import description
+
+TENSORS = {
+    "W": TensorEntry(dtype="float16", shape=(3, 5)),
+    "b": TensorEntry(dtype="float32", shape=(3,)),
+    "triples": TensorEntry(dtype="int32", shape=(2, 3)),
+}
+
+
+def source(name: str, *, research_only: bool) -> dict[str, Any]:
+    return {
+        "source": name,
+        "scenes": 8133,
+        "digest": "cd" * 32,
+        "terms": f"terms of {name}",
+        "research_only": research_only,
+    }
+
+
+def card(**changes: Any) -> str:
+    return render_card(description(**changes), TENSORS)
+
+
+def test_names_data_terms_metrics_and_limits() -> None:
+    page = card(data=[source("rooms", research_only=False)])
+    assert page.startswith("# tiny 1.0.0\n")
+    assert "| rooms | 8,133 | terms of rooms | `cdcdcdcdcdcdcdcd…` |" in page
+    assert "| missing | generated | MRR | 0.5 | 0.4 – 0.6 | 34 |" in page
+    assert "Terms of the weights: Apache-2.0" in page
+    assert "18 (stored as float16, float32, int32)" in page
+    assert "3, of which 2 may be proposed" in page
+    assert "bedroom, office" in page
+    for heading in ("Intended use", "Metrics", "Data and terms", "Limits"):
+        assert f"\n## {heading}\n" in page
+
+
+def test_warns_of_research_data_by_name_and_of_no_other() -> None:
+    free, bound = source("free", research_only=False), source("bound", research_only=True)
+    assert "commercial robot" not in card(data=[free])
+    warned = card(data=[free, bound])
+    assert "learned from bound, whose" in warned
+    assert warned.index("commercial robot") < warned.index("## Model"), "before anything else"
+
+
+def test_says_so_where_nothing_was_measured() -> None:
+    assert "nothing is known of how well" in card(metrics=[])
+
+
+def test_text_stays_in_its_cell() -> None:
+    hostile = source("a|b\n\n# Heading", research_only=True)
+    page = card(data=[hostile])
+    assert "\n# Heading" not in page
+    assert "a\\|b # Heading" in page

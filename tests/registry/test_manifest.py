@@ -1,0 +1,256 @@
+"""The manifest: what it refuses to say, and that it reads back as it was written."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from app.registry import ArtifactError, Calibration, CountSlope, Description, Manifest
+from app.registry.description import VocabularyEntry
+from app.scene.relations import CANONICAL
+from tests.registry.small_artifacts import VOCABULARY, description, resign
+
+DIGEST = "ab" * 32
+FILES = {
+    "model.safetensors": {"sha256": DIGEST, "bytes": 1},
+    "card.md": {"sha256": DIGEST, "bytes": 2},
+}
+
+
+def manifest(**changes: Any) -> Manifest:
+    tensors = {"b": {"dtype": "float32", "shape": [3]}}
+    return Manifest.model_validate(
+        {**dict(description()), "tensors": tensors, "files": FILES, **changes}
+    )
+
+
+text = st.text(st.characters(exclude_categories=("Cs",)), min_size=1, max_size=20)
+number = st.floats(allow_nan=False, allow_infinity=False)
+count = st.integers(0, 10**12)
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**20), 10**20) | number | text,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(text, inner, max_size=3),
+    max_leaves=8,
+)
+count_slopes = st.builds(CountSlope, intercept=number, slope=number, log_count=number)
+metrics = st.tuples(number, number, number).map(
+    lambda v: {"value": v[0], "low": min(v[1:]), "high": max(v[1:])}
+)
+changes = st.fixed_dictionaries(
+    {},
+    optional={
+        "version": st.tuples(count.filter(lambda n: n < 10**9), st.just(0), st.just(7)).map(
+            lambda v: ".".join(map(str, v))
+        ),
+        "created": st.datetimes(timezones=st.timezones()),
+        "training": st.dictionaries(text, json_values, max_size=4),
+        "terms": text,
+        "libraries": st.dictionaries(text, text, max_size=3),
+        "calibration": st.builds(
+            Calibration,
+            missing_temperature=st.floats(0.01, 100),
+            outlier=count_slopes,
+            outlier_threshold=st.floats(0, 1),
+            relation=st.tuples(*[count_slopes] * 4),
+        ),
+        "metrics": st.lists(
+            st.builds(
+                lambda figures, task, n: {
+                    "task": task,
+                    "source": task,
+                    "metric": task,
+                    "n": n + 1,
+                    **figures,
+                },
+                metrics,
+                text,
+                count,
+            ),
+            max_size=3,
+        ),
+        "tensors": st.dictionaries(
+            text,
+            st.fixed_dictionaries(
+                {
+                    "dtype": st.sampled_from(["float16", "int64"]),
+                    "shape": st.lists(count, max_size=3),
+                }
+            ),
+            max_size=3,
+        ),
+    },
+)
+
+
+@given(changes)
+def test_reads_back_as_written(change: dict[str, Any]) -> None:
+    written = manifest(**change)
+    data = written.to_bytes()
+    read = Manifest.from_bytes(data)
+    assert read == written
+    assert read.to_bytes() == data
+    assert json.loads(data)["format"] == 1
+
+
+@given(changes, st.data())
+def test_one_changed_byte_is_refused(change: dict[str, Any], data: st.DataObject) -> None:
+    written = bytearray(manifest(**change).to_bytes())
+    position = data.draw(st.integers(0, len(written) - 1))
+    written[position] ^= data.draw(st.integers(1, 255))
+    with pytest.raises(ArtifactError):
+        Manifest.from_bytes(bytes(written))
+
+
+def test_every_proper_prefix_is_refused() -> None:
+    written = manifest().to_bytes()
+    codes = set()
+    for length in range(len(written)):
+        with pytest.raises(ArtifactError) as refused:
+            Manifest.from_bytes(written[:length])
+        codes.add(refused.value.code)
+    # Without its last newline it is whole JSON, and yet not what was written.
+    assert codes == {"truncated", "invalid_manifest"}
+
+
+@pytest.mark.parametrize("value", [0, 2, 1.0, "1", None, True])
+def test_refuses_an_unknown_format(value: object) -> None:
+    members = json.loads(manifest().to_bytes())
+    del members["checksum"]
+    body = json.dumps({**members, "format": value}).encode()
+    # A later format may end in another way: the format is asked before the checksum is missed.
+    for data in (resign(body), body):
+        with pytest.raises(ArtifactError) as refused:
+            Manifest.from_bytes(data)
+        assert refused.value.code == "unknown_format"
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (b"", "truncated"),
+        (b"[]", "invalid_manifest"),
+        (b"null\n", "invalid_manifest"),
+        (b"\xff\xfe", "truncated"),
+        (b"[" * 200_000, "truncated"),
+        (resign(b"{" + b'"a":[' * 100_000 + b"]" * 100_000 + b"}"), "invalid_manifest"),
+        (resign(b'{"format": 1, nonsense}'), "invalid_manifest"),
+        (b'{"format": 1}', "invalid_manifest"),
+        (resign(b'{"format": 1}'), "invalid_manifest"),
+    ],
+)
+def test_refuses_what_is_no_manifest(data: bytes, code: str) -> None:
+    with pytest.raises(ArtifactError) as refused:
+        Manifest.from_bytes(data)
+    assert refused.value.code == code
+
+
+def change_nested(members: dict[str, Any], path: str, value: object) -> None:
+    *outer, last = path.split(".")
+    target: Any = members
+    for step in outer:
+        target = target[int(step) if step.isdigit() else step]
+    target[last] = value
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("surplus", 1),
+        ("vocabulary.surplus", 1),
+        ("vocabulary.objects.0.surplus", 1),
+        ("calibration.outlier.surplus", 1),
+        ("tensors.b.surplus", 1),
+        ("name", "../up"),
+        ("name", "Upper"),
+        ("name", "a\n"),
+        ("version", "1.0"),
+        ("version", "01.0.0"),
+        ("version", "1.0.0\n"),
+        ("created", "2020-02-02T20:20:20"),  # no time zone
+        ("created", "yesterday"),
+        ("spec", None),
+        ("spec.V", 4),
+        ("spec.A", 2),
+        ("spec.C", 5),
+        ("vocabulary.relations", ["left", "front", "above", "on-top"]),
+        ("vocabulary.objects.1.label", "beds"),  # the plural of another one
+        ("vocabulary.objects.0.size", [1.0, 2.0]),
+        ("vocabulary.objects.0.size", [1.0, 2.0, -3.0]),
+        ("calibration.relation", []),
+        ("calibration.missing_temperature", 0),
+        ("calibration.outlier_threshold", 1.5),
+        ("calibration.outlier.slope", math.nan),
+        ("calibration.outlier.slope", math.inf),
+        ("training.rate", math.nan),
+        ("data.0.digest", "xyz"),
+        ("data.0.scenes", -1),
+        ("data.0.research_only", None),
+        ("metrics.0.low", 0.7),  # above high
+        ("metrics.0.n", 0),
+        ("metrics.0.value", math.nan),
+        ("terms", ""),
+        ("tensors.b.dtype", "object"),
+        ("tensors.b.shape", [-1]),
+        ("files", {}),
+        ("files", {**FILES, "model.pkl": FILES["card.md"]}),
+        ("files", {**FILES, "../card.md": FILES["card.md"]}),
+    ],
+)
+def test_refuses_a_field_that_does_not_fit(path: str, value: object) -> None:
+    members = json.loads(manifest().to_bytes())
+    del members["checksum"]
+    change_nested(members, path, value)
+    with pytest.raises(ArtifactError) as refused:
+        Manifest.from_bytes(resign(json.dumps(members).encode()))
+    assert refused.value.code == "invalid_manifest"
+
+
+@pytest.mark.parametrize("missing", sorted(Description.model_fields))
+def test_refuses_a_missing_field(missing: str) -> None:
+    members = json.loads(manifest().to_bytes())
+    del members["checksum"], members[missing]
+    with pytest.raises(ArtifactError) as refused:
+        Manifest.from_bytes(resign(json.dumps(members).encode()))
+    assert refused.value.code == "invalid_manifest"
+    assert missing in refused.value.reason
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"training": {"rate": math.inf}},
+        {"training": {"\ud800": 1}},
+        {"training": {"note": "\ud800"}},
+        {"terms": "\ud800"},
+        {"libraries": {"torch": "\ud800"}},
+    ],
+)
+def test_a_description_can_always_be_written(change: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        description(**change)
+
+
+def test_is_frozen() -> None:
+    with pytest.raises(ValidationError):
+        manifest().name = "other"  # type: ignore[misc]
+
+
+def test_neutral_calibration_changes_nothing() -> None:
+    neutral = Calibration.neutral(4)
+    assert neutral.relation == (CountSlope(intercept=0, slope=1, log_count=0),) * 4
+    assert (neutral.missing_temperature, neutral.placed_temperature) == (1, 1)
+    assert (neutral.placed_relation_weight, neutral.misplaced.slope) == (1, 1)
+    assert neutral.outlier == CountSlope(intercept=0, slope=1, log_count=0)
+
+
+def test_a_vocabulary_is_kept_whole() -> None:
+    entry = VocabularyEntry.of(VOCABULARY)
+    assert entry.vocabulary() == VOCABULARY
+    assert entry.relations == CANONICAL
+    assert VocabularyEntry.of(VOCABULARY, 2).relations == CANONICAL[:2]

@@ -1,0 +1,220 @@
+"""The loaded snapshot: what is reused, what is refused, and that refusals are seen."""
+
+from __future__ import annotations
+
+import gc
+import shutil
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from app.registry import (
+    AliasTarget,
+    Artifact,
+    ArtifactError,
+    ArtifactFailure,
+    ModelSet,
+    Store,
+    StoreError,
+    load_model_set,
+)
+from tests.registry.small_artifacts import description, rewrite_manifest, state
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    store = Store(tmp_path / "store")
+    store.publish(description(), state())
+    store.publish(description(version="2.0.0"), state(seed=1))
+    store.publish(description(name="other"), state(seed=2))
+    store.set_alias("default", AliasTarget(name="tiny"))
+    return store
+
+
+def entry(models: ModelSet, name: str, version: str) -> Artifact:
+    found = models.entries[name, version]
+    assert isinstance(found, Artifact)
+    return found
+
+
+def test_holds_every_version_and_alias(store: Store) -> None:
+    models = load_model_set(store)
+    assert dict(models.versions) == {"other": ("1.0.0",), "tiny": ("1.0.0", "2.0.0")}
+    assert models.failure is None
+    assert not models.failures
+    assert models.ready
+    assert models.default_failure is None
+    assert models.resolve("default") is models.resolve("tiny@2.0.0") is models.resolve("tiny")
+    assert models.resolve("tiny@1.0.0").manifest.version == "1.0.0"
+    assert dict(models.aliases) == {"default": AliasTarget(name="tiny")}
+
+
+def test_unknown_references_are_the_stores_errors(store: Store) -> None:
+    models = load_model_set(store)
+    for reference, code in (
+        ("nothing", "unknown_model"),
+        ("tiny@3.0.0", "unknown_version"),
+        ("../tiny", "invalid_reference"),
+    ):
+        with pytest.raises(StoreError) as refused:
+            models.resolve(reference)
+        assert refused.value.code == code
+
+
+def test_a_snapshot_does_not_change_with_the_store(store: Store) -> None:
+    models = load_model_set(store)
+    store.publish(description(version="3.0.0"), state(), alias="newest")
+    assert models.resolve("tiny").manifest.version == "2.0.0"
+    assert "newest" not in models.aliases
+    with pytest.raises(TypeError):
+        models.entries["tiny", "3.0.0"] = models.resolve("tiny")  # type: ignore[index]
+    with pytest.raises(TypeError):
+        models.aliases["newest"] = AliasTarget(name="tiny")  # type: ignore[index]
+
+
+def test_a_broken_latest_version_answers_with_its_failure(store: Store) -> None:
+    (store.root / "tiny" / "2.0.0" / "model.safetensors").write_bytes(b"")
+    models = load_model_set(store)
+    assert set(models.failures) == {("tiny", "2.0.0")}
+    for reference in ("tiny", "tiny@2.0.0", "default"):
+        with pytest.raises(ArtifactError) as refused:
+            models.resolve(reference)
+        assert refused.value.code == "truncated"
+        assert "tiny@2.0.0" in refused.value.reason
+    assert not models.ready
+    assert models.default_failure is not None
+    assert "truncated" in models.default_failure
+    assert models.resolve("tiny@1.0.0").manifest.version == "1.0.0"
+    assert models.resolve("other").manifest.name == "other"
+
+
+def test_whatever_stands_in_a_versions_place_is_reported(store: Store) -> None:
+    (store.root / "tiny" / "3.0.0").mkdir()
+    (store.root / "tiny" / "4.0.0").write_text("not a directory")
+    shutil.copytree(store.root / "other" / "1.0.0", store.root / "tiny" / "5.0.0")
+    codes = {version: f.code for (_, version), f in load_model_set(store).failures.items()}
+    assert codes == {"3.0.0": "missing_file", "4.0.0": "unreadable", "5.0.0": "wrong_place"}
+
+
+def test_reuses_what_did_not_change(store: Store) -> None:
+    first = load_model_set(store)
+    store.publish(description(version="3.0.0"), state(seed=3))
+    rewrite_manifest(store.root / "other" / "1.0.0", lambda members: members.update(terms="new"))
+    second = load_model_set(store, first)
+    for version in ("1.0.0", "2.0.0"):
+        assert entry(second, "tiny", version) is entry(first, "tiny", version)
+    assert entry(second, "other", "1.0.0") is not entry(first, "other", "1.0.0")
+    assert entry(second, "other", "1.0.0").manifest.terms == "new"
+    assert second.resolve("tiny").manifest.version == "3.0.0"
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "card.md"])
+def test_what_was_loaded_before_is_verified_again(file: str, store: Store) -> None:
+    first = load_model_set(store)
+    path = store.root / "tiny" / "2.0.0" / file
+    good = path.read_bytes()
+    path.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
+    broken = load_model_set(store, first)
+    assert broken.entries["tiny", "2.0.0"] == ArtifactFailure(
+        "checksum_mismatch", f"{file} does not match its checksum"
+    )
+    path.write_bytes(good)
+    assert load_model_set(store, broken).resolve("tiny").digest == first.resolve("tiny").digest
+
+
+def test_an_old_snapshot_and_a_failure_keep_nothing_alive(store: Store) -> None:
+    first = load_model_set(store)
+    machine = weakref.ref(entry(first, "tiny", "2.0.0").machine)
+    (store.root / "tiny" / "2.0.0" / "model.safetensors").write_bytes(b"")
+    second = load_model_set(store, first)
+    del first
+    gc.collect()
+    assert machine() is None
+    assert ("tiny", "2.0.0") in second.failures
+
+
+def test_a_missing_store_is_a_failure_that_is_seen(tmp_path: Path) -> None:
+    models = load_model_set(Store(tmp_path / "nowhere"))
+    assert models.failure is not None
+    assert models.failure.code == "unreadable"
+    assert str(tmp_path) not in models.failure.reason
+    assert not models.ready
+    with pytest.raises(StoreError) as refused:
+        models.resolve("default")
+    assert refused.value.code == "unreadable"
+
+
+def test_an_empty_store_is_not_ready(tmp_path: Path) -> None:
+    models = load_model_set(Store(tmp_path))
+    assert (models.failure, models.ready) == (None, False)
+    assert "default" in (models.default_failure or "")
+
+
+def test_spoilt_aliases_leave_names_usable(store: Store) -> None:
+    (store.root / "aliases.json").write_text("{")
+    models = load_model_set(store)
+    assert models.failure is not None
+    assert models.failure.code == "invalid_aliases"
+    assert models.resolve("tiny").manifest.version == "2.0.0"
+    assert not models.ready
+    with pytest.raises(StoreError) as refused:
+        models.resolve("default")
+    assert refused.value.code == "invalid_aliases"
+
+
+def test_an_alias_to_a_removed_version_does_not_fall_back(store: Store) -> None:
+    store.set_alias("default", AliasTarget(name="tiny", version="2.0.0"))
+    shutil.rmtree(store.root / "tiny" / "2.0.0")
+    models = load_model_set(store)
+    assert not models.ready
+    with pytest.raises(StoreError) as refused:
+        models.resolve("default")
+    assert refused.value.code == "dangling_alias"
+
+
+def test_a_publication_between_two_looks_leaves_no_alias_dangling(store: Store) -> None:
+    class OvertakenStore(Store):
+        """Another process publishes right after the first look, whichever that is."""
+
+        overtaken = False
+
+        def overtake(self) -> None:
+            if not self.overtaken:
+                self.overtaken = True
+                store.publish(description(name="zeta"), state(), alias="default")
+
+        def aliases(self) -> Mapping[str, AliasTarget]:
+            found = super().aliases()
+            self.overtake()
+            return found
+
+        def versions(self, name: str) -> tuple[str, ...]:
+            found = super().versions(name)
+            self.overtake()
+            return found
+
+    models = load_model_set(OvertakenStore(store.root))
+    assert models.ready
+    assert models.resolve("default").manifest.name == "tiny"
+
+
+def test_one_unreadable_folder_does_not_take_the_others_down(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    iterdir = Path.iterdir
+
+    def deny(path: Path) -> object:
+        if path.name == "other":
+            raise PermissionError(13, "Permission denied", str(path))
+        return iterdir(path)
+
+    monkeypatch.setattr(Path, "iterdir", deny)
+    models = load_model_set(store)
+    assert models.failure is not None
+    assert models.failure.reason == "model 'other': Permission denied"
+    assert models.ready
+    with pytest.raises(StoreError) as refused:
+        models.resolve("other")
+    assert refused.value.code == "unreadable"

@@ -1,0 +1,363 @@
+"""The store: publishing, aliases, references, and what lies about in a directory."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.registry import AliasTarget, ArtifactError, RegistryError, Store, StoreError
+from app.registry.locking import exclusive
+from tests.registry.small_artifacts import description, state
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+def publish(store: Store, version: str = "1.0.0", *, name: str = "tiny", seed: int = 0) -> None:
+    store.publish(description(name, version), state(seed=seed))
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def refused(code: str) -> pytest.RaisesExc[StoreError]:
+    return pytest.raises(StoreError, check=lambda error: error.code == code)
+
+
+# -- publishing ---------------------------------------------------------------------------------
+
+
+def test_publishes_what_a_reader_loads(store: Store) -> None:
+    published = store.publish(description(), state(), storage_dtype="float16", alias="default")
+    loaded = store.load(*store.resolve("default"))
+    assert published.path == loaded.path == store.root / "tiny" / "1.0.0"
+    assert published.digest == loaded.digest
+    weights = published.machine.state_dict()
+    assert all(
+        np.array_equal(t.numpy(), weights[k].numpy())
+        for k, t in loaded.machine.state_dict().items()
+    )
+    assert sorted(tree(store.root)) == [
+        "aliases.json",
+        "tiny/1.0.0/card.md",
+        "tiny/1.0.0/manifest.json",
+        "tiny/1.0.0/model.safetensors",
+    ]
+
+
+def test_lists_names_and_versions_in_order(store: Store) -> None:
+    for version in ("1.10.0", "1.9.0", "0.2.0"):
+        publish(store, version)
+    publish(store, name="another")
+    assert store.names() == ("another", "tiny")
+    assert store.versions("tiny") == ("0.2.0", "1.9.0", "1.10.0")
+    assert store.latest("tiny") == "1.10.0"
+    assert store.resolve("tiny") == ("tiny", "1.10.0")
+    assert store.resolve("tiny@0.2.0") == ("tiny", "0.2.0")
+    assert store.versions("nothing") == ()
+    with refused("unknown_model"):
+        store.latest("nothing")
+    with refused("unknown_version"):
+        store.load("tiny", "3.0.0")
+
+
+def test_never_overwrites_a_version(store: Store) -> None:
+    publish(store)
+    before = tree(store.root)
+    with refused("version_exists"):
+        publish(store, seed=1)
+    assert tree(store.root) == before
+
+
+def test_does_not_even_overwrite_what_is_broken(store: Store) -> None:
+    (store.root / "tiny" / "1.0.0").mkdir(parents=True)
+    with refused("version_exists"):
+        publish(store)
+
+
+def test_publishes_nothing_that_would_be_refused(store: Store) -> None:
+    weights = state()
+    weights["triples"][1] = (3, 99, 0)
+    publish(store)
+    before = tree(store.root)
+    for broken in (weights, {**state(), "W": np.zeros((3, 4), np.float32)}):
+        with pytest.raises(ArtifactError):
+            store.publish(description(version="2.0.0"), broken, alias="default")
+    assert tree(store.root) == before
+    assert [path.name for path in (store.root / "tiny").iterdir()] == ["1.0.0"]
+
+
+def test_can_be_read_by_another_user(store: Store) -> None:
+    before = os.umask(0o022)
+    try:
+        store.publish(description(), state(), alias="default")
+    finally:
+        os.umask(before)
+    for path in store.root.rglob("*"):
+        needed = 0o555 if path.is_dir() else 0o444
+        assert path.stat().st_mode & needed == needed, path
+
+
+def test_says_so_where_it_cannot_write(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for root in (tmp_path / "file", tmp_path / "file" / "store"):
+        with pytest.raises(StoreError) as error:
+            publish(Store(root))
+        assert error.value.code == "not_writable"
+        assert str(tmp_path) not in str(error.value)
+
+
+def test_waits_for_another_writer_but_not_for_ever(tmp_path: Path) -> None:
+    store = Store(tmp_path, lock_timeout=0.05)
+    with exclusive(tmp_path / ".lock", timeout=0):
+        with refused("locked"):
+            publish(store)
+        patient = Store(tmp_path, lock_timeout=30)
+        thread = threading.Thread(target=publish, args=(patient,))
+        thread.start()
+        thread.join(0.1)
+        assert thread.is_alive()
+        assert store.names() == (), "readers do not wait"
+    thread.join(30)
+    assert store.names() == ("tiny",)
+
+
+def test_everything_is_on_disk_before_it_is_pointed_at(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rename may outlive a power cut that the renamed bytes do not, unless these came first."""
+    events: list[tuple[str, object]] = []
+    fsync, rename = os.fsync, Path.rename
+
+    def watched_fsync(descriptor: int) -> None:
+        fsync(descriptor)
+        events.append(("synced", os.fstat(descriptor).st_ino))
+
+    def watched_rename(source: Path, target: Path) -> Path:
+        inodes = {path.stat().st_ino for path in (source, *source.rglob("*"))}
+        unsynced = inodes - {inode for kind, inode in events if kind == "synced"}
+        assert not unsynced, "renamed before its bytes were on disk"
+        events.append(("renamed", target.name))
+        return rename(source, target)
+
+    monkeypatch.setattr(os, "fsync", watched_fsync)
+    monkeypatch.setattr(Path, "rename", watched_rename)
+    store.publish(description(), state(), alias="default")
+    root, folder = (path.stat().st_ino for path in (store.root, store.root / "tiny"))
+    parent = store.root.parent.stat().st_ino
+    version = events.index(("renamed", "1.0.0"))
+    table = events.index(("renamed", "aliases.json"))
+    assert events.index(("synced", parent)) < events.index(("synced", root)) < version
+    assert events[version + 1] == ("synced", folder), "the version's entry"
+    assert version + 1 < table
+    assert events[table + 1] == ("synced", root), "the alias's entry"
+    assert [kind for kind, _ in events].count("renamed") == 2
+
+
+# -- aliases ------------------------------------------------------------------------------------
+
+
+def test_an_alias_follows_the_latest_or_stays(store: Store) -> None:
+    publish(store)
+    store.set_alias("default", AliasTarget(name="tiny"))
+    store.set_alias("stable", AliasTarget(name="tiny", version="1.0.0"))
+    publish(store, "2.0.0")
+    assert store.resolve("default") == ("tiny", "2.0.0")
+    assert store.resolve("stable") == ("tiny", "1.0.0")
+    store.remove_alias("stable")
+    assert dict(store.aliases()) == {"default": AliasTarget(name="tiny")}
+    with refused("unknown_model"):
+        store.resolve("stable")
+    with refused("unknown_model"):
+        store.remove_alias("stable")
+
+
+def test_publishing_moves_the_alias_to_that_very_version(store: Store) -> None:
+    store.publish(description(version="2.0.0"), state(), alias="default")
+    store.publish(description(version="1.5.0"), state(), alias="default")
+    assert store.resolve("default") == ("tiny", "1.5.0")
+
+
+def test_an_alias_moves_only_from_where_it_was_expected(store: Store) -> None:
+    publish(store)
+    publish(store, "2.0.0")
+    one, two = (AliasTarget(name="tiny", version=v) for v in ("1.0.0", "2.0.0"))
+    with refused("alias_conflict"):
+        store.set_alias("default", two, expected=one)
+    store.set_alias("default", one, expected=None)
+    for stale in (None, two, AliasTarget(name="tiny")):
+        with refused("alias_conflict"):
+            store.set_alias("default", two, expected=stale)
+    with refused("alias_conflict"):
+        store.remove_alias("default", expected=two)
+    assert store.aliases()["default"] == one
+    store.set_alias("default", two, expected=one)
+    store.remove_alias("default", expected=two)
+    assert not store.aliases()
+
+
+def test_an_alias_needs_a_target_and_a_name_of_its_own(store: Store) -> None:
+    publish(store)
+    with refused("unknown_model"):
+        store.set_alias("default", AliasTarget(name="nothing"))
+    with refused("unknown_version"):
+        store.set_alias("default", AliasTarget(name="tiny", version="9.0.0"))
+    with refused("name_conflict"):
+        store.set_alias("tiny", AliasTarget(name="tiny"))
+    with refused("name_conflict"):
+        store.publish(description(name="new"), state(), alias="new")
+    with refused("name_conflict"):
+        store.publish(description(version="2.0.0"), state(), alias="tiny")
+    store.set_alias("default", AliasTarget(name="tiny"))
+    with refused("name_conflict"):
+        publish(store, name="default")
+    for alias in ("", "../up", "a/b", ".hidden", "tiny@1.0.0", "Default"):
+        with refused("invalid_reference"):
+            store.set_alias(alias, AliasTarget(name="tiny"))
+        with refused("invalid_reference"):
+            store.publish(description(version="2.0.0"), state(), alias=alias)
+    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0",))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{",
+        '{"default": "tiny"}',
+        '{"default": {"name": "tiny", "surplus": 1}}',
+        '{"default": {"name": "../tiny"}}',
+        '{"../default": {"name": "tiny"}}',
+        '{"default": {"name": "tiny", "version": "latest"}}',
+        '{"default": {"version": "1.0.0"}}',
+    ],
+)
+def test_a_spoilt_table_of_aliases_is_neither_believed_nor_replaced(
+    text: str, store: Store
+) -> None:
+    publish(store)
+    (store.root / "aliases.json").write_text(text)
+    target = AliasTarget(name="tiny")
+    for use in (
+        store.aliases,
+        lambda: store.resolve("default"),
+        lambda: store.set_alias("default", target),
+        lambda: store.remove_alias("default"),
+        lambda: store.publish(description(version="2.0.0"), state(), alias="default"),
+    ):
+        with refused("invalid_aliases"):
+            use()
+    assert (store.root / "aliases.json").read_text() == text
+    assert store.versions("tiny") == ("1.0.0",)
+
+
+# -- what lies about ----------------------------------------------------------------------------
+
+
+def test_readers_see_no_leftovers_and_the_next_writer_clears_them(store: Store) -> None:
+    publish(store)
+    half = store.root / "tiny" / ".publishing-2.0.0-dead"
+    half.mkdir()
+    (half / "model.safetensors").write_bytes(b"half")
+    only = store.root / "other" / ".publishing-1.0.0-dead"
+    only.mkdir(parents=True)
+    table = store.root / ".publishing-dead"
+    table.write_bytes(b"{")
+    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0",))
+    publish(store, "2.0.0")
+    assert not any(leftover.exists() for leftover in (half, only, table))
+    assert store.versions("tiny") == ("1.0.0", "2.0.0")
+
+
+def test_clearing_does_not_follow_links(store: Store, tmp_path: Path) -> None:
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / ".publishing-1.0.0-x").write_text("")
+    publish(store)
+    (store.root / "tiny" / ".publishing-link").symlink_to(tmp_path / "precious")
+    (store.root / "linked").symlink_to(tmp_path / "precious")
+    publish(store, "2.0.0")
+    assert (tmp_path / "precious" / ".publishing-1.0.0-x").exists()
+    assert not os.path.lexists(store.root / "tiny" / ".publishing-link")
+
+
+def test_a_model_outside_the_root_is_no_model(store: Store, tmp_path: Path) -> None:
+    publish(store)
+    outside = Store(tmp_path / "outside")
+    publish(outside, name="foreign")
+    (store.root / "foreign").symlink_to(outside.root / "foreign")
+    assert store.names() == ("tiny",)
+    with refused("unknown_model"):
+        store.resolve("foreign")
+    with refused("unsafe_path"):
+        publish(store, "2.0.0", name="foreign")
+    assert outside.versions("foreign") == ("1.0.0",)
+
+
+def test_a_version_outside_the_root_is_seen_and_refused(store: Store, tmp_path: Path) -> None:
+    publish(store)
+    shutil.copytree(store.root / "tiny" / "1.0.0", tmp_path / "outside")
+    (store.root / "tiny" / "2.0.0").symlink_to(tmp_path / "outside")
+    assert store.resolve("tiny") == ("tiny", "2.0.0"), "no older one stands in for it"
+    with pytest.raises(ArtifactError) as error:
+        store.load("tiny", "2.0.0")
+    assert error.value.code == "unreadable"
+
+
+def test_a_copy_under_another_name_is_refused(store: Store) -> None:
+    publish(store)
+    shutil.copytree(store.root / "tiny" / "1.0.0", store.root / "tiny" / "1.0.1")
+    shutil.copytree(store.root / "tiny", store.root / "copy")
+    for name, version in (("tiny", "1.0.1"), ("copy", "1.0.0")):
+        with pytest.raises(ArtifactError) as error:
+            store.load(name, version)
+        assert error.value.code == "wrong_place"
+    assert store.load("tiny", "1.0.0").manifest.version == "1.0.0"
+
+
+def test_other_files_in_the_root_are_none_of_its_business(store: Store) -> None:
+    publish(store)
+    (store.root / "README.md").write_text("about")
+    (store.root / "plain").write_text("a file")
+    (store.root / "lost+found").mkdir()
+    (store.root / "tiny" / "notes").mkdir()
+    publish(store, "2.0.0")
+    assert (store.names(), store.versions("tiny")) == (("tiny",), ("1.0.0", "2.0.0"))
+    assert (store.root / "README.md").read_text() == "about"
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../tiny", "tiny/1.0.0", "/etc", "tiny\0"])
+def test_no_name_leads_out_of_the_root(name: str, store: Store) -> None:
+    publish(store)
+    for use in (store.versions, store.latest, lambda name: store.load(name, "1.0.0")):
+        with refused("invalid_reference"):
+            use(name)
+    for version in ("", "..", "1.0.0/..", "../1.0.0"):
+        with refused("invalid_reference"):
+            store.load("tiny", version)
+
+
+def test_a_missing_store_is_told_from_an_empty_one(store: Store) -> None:
+    with refused("unreadable"):
+        store.names()
+    store.root.mkdir()
+    assert (store.names(), dict(store.aliases())) == ((), {})
+
+
+def test_errors_have_a_code_a_reason_and_one_base() -> None:
+    error = StoreError("locked", "by another")
+    assert (error.code, error.reason, str(error)) == ("locked", "by another", "locked: by another")
+    assert issubclass(StoreError, RegistryError)
+    assert issubclass(ArtifactError, RegistryError)

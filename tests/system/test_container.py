@@ -1,0 +1,127 @@
+"""The image and its compose file: linted, valid, and in agreement with the service's settings."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from app.settings import Settings
+from deploy.by_hand import Instruction, parse, split_stages
+
+pytestmark = pytest.mark.system
+
+FindTool = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def stages(repository: Path) -> dict[str, list[Instruction]]:
+    return split_stages(parse((repository / "Dockerfile").read_text("utf-8")))
+
+
+@pytest.fixture(scope="module")
+def compose(repository: Path) -> dict[str, Any]:
+    return yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))
+
+
+def arguments(stage: list[Instruction], keyword: str) -> list[str]:
+    return [i.argument for i in stage if i.keyword == keyword]
+
+
+def run(*command: str | Path) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_dockerfile_has_no_lint(repository: Path, require_system_tool: FindTool) -> None:
+    run(require_system_tool("hadolint"), "--failure-threshold=style", repository / "Dockerfile")
+
+
+def test_shell_scripts_have_no_lint(repository: Path, require_system_tool: FindTool) -> None:
+    run(require_system_tool("shellcheck"), repository / ".ci" / "run")
+
+
+def test_compose_file_fits_the_compose_specification(
+    repository: Path, require_system_tool: FindTool
+) -> None:
+    checker = require_system_tool("check-jsonschema")
+    schema = "--builtin-schema=vendor.compose-spec"
+    run(checker, schema, repository / "docker-compose.yml")
+
+
+@pytest.mark.parametrize("name", ["runtime", "train"])
+def test_final_stages_run_as_a_fixed_unprivileged_user(
+    stages: dict[str, list[Instruction]], compose: dict[str, Any], name: str
+) -> None:
+    (user,) = arguments(stages[name], "USER")
+    assert re.fullmatch(r"[1-9]\d{3,}:[1-9]\d{3,}", user)
+    assert {service["user"] for service in compose["services"].values()} == {user}
+
+
+def test_the_default_stage_serves_and_knows_nothing_of_training(
+    stages: dict[str, list[Instruction]],
+) -> None:
+    assert list(stages)[-1] == "runtime"
+    assert arguments(stages["runtime"], "CMD") == ['["python", "-m", "app"]']
+    assert "/health/ready" in arguments(stages["runtime"], "HEALTHCHECK")[0]
+    assert not any("training" in i.argument + str(i.flags) for i in stages["runtime"])
+
+
+def test_every_variable_given_to_the_service_is_one_it_reads(
+    stages: dict[str, list[Instruction]], compose: dict[str, Any]
+) -> None:
+    known = {f"SCENE_{field.upper()}" for field in Settings.model_fields}
+    in_image = set(re.findall(r"\bSCENE_\w+(?==)", " ".join(arguments(stages["runtime"], "ENV"))))
+    in_compose = set(compose["services"]["scene"]["environment"])
+    assert {"SCENE_HOST", "SCENE_PORT", "SCENE_STORE"} <= in_image <= known
+    assert in_compose <= known
+
+
+@pytest.mark.parametrize("name", ["scene", "train"])
+def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
+    service = compose["services"][name]
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert "no-new-privileges:true" in service["security_opt"]
+    assert {"memory", "pids"} <= service["deploy"]["resources"]["limits"].keys()
+
+
+def test_nothing_is_published_beyond_this_machine_unless_asked(compose: dict[str, Any]) -> None:
+    (port,) = compose["services"]["scene"]["ports"]
+    assert port.startswith("${PUBLISH_ADDRESS:-127.0.0.1}:")
+    assert "ports" not in compose["services"]["train"]
+
+
+def test_the_store_is_one_volume_where_the_image_keeps_its_models(
+    stages: dict[str, list[Instruction]], compose: dict[str, Any]
+) -> None:
+    store = compose["services"]["scene"]["environment"]["SCENE_STORE"]
+    assert f"SCENE_STORE={store}" in " ".join(arguments(stages["runtime"], "ENV"))
+    for service in compose["services"].values():
+        assert f"models:{store}" in service["volumes"]
+
+
+@pytest.mark.parametrize("lock", ["", "-training", "-dev"])
+def test_locks_pin_every_package_and_name_no_build_or_index(repository: Path, lock: str) -> None:
+    lines = (repository / f"requirements{lock}.lock").read_text("utf-8").splitlines()
+    pins = [line for line in lines if not line.startswith("#")]
+    assert "torch==2.13.0" in pins
+    for pin in pins:
+        assert re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*(; .+)?", pin), pin
+
+
+def test_smaller_locks_are_subsets_of_the_larger(repository: Path) -> None:
+    service, training, development = (
+        {
+            line
+            for line in (repository / f"requirements{which}.lock").read_text("utf-8").splitlines()
+            if not line.startswith("#")
+        }
+        for which in ("", "-training", "-dev")
+    )
+    assert service < training < development
