@@ -45,11 +45,7 @@ class SplitScenes:
 
     def training_data(self) -> TrainingData:
         """Tensors for the trainer. What a source annotates is learnt from its training part."""
-        by_source: dict[str, list[EncodedScene]] = {}
-        for scene in self.parts["train"]:
-            by_source.setdefault(scene.source, []).append(scene)
-        size = len(self.vocabulary)
-        annotated = {source: annotated_classes(some, size) for source, some in by_source.items()}
+        annotated = annotated_classes(self.parts["train"], self.vocabulary)
         every = {scene.source for scenes in self.parts.values() for scene in scenes}
         for source in every - set(annotated):
             raise ConfigError(f"source {source!r} has no scene in the training part")

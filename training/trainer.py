@@ -76,6 +76,8 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
     with torch.no_grad():
         annotated = data.train.annotated_classes[data.train.source].sum(0)
+        # A class that no source annotates must start as a rare one, not at even odds.
+        annotated = torch.where(annotated > 0, annotated, len(data.train))
         machine.b.copy_(log_odds_of(data.train.v.sum(0), annotated))
         machine.c1.fill_(shape.initial_c1)
         machine.Q.zero_()

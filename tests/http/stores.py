@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -43,16 +44,17 @@ VOCABULARY = Vocabulary(
 V, A, C = len(VOCABULARY), len(CANONICAL), len(VOCABULARY.room_types)
 TRIPLES = torch.tensor([(0, 0, 1), (0, 1, 0), (1, 3, 5), (2, 2, 1), (2, 7, 5), (3, 2, 0)])
 SPECS = {
-    "triway": MachineSpec("triway", V=V, A=A, H1=6, C=C, K=3, T=len(TRIPLES), form="local"),
-    "gbm": MachineSpec("gbm", V=V, A=A, H1=6, H2=4, C=C, T=len(TRIPLES)),
-    "rbm": MachineSpec("rbm", V=V, A=A, H1=6, C=C, T=len(TRIPLES)),
+    "triway": MachineSpec("triway", V=V, A=A, H1=6, C=C, K=3, form="local"),
+    "gbm": MachineSpec("gbm", V=V, A=A, H1=6, H2=4, C=C),
+    "rbm": MachineSpec("rbm", V=V, A=A, H1=6, C=C),
 }
 
 
-def random_machine(variant: str, seed: int = 0) -> BoltzmannMachine:
-    """A machine whose every weight is drawn from N(0, 0.5²)."""
+def random_machine(variant: str, seed: int = 0, classes: int = V) -> BoltzmannMachine:
+    """A machine whose every weight is drawn from N(0, 0.5²), for the first ``classes`` classes."""
     generator = torch.Generator().manual_seed(seed)
-    machine = build(SPECS[variant]).set_triples(TRIPLES)
+    triples = TRIPLES[(TRIPLES[:, 1:] < classes).all(dim=1)]
+    machine = build(replace(SPECS[variant], V=classes, T=len(triples))).set_triples(triples)
     with torch.no_grad():
         for parameter in machine.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
@@ -66,16 +68,19 @@ def publish(
     *,
     variant: str = "triway",
     seed: int = 0,
+    classes: int = V,
     alias: str | None = None,
 ) -> None:
-    """Publish a random machine."""
+    """Publish a random machine, which knows the first ``classes`` classes."""
+    machine = random_machine(variant, seed, classes)
+    vocabulary = Vocabulary(VOCABULARY.objects[:classes], VOCABULARY.room_types)
     Store(root).publish(
         Description(
             name=name,
             version=version,
             created=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
-            spec=SPECS[variant].to_dict(),
-            vocabulary=VocabularyEntry.of(VOCABULARY),
+            spec=machine.spec.to_dict(),
+            vocabulary=VocabularyEntry.of(vocabulary),
             calibration=Calibration.neutral(A),
             training={"objective": "none: random weights", "seed": seed},
             data=(
@@ -95,7 +100,7 @@ def publish(
             terms="public domain",
             libraries={"torch": torch.__version__},
         ),
-        random_machine(variant, seed).state_dict(),
+        machine.state_dict(),
         alias=alias,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -18,7 +19,8 @@ from app.schemas import (
     RelationsAnswer,
     RelationsRequest,
 )
-from tests.http.stores import VOCABULARY
+from tests.http.conftest import serve
+from tests.http.stores import VOCABULARY, publish
 
 pytestmark = pytest.mark.anyio
 
@@ -275,6 +277,22 @@ async def test_context_can_be_given(client: httpx.AsyncClient) -> None:
     answer = await ask(client, "generate", context={"h1": [0, 2]}, count=2, seed=3)
     for scene in answer["scenes"]:
         assert {0, 2} <= set(scene["context"]["h1"])
+
+
+# -------------------------------------------------------------------------- small vocabularies
+
+
+@pytest.mark.parametrize("classes", [1, 2, 3])
+@pytest.mark.parametrize("variant", ["rbm", "gbm", "triway"])
+async def test_models_of_few_classes_answer(tmp_path: Path, variant: str, classes: int) -> None:
+    publish(tmp_path, "tiny", "1.0.0", variant=variant, classes=classes, alias="default")
+    async with serve(tmp_path) as client:
+        assert (await client.get("/health/ready")).status_code == 200
+        for question in ANSWERS:
+            # The default top_k is larger than these vocabularies.
+            await ask(client, question, objects=["bed"])
+        refused = await client.post("/missing", json={"objects": ["bed"], "top_k": classes + 1})
+        assert refused.status_code == 422
 
 
 # ---------------------------------------------------------------------------------- examples

@@ -86,6 +86,7 @@ def test_a_store_that_is_a_file_is_refused(tmp_path: Path) -> None:
         Settings(store=file)
 
 
+@pytest.mark.system
 def test_a_misconfigured_service_says_which_variable_and_exits(tmp_path: Path) -> None:
     environment = {**os.environ, "SCENE_STORE": str(tmp_path / "none"), "SCENE_PORT": "many"}
     run = subprocess.run(

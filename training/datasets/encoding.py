@@ -31,6 +31,10 @@ _ON_TOP: Final = CANONICAL.index("on-top")
 # Labels that a source annotates so incompletely that they say nothing there.
 LEFT_OUT: Final[dict[str, tuple[str, ...]]] = {"sunrgbd": ("wall", "floor")}
 
+# Sources annotated in free words: a class that they never mention was not there. In the others the
+# annotator chose from a list, and a class that is not on it is unobserved.
+OPEN_VOCABULARY: Final = frozenset({"sunrgbd"})
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedScene:
@@ -76,19 +80,25 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
     return [encoder(scene) for scene in scenes]
 
 
-def annotated_classes(scenes: Sequence[EncodedScene], size: int) -> NDArray[np.bool_]:
-    """(V,) the classes that the given scenes of a source ever mention.
+def annotated_classes(
+    scenes: Sequence[EncodedScene], vocabulary: Vocabulary
+) -> dict[str, NDArray[np.bool_]]:
+    """Per source, (V,) the classes whose absence from a scene means something.
 
-    The others are unobserved there, not absent.
-
-    Args:
-        scenes: all encoded scenes of one source.
-        size: V, the number of classes of the vocabulary.
+    These are the classes that the source ever mentions, or all of them in a source of open
+    vocabulary, less those in `LEFT_OUT`. The others are unobserved there, not absent.
     """
-    mentioned = np.zeros(size, dtype=np.bool_)
+    annotated: dict[str, NDArray[np.bool_]] = {}
     for scene in scenes:
-        mentioned[scene.instance_classes] = True
-    return mentioned
+        if scene.source not in annotated:
+            start = scene.source in OPEN_VOCABULARY
+            annotated[scene.source] = np.full(len(vocabulary), start)
+        annotated[scene.source][scene.instance_classes] = True
+    for source, labels in LEFT_OUT.items():
+        for index in map(vocabulary.index, labels):
+            if source in annotated and index is not None:
+                annotated[source][index] = False
+    return annotated
 
 
 class _Encoder:

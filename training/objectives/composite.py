@@ -36,8 +36,6 @@ from training.batches import Batch, relation_units
 from training.objectives.base import Objective, withhold_rooms
 from training.objectives.contrastive import relation_nll
 
-_MEAN_FIELD_SWEEPS = 3
-
 
 @dataclass(frozen=True)
 class Masked:
@@ -120,9 +118,7 @@ class CompositeLikelihood(Objective):
         if machine.spec.form == "seed":
             classes = torch.where(v.gather(1, batch.classes.clamp(min=0)) > 0, batch.classes, -1)
             edges = machine.edges(classes, batch.counts)
-        return object_log_odds(
-            machine, Evidence(v, edges, room=room), iterations=_MEAN_FIELD_SWEEPS
-        )
+        return object_log_odds(machine, Evidence(v, edges, room=room))
 
     def relation_part(
         self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
@@ -135,8 +131,6 @@ class CompositeLikelihood(Objective):
         room = withhold_rooms(some, self.config.room_dropout, generator)
         edges, r, observed = relation_units(machine, some)
         unseen = edges if machine.spec.form == "seed" and isinstance(machine, Triway) else None
-        field = mean_field(
-            machine, Evidence(some.v, unseen, room=room), iterations=_MEAN_FIELD_SWEEPS
-        )
+        field = mean_field(machine, Evidence(some.v, unseen, room=room))
         nll = relation_nll(machine, edges, some.v, field.y.sigmoid(), r, observed)
         return nll.sum() / len(batch)

@@ -95,7 +95,7 @@ def test_labels_that_a_source_annotates_incompletely_are_left_out() -> None:
     found = encoded(things("wall", "desk", "floor"), source="sunrgbd")
     assert found.evidence.classes.tolist() == [DESK]
     assert found.unknown == 0
-    assert not annotated_classes([found], 5)[[WALL, FLOOR]].any()
+    assert not annotated_classes([found], VOCABULARY)["sunrgbd"][[WALL, FLOOR]].any()
     assert encoded(things("wall", "desk")).evidence.classes.tolist() == [DESK, WALL]
 
 
@@ -208,5 +208,12 @@ def test_scenes_of_nothing() -> None:
 
 def test_annotated_classes() -> None:
     first, second = encoded(things("desk")), encoded(things("screen", "wall"))
-    assert annotated_classes([first, second], 5).tolist() == [True, True, False, True, False]
-    assert not annotated_classes([], 5).any()
+    found = annotated_classes([first, second], VOCABULARY)
+    assert found["t"].tolist() == [True, True, False, True, False]
+    assert annotated_classes([], VOCABULARY) == {}
+
+
+def test_a_source_of_open_vocabulary_annotates_every_class() -> None:
+    """But for the labels it leaves out: what free words never mention was not there."""
+    found = annotated_classes([encoded(things("desk"), source="sunrgbd")], VOCABULARY)
+    assert found["sunrgbd"].tolist() == [True, True, True, False, False]

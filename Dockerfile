@@ -1,0 +1,55 @@
+# Stages: `runtime` (the default) serves; `train` trains into the same store.
+#   docker build -t scene-boltzmann .
+#   docker build -t scene-boltzmann-train --target train .
+
+FROM python:3.11-slim-bookworm AS base
+ENV PYTHONUNBUFFERED=1 \
+    PYTHONDONTWRITEBYTECODE=1 \
+    PATH=/opt/venv/bin:$PATH
+WORKDIR /srv/scene
+
+# ---- packages of the service
+FROM base AS packages
+# The index for CPU builds of torch; without it the default index may bring a CUDA build.
+ARG TORCH_INDEX_URL=""
+COPY requirements.lock ./
+RUN python -m venv /opt/venv \
+    && /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
+        ${TORCH_INDEX_URL:+--extra-index-url "$TORCH_INDEX_URL"} -r requirements.lock
+
+# ---- packages of training, on top
+FROM packages AS training-packages
+ARG TORCH_INDEX_URL=""
+COPY requirements-training.lock ./
+RUN /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
+        ${TORCH_INDEX_URL:+--extra-index-url "$TORCH_INDEX_URL"} -r requirements-training.lock
+
+# ---- training: docker run ... train --help
+FROM base AS train
+COPY --from=training-packages /opt/venv /opt/venv
+COPY app ./app
+COPY training ./training
+COPY --chown=10001:10001 model_store ./model_store
+# The only writable home under a read-only root is /tmp.
+ENV HOME=/tmp \
+    MPLCONFIGDIR=/tmp/matplotlib
+USER 10001:10001
+ENTRYPOINT ["python", "-m", "training"]
+CMD ["--help"]
+
+# ---- the service
+FROM base AS runtime
+COPY --from=packages /opt/venv /opt/venv
+COPY app ./app
+# Owned by the service, which moves aliases; publishing adds versions beside those shipped.
+COPY --chown=10001:10001 model_store ./model_store
+ENV HOME=/tmp \
+    SCENE_HOST=0.0.0.0 \
+    SCENE_PORT=8000 \
+    SCENE_STORE=/srv/scene/model_store
+USER 10001:10001
+EXPOSE 8000
+# http.client, unlike urlopen, never takes a proxy that the environment names.
+HEALTHCHECK --interval=10s --timeout=3s --start-period=60s --retries=3 \
+    CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENE_PORT']), timeout=2); c.request('GET', '/health/ready'); sys.exit(c.getresponse().status != 200)"]
+CMD ["python", "-m", "app"]

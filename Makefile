@@ -1,0 +1,73 @@
+# Everything starts from Python ≥ 3.11 and make; the rest is installed into .venv from the lock files.
+
+PORT ?= 8000
+PYTHON ?= python3
+# The index for CPU builds of torch, where the default index would bring a CUDA build. See README.md.
+TORCH_INDEX_URL ?=
+# Further arguments for pytest, the benchmarks or the lock's resolver: make test ARGS="-k geometry".
+ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+INDEX := $(if $(TORCH_INDEX_URL),--extra-index-url $(TORCH_INDEX_URL))
+
+# A stamp says that the environment holds what its lock file asks for; it is made anew when the lock
+# or pyproject.toml is newer. Both are subsets of one resolution, so they share one environment.
+SERVICE := $(VENV)/.installed-service
+EVERYTHING := $(VENV)/.installed-everything
+
+.DEFAULT_GOAL := help
+.PHONY: help run test setup format bench lock clean
+.DELETE_ON_ERROR:
+
+help:  ## show this help
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
+
+run: $(SERVICE)  ## serve the shipped models on 127.0.0.1 (PORT=8000)
+	SCENE_HOST=127.0.0.1 SCENE_PORT=$(PORT) exec $(BIN)/python -m app
+
+test: $(EVERYTHING)  ## lint, format, types, import rules, then the tests
+	$(BIN)/python -m ruff check --quiet .
+	$(BIN)/python -m ruff format --quiet --check .
+	$(BIN)/python -m mypy --no-error-summary
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/python -m pytest $(ARGS)
+
+setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need
+
+format: $(EVERYTHING)  ## rewrite the sources in the house format
+	$(BIN)/python -m ruff check --fix-only --quiet .
+	$(BIN)/python -m ruff format .
+
+bench: $(EVERYTHING)  ## run the benchmarks
+	$(BIN)/python -m benchmarks $(ARGS)
+
+lock: $(BIN)/python  ## resolve pyproject.toml anew into requirements*.lock
+	$(BIN)/python scripts/lock.py $(INDEX) $(ARGS)
+
+clean:  ## remove the environment and every cache
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(SERVICE): requirements.lock pyproject.toml | $(BIN)/python
+	@echo "Installing the service's packages into $(VENV) ..."
+	@$(PIP) install -qq $(INDEX) -r requirements.lock
+	@touch $@
+
+$(EVERYTHING): requirements-dev.lock pyproject.toml | $(BIN)/python
+	@echo "Installing every package into $(VENV) ..."
+	@$(PIP) install -qq $(INDEX) -r requirements-dev.lock
+	@touch $(SERVICE) $@
+
+# Order-only above: an environment is made once and then kept, whatever its own time stamp says.
+$(BIN)/python:
+	@set -eu; for candidate in $(PYTHON) python3.13 python3.12 python3.11; do \
+	    if $$candidate -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	        found=$$candidate; break; fi; done; \
+	if [ -z "$${found:-}" ]; then \
+	    echo "error: no Python 3.11 or newer found; name one: make PYTHON=/path/to/python3" >&2; exit 1; fi; \
+	if ! $$found -c 'import ensurepip, venv' 2>/dev/null; then \
+	    echo "error: $$found cannot create virtual environments: its venv or ensurepip module is missing" \
+	         "(on Debian and Ubuntu: apt-get install python3-venv)" >&2; exit 1; fi; \
+	$$found -m venv --clear $(VENV) || { rm -rf $(VENV); exit 1; }

@@ -1,0 +1,51 @@
+"""HTTP and nothing else: routes, problems, middleware, documentation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+from starlette.types import Lifespan
+
+from app.api import batches, health, middleware, models, openapi, pages, problems, questions
+from app.serving.runtime import Runtime
+from app.settings import Settings
+
+
+def build(
+    settings: Settings, runtime: Runtime, lifespan: Lifespan[Any], **metadata: str
+) -> FastAPI:
+    """The application that answers for ``runtime``.
+
+    Args:
+        settings: limits, admin key, pages.
+        runtime: what answers.
+        lifespan: starts and stops it.
+        **metadata: title, description and version for the documentation.
+    """
+    app = openapi.DocumentedAPI(
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        openapi_tags=list(openapi.TAGS),
+        generate_unique_id_function=openapi.operation_id,
+        **metadata,  # type: ignore[arg-type]
+    )
+    app.state.settings = settings
+    app.state.runtime = runtime
+    problems.install(app)
+    app.add_middleware(middleware.BodyLimit, limit=settings.max_body_bytes)
+    # Added last, so outermost: an answer of the limit above carries the id as well.
+    app.add_middleware(middleware.RequestContext, access_log=settings.access_log)
+    for router in (
+        questions.router,
+        batches.router,
+        models.router,
+        models.administration,
+        health.router,
+        health.protocol,
+    ):
+        app.include_router(router)
+    pages.install(app, docs=settings.docs)
+    return app

@@ -1,0 +1,112 @@
+"""Many scenes in one request, answered in order, each as if it had come alone."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Annotated, Any, Final, TypeVar
+
+from fastapi import APIRouter, Body
+from pydantic import ValidationError
+
+from app.api import catalogue, examples
+from app.api.body import JSONRoute
+from app.api.dependencies import SessionDep
+from app.api.openapi import problems
+from app.api.problems import from_exception, report_defect, unfit
+from app.schemas import (
+    Answer,
+    BatchAnswer,
+    BatchEntry,
+    BatchRequest,
+    MissingAnswer,
+    MissingRequest,
+    OutliersAnswer,
+    OutliersRequest,
+    RelationsAnswer,
+    RelationsRequest,
+    SceneRequest,
+)
+from app.serving import questions
+from app.serving.session import Session
+
+RequestT = TypeVar("RequestT", bound=SceneRequest)
+AnswerT = TypeVar("AnswerT", bound=Answer)
+
+_PROBLEMS: Final = problems(
+    catalogue.NOT_JSON,
+    catalogue.BODY_TOO_LARGE,
+    catalogue.UNSUPPORTED_MEDIA_TYPE,
+    catalogue.INVALID_REQUEST,
+    catalogue.NOT_READY,
+)
+
+router = APIRouter(tags=["batches"], route_class=JSONRoute, responses=_PROBLEMS)
+
+
+async def _answer_each(
+    session: Session,
+    batch: BatchRequest[RequestT],
+    kind: type[RequestT],
+    question: Callable[[Session, RequestT], Awaitable[AnswerT]],
+) -> BatchAnswer[AnswerT]:
+    results: list[BatchEntry[AnswerT]] = []
+    for place, scene in enumerate(batch.scenes):
+        try:
+            result = await question(session, _validated(scene, place, kind))
+            results.append(BatchEntry[AnswerT](status=200, result=result))
+        except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
+            problem = from_exception(error, at=("scenes", place)).describe(session.request_id)
+            if problem.status == 500:
+                report_defect(error, session.request_id)
+            results.append(BatchEntry[AnswerT](status=problem.status, problem=problem))
+        # Others are served between two scenes, health checks first of all.
+        await asyncio.sleep(0)
+    return BatchAnswer[AnswerT](request_id=session.request_id, results=results)
+
+
+def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
+    try:
+        return kind.model_validate(scene)
+    except ValidationError as error:
+        # Here, not below: what fails to validate later is an answer, and no fault of the client's.
+        raise unfit(error, scene, at=("scenes", place)) from None
+
+
+@router.post(
+    "/relations/batch",
+    summary="Relations of many scenes",
+    response_model_exclude_none=True,
+)
+async def relations_batch(
+    request: Annotated[BatchRequest[RelationsRequest], Body(examples=[examples.BATCH])],
+    session: SessionDep,
+) -> BatchAnswer[RelationsAnswer]:
+    """As `POST /relations`, for up to 256 scenes."""
+    return await _answer_each(session, request, RelationsRequest, questions.relations)
+
+
+@router.post(
+    "/missing/batch",
+    summary="Missing objects of many scenes",
+    response_model_exclude_none=True,
+)
+async def missing_batch(
+    request: Annotated[BatchRequest[MissingRequest], Body(examples=[examples.BATCH])],
+    session: SessionDep,
+) -> BatchAnswer[MissingAnswer]:
+    """As `POST /missing`, for up to 256 scenes."""
+    return await _answer_each(session, request, MissingRequest, questions.missing)
+
+
+@router.post(
+    "/outliers/batch",
+    summary="Outliers of many scenes",
+    response_model_exclude_none=True,
+)
+async def outliers_batch(
+    request: Annotated[BatchRequest[OutliersRequest], Body(examples=[examples.BATCH])],
+    session: SessionDep,
+) -> BatchAnswer[OutliersAnswer]:
+    """As `POST /outliers`, for up to 256 scenes."""
+    return await _answer_each(session, request, OutliersRequest, questions.outliers)

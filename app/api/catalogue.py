@@ -1,0 +1,183 @@
+"""Every kind of problem the service reports: its stable name, its status and what to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class ProblemType:
+    """A kind of problem.
+
+    Attributes:
+        slug: last segment of its ``type``; stable, programs branch on it.
+        status: HTTP status.
+        title: the same for every occurrence.
+        explanation: what it means and what to do, for its page.
+    """
+
+    slug: str
+    status: int
+    title: str
+    explanation: str
+
+    @property
+    def uri(self) -> str:
+        """The ``type`` member (RFC 9457, section 3.1.1)."""
+        return f"/problems/{self.slug}"
+
+
+NOT_JSON: Final = ProblemType(
+    "not-json",
+    400,
+    "The body is not acceptable JSON",
+    "The body must be one JSON value in UTF-8 without a byte order mark. NaN and Infinity, lone "
+    "surrogates, a member name used twice in one object and nesting deeper than 200 are refused, "
+    "because receivers read such texts in different ways.",
+)
+BAD_REQUEST: Final = ProblemType(
+    "bad-request",
+    400,
+    "The request could not be read",
+    "The connection broke off or the request breaks HTTP. Send it again.",
+)
+UNAUTHORIZED: Final = ProblemType(
+    "unauthorized",
+    401,
+    "A valid admin key is required",
+    "Send the key as X-Admin-Key, or as Authorization: Bearer. A service that was started without "
+    "SCENE_ADMIN_KEY refuses every key.",
+)
+NOT_FOUND: Final = ProblemType(
+    "not-found",
+    404,
+    "There is nothing at this address",
+    "No route has this path. /openapi.json lists the routes.",
+)
+MODEL_NOT_FOUND: Final = ProblemType(
+    "model-not-found",
+    404,
+    "No such model or version",
+    "A model is named by an alias, by its name (its newest version answers), or as name@version. "
+    "GET /models lists them.",
+)
+METHOD_NOT_ALLOWED: Final = ProblemType(
+    "method-not-allowed",
+    405,
+    "This route does not take this method",
+    "The Allow header lists the methods it takes.",
+)
+ALIAS_CONFLICT: Final = ProblemType(
+    "alias-conflict",
+    409,
+    "The alias does not point where the request expected",
+    "Somebody else moved the alias. Read GET /models, decide again, and send the new `expected`.",
+)
+MODEL_UNUSABLE: Final = ProblemType(
+    "model-unusable",
+    409,
+    "This model cannot take an alias",
+    "The version exists but was refused when it was loaded; GET /models says why.",
+)
+REFRESH_REFUSED: Final = ProblemType(
+    "refresh-refused",
+    409,
+    "The store was not taken over",
+    "Something in the store is worse than what is being served: a version that did not verify, did "
+    "not answer its warm-up, or an alias that leads to none. Nothing has changed: the versions "
+    "served before still answer. `failures` names what was refused and why.",
+)
+STORE_NOT_WRITABLE: Final = ProblemType(
+    "store-not-writable",
+    409,
+    "The store cannot be written",
+    "Aliases are kept in the store, and this service cannot write them there. Move the alias where "
+    "the store is writable, then POST /models/refresh.",
+)
+STORE_BUSY: Final = ProblemType(
+    "store-busy",
+    503,
+    "The store is being written by somebody else",
+    "Another process holds the store's lock, for example while it publishes a version. "
+    "Retry-After says when to ask again.",
+)
+BODY_TOO_LARGE: Final = ProblemType(
+    "body-too-large",
+    413,
+    "The body is over the limit",
+    "Send fewer scenes at once. The limit, SCENE_MAX_BODY_BYTES, holds for chunked bodies too.",
+)
+UNSUPPORTED_MEDIA_TYPE: Final = ProblemType(
+    "unsupported-media-type",
+    415,
+    "The body is not declared as JSON",
+    "Send Content-Type: application/json.",
+)
+INVALID_REQUEST: Final = ProblemType(
+    "invalid-request",
+    422,
+    "The request does not fit",
+    "The body is JSON, but not what this route takes. `errors` lists what is wrong: `pointer` is a "
+    "JSON pointer into the body, `suggestions` the nearest known names.",
+)
+UNKNOWN_LABELS: Final = ProblemType(
+    "unknown-labels",
+    422,
+    "The model does not know some of the labels",
+    "`errors` points at each label and suggests the nearest known ones. With `unknown_labels` set "
+    "to `ignore` the service answers without them and lists them in `ignored`. "
+    "GET /models/{name}/vocabulary lists every label.",
+)
+CONTRADICTORY_EVIDENCE: Final = ProblemType(
+    "contradictory-evidence",
+    422,
+    "The scene contradicts itself",
+    "No scene can be like that: an object stands in a relation to itself, or a pair stands both in "
+    "a relation and in its opposite (left and right, on-top and under).",
+)
+NOT_READY: Final = ProblemType(
+    "not-ready",
+    503,
+    "The service is not ready",
+    "It is starting, or its default model is not usable; GET /models says why. Retry-After says "
+    "when to ask again.",
+)
+MODEL_UNAVAILABLE: Final = ProblemType(
+    "model-unavailable",
+    503,
+    "This model is not usable",
+    "The version is in the store but was refused when it was loaded; GET /models says why. Other "
+    "models answer.",
+)
+INTERNAL_ERROR: Final = ProblemType(
+    "internal-error",
+    500,
+    "The service failed",
+    "This is a defect of the service. Its log has the details under the request id.",
+)
+
+PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
+    kind.slug: kind
+    for kind in (
+        NOT_JSON,
+        BAD_REQUEST,
+        UNAUTHORIZED,
+        NOT_FOUND,
+        MODEL_NOT_FOUND,
+        METHOD_NOT_ALLOWED,
+        ALIAS_CONFLICT,
+        MODEL_UNUSABLE,
+        REFRESH_REFUSED,
+        STORE_NOT_WRITABLE,
+        STORE_BUSY,
+        BODY_TOO_LARGE,
+        UNSUPPORTED_MEDIA_TYPE,
+        INVALID_REQUEST,
+        UNKNOWN_LABELS,
+        CONTRADICTORY_EVIDENCE,
+        INTERNAL_ERROR,
+        NOT_READY,
+        MODEL_UNAVAILABLE,
+    )
+}

@@ -1,0 +1,219 @@
+"""Worked examples for the documentation: a batch, and an answer of every operation.
+
+Examples of single questions stand beside their schemas. The figures only illustrate.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
+_MODEL: Final = {
+    "name": "home",
+    "version": "1.0.0",
+    "variant": "triway",
+    "digest": "4e706b9f30e062589ec5cace2744da497a49f08f095626ee533c50f22dad94d4",
+}
+_ENVELOPE: Final = {"model": _MODEL, "request_id": _ID, "ignored": []}
+
+BATCH: Final[dict[str, Any]] = {
+    "scenes": [
+        {"objects": ["bed", "nightstand", "lamp"], "room_type": "bedroom"},
+        {"objects": ["desk", "nigthstand"]},
+    ]
+}
+_UNKNOWN: Final = {
+    "type": "/problems/unknown-labels",
+    "title": "The model does not know some of the labels",
+    "status": 422,
+    "detail": "The request has 1 fault; see errors.",
+    "instance": f"/problems/unknown-labels#{_ID}",
+    "request_id": _ID,
+    "errors": [
+        {
+            "pointer": "#/scenes/1/objects/1",
+            "message": "the model does not know this label",
+            "suggestions": ["nightstand"],
+        }
+    ],
+}
+_RELATIONS: Final = _ENVELOPE | {
+    "relations": [
+        {
+            "subject": "lamp_1",
+            "relation": "on-top",
+            "object": "nightstand_1",
+            "probability": 0.83,
+        },
+        {"subject": "nightstand_1", "relation": "left", "object": "bed", "probability": 0.41},
+    ]
+}
+_MISSING: Final = _ENVELOPE | {
+    "missing": [
+        {
+            "label": "pillow",
+            "probability": 0.46,
+            "log_odds": 1.9,
+            "placements": [{"relation": "on-top", "object": "bed", "probability": 0.91}],
+        }
+    ]
+}
+_OUTLIERS: Final = _ENVELOPE | {
+    "outliers": [
+        {
+            "object": "toilet",
+            "label": "toilet",
+            "probability": 0.94,
+            "log_odds": -5.2,
+            "is_outlier": True,
+            "because": [{"object": "bed", "log_odds_change": -2.7}],
+        },
+        {
+            "object": "bed",
+            "label": "bed",
+            "probability": 0.03,
+            "log_odds": 2.4,
+            "is_outlier": False,
+            "because": [],
+        },
+    ],
+    "misplaced": [
+        {
+            "subject": "lamp_1",
+            "relation": "on-top",
+            "object": "nightstand_1",
+            "probability": 0.05,
+        }
+    ],
+}
+_GENERATED: Final = _ENVELOPE | {
+    "seed": 7,
+    "scenes": [
+        {
+            "objects": ["bed", "nightstand", "lamp"],
+            "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
+            "log_score": -6.1,
+            "context": {"h1": [3, 17]},
+        }
+    ],
+}
+_VERSION: Final = {
+    "version": "1.0.0",
+    "status": "ready",
+    "aliases": ["default"],
+    "variant": _MODEL["variant"],
+    "digest": _MODEL["digest"],
+}
+_REFUSED: Final = {
+    "version": "1.1.0",
+    "status": "refused",
+    "aliases": [],
+    "reason": "checksum_mismatch",
+    "detail": "model.safetensors does not match the manifest",
+}
+_FAILURE: Final = {
+    "subject": "home@1.1.0",
+    "reason": "checksum_mismatch",
+    "detail": "model.safetensors does not match the manifest",
+}
+_SUMMARY: Final = {"name": "home", "versions": [_REFUSED, _VERSION]}
+
+
+def _batch(result: dict[str, Any]) -> dict[str, Any]:
+    entries = [{"status": 200, "result": result}, {"status": 422, "problem": _UNKNOWN}]
+    return {"request_id": _ID, "results": entries}
+
+
+ANSWERS: Final[dict[str, dict[str, Any]]] = {
+    "relations": _RELATIONS,
+    "missing": _MISSING,
+    "outliers": _OUTLIERS,
+    "generate": _GENERATED,
+    "relations_batch": _batch(_RELATIONS),
+    "missing_batch": _batch(_MISSING),
+    "outliers_batch": _batch(_OUTLIERS),
+    "list_models": {
+        "models": [_SUMMARY],
+        "aliases": {"default": "home@1.0.0"},
+        "failures": [_FAILURE],
+    },
+    "show_model": _SUMMARY,
+    "show_version": _VERSION
+    | {
+        "name": "home",
+        "created": "2026-01-02T03:04:05Z",
+        "parameters": 136000,
+        "metrics": [
+            {
+                "task": "T2",
+                "source": "procthor",
+                "metric": "MRR",
+                "value": 0.5,
+                "low": 0.49,
+                "high": 0.51,
+                "n": 1000,
+            }
+        ],
+        "data": [
+            {
+                "source": "procthor",
+                "scenes": 4936,
+                "digest": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
+                "terms": "Apache-2.0",
+                "research_only": False,
+            }
+        ],
+        "terms": "Apache-2.0",
+        "card": "# home 1.0.0\n",
+    },
+    "show_vocabulary": {
+        "model": _MODEL,
+        "objects": [
+            {"label": "garbage bin", "aliases": ["trash can"], "structure": False},
+            {"label": "floor", "aliases": [], "structure": True},
+        ],
+        "relations": ["left", "front", "on-top", "above", "right", "behind", "under", "below"],
+        "room_types": ["bedroom"],
+    },
+    "show_contexts": {
+        "model": _MODEL,
+        "layers": {
+            "h1": [
+                {
+                    "unit": 0,
+                    "objects": [
+                        {"label": "bed", "weight": 2.1},
+                        {"label": "nightstand", "weight": 1.7},
+                    ],
+                    "room_types": [{"label": "bedroom", "weight": 0.9}],
+                }
+            ]
+        },
+    },
+    "refresh_models": {
+        "request_id": _ID,
+        "default": _MODEL,
+        "added": ["home@1.0.0"],
+        "removed": [],
+        "failures": [_FAILURE],
+    },
+    "move_alias": {
+        "request_id": _ID,
+        "alias": "default",
+        "model": "home@1.1.0",
+        "previous": "home@1.0.0",
+    },
+    "health_live": {"status": "live"},
+    "health_ready": {"status": "ready"},
+    "server_metadata": {"name": "scene-boltzmann", "version": "0.1.0", "extensions": []},
+    "server_live": {"live": True},
+    "server_ready": {"ready": True},
+    "model_metadata": {
+        "name": "home",
+        "versions": ["1.0.0", "1.1.0"],
+        "platform": "torch_triway",
+        "inputs": [],
+        "outputs": [],
+    },
+    "model_ready": {"name": "home", "ready": True},
+}

@@ -1,0 +1,79 @@
+"""Liveness and readiness, in our spelling and in that of the Open Inference Protocol.
+
+Alive is a process that answers. Ready is one whose default model has answered a real question; a
+model that was refused keeps the service not ready where it is the default.
+"""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from app import __version__
+from app.api import catalogue
+from app.api.dependencies import RuntimeDep
+from app.api.openapi import problems
+from app.schemas import (
+    Health,
+    ModelMetadata,
+    ModelReady,
+    ServerLive,
+    ServerMetadata,
+    ServerReady,
+)
+
+router = APIRouter(tags=["health"])
+protocol = APIRouter(prefix="/v2", tags=["inference protocol"])
+
+_NOT_READY = problems(catalogue.NOT_READY)
+_NO_MODEL = problems(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
+
+
+@router.get("/health/live", summary="Is the process alive?", responses=problems())
+async def health_live() -> Health:
+    """Answers as long as the process does, whatever its models do."""
+    return Health(status="live")
+
+
+@router.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
+async def health_ready(runtime: RuntimeDep) -> Health:
+    """Status 200 when the default model answers, 503 when it does not."""
+    runtime.check_ready()
+    return Health(status="ready")
+
+
+@protocol.get("", summary="Server metadata", responses=problems())
+async def server_metadata() -> ServerMetadata:
+    """Name and version of the server."""
+    return ServerMetadata(name="scene-boltzmann", version=__version__, extensions=[])
+
+
+@protocol.get("/health/live", summary="Is the process alive?", responses=problems())
+async def server_live() -> ServerLive:
+    """As `GET /health/live`."""
+    return ServerLive(live=True)
+
+
+@protocol.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
+async def server_ready(runtime: RuntimeDep) -> ServerReady:
+    """As `GET /health/ready`."""
+    runtime.check_ready()
+    return ServerReady(ready=True)
+
+
+@protocol.get("/models/{name}", summary="Model metadata", responses=_NO_MODEL)
+async def model_metadata(name: str, runtime: RuntimeDep) -> ModelMetadata:
+    """Versions and variant of a model, named by an alias, `name` or `name@version`."""
+    models = runtime.models
+    reference = models.resolve(name).reference
+    return ModelMetadata(
+        name=reference.name,
+        versions=list(models.store.versions[reference.name]),
+        platform=f"torch_{reference.variant}",
+    )
+
+
+@protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_NO_MODEL)
+async def model_ready(name: str, runtime: RuntimeDep) -> ModelReady:
+    """Status 200 when the model answers."""
+    model = runtime.models.resolve(name)
+    return ModelReady(name=model.reference.name, ready=True)

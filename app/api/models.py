@@ -1,0 +1,121 @@
+"""What can be asked, and changing it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+from fastapi import APIRouter, Path
+
+from app.api import admin, catalogue
+from app.api.dependencies import RequestId, RuntimeDep
+from app.api.openapi import problems
+from app.schemas import (
+    AliasAnswer,
+    AliasRequest,
+    ContextsAnswer,
+    ModelList,
+    ModelSummary,
+    RefreshAnswer,
+    VersionDetails,
+    VocabularyAnswer,
+)
+from app.serving import describe
+
+_PROBLEMS: Final = problems(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY)
+_USABLE: Final = problems(
+    catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE
+)
+
+Reference = Annotated[
+    str, Path(description="an alias, `name` (its newest version) or `name@version`")
+]
+
+router = APIRouter(prefix="/models", tags=["models"])
+administration = APIRouter(
+    prefix="/models",
+    tags=["administration"],
+    route_class=admin.AdminRoute,
+    dependencies=admin.SCHEMES,
+)
+
+
+@router.get(
+    "",
+    summary="Models, versions and aliases",
+    responses=problems(catalogue.NOT_READY),
+    response_model_exclude_none=True,
+)
+async def list_models(runtime: RuntimeDep) -> ModelList:
+    """Everything in the store, with what was refused and why."""
+    return describe.everything(runtime.models)
+
+
+@router.get("/{name}", summary="One model", responses=_PROBLEMS, response_model_exclude_none=True)
+async def show_model(name: Reference, runtime: RuntimeDep) -> ModelSummary:
+    """The versions of a model, newest first."""
+    return describe.model(runtime.models, name)
+
+
+@router.get(
+    "/{name}/versions/{version}",
+    summary="One version of a model",
+    responses=_PROBLEMS,
+    response_model_exclude_none=True,
+)
+async def show_version(name: Reference, version: str, runtime: RuntimeDep) -> VersionDetails:
+    """Metrics, data, terms and card of a version; of a refused one, why."""
+    return describe.version(runtime.models, name, version)
+
+
+@router.get("/{name}/vocabulary", summary="The words of a model", responses=_USABLE)
+async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> VocabularyAnswer:
+    """Object classes with their aliases, relations and room types."""
+    return describe.vocabulary(runtime.models.resolve(name))
+
+
+@router.get("/{name}/contexts", summary="The hidden units of a model", responses=_USABLE)
+async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
+    """Each hidden unit by its strongest objects; `context` of `/generate` names units by number."""
+    return describe.contexts(runtime.models.resolve(name))
+
+
+@administration.post(
+    "/refresh",
+    summary="Take over what the store holds now",
+    responses=problems(catalogue.UNAUTHORIZED, catalogue.REFRESH_REFUSED),
+    response_model_exclude_none=True,
+)
+async def refresh_models(runtime: RuntimeDep, request_id: RequestId) -> RefreshAnswer:
+    """Load, verify and warm everything in the store, then swap it in at once.
+
+    What is served now goes on answering meanwhile, and for good if anything is wrong with the new.
+    """
+    return await runtime.refresh(request_id)
+
+
+@administration.put(
+    "/aliases/{alias}",
+    summary="Promote or roll back",
+    responses=problems(
+        catalogue.NOT_JSON,
+        catalogue.UNAUTHORIZED,
+        catalogue.MODEL_NOT_FOUND,
+        catalogue.ALIAS_CONFLICT,
+        catalogue.MODEL_UNUSABLE,
+        catalogue.STORE_NOT_WRITABLE,
+        catalogue.STORE_BUSY,
+        catalogue.BODY_TOO_LARGE,
+        catalogue.UNSUPPORTED_MEDIA_TYPE,
+        catalogue.INVALID_REQUEST,
+        catalogue.NOT_READY,
+    ),
+    response_model_exclude_none=True,
+)
+async def move_alias(
+    alias: Annotated[str, Path(description="`default`, or any name of your own")],
+    request: AliasRequest,
+    runtime: RuntimeDep,
+    request_id: RequestId,
+) -> AliasAnswer:
+    """Let an alias lead to a version that is served; the store remembers it."""
+    return await runtime.move_alias(alias, request, request_id)

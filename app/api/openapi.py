@@ -1,0 +1,95 @@
+"""The OpenAPI document: stable operation ids, and every error a route can answer with."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from fastapi import FastAPI
+from fastapi.routing import APIRoute
+
+from app.api import catalogue, examples
+from app.api.catalogue import ProblemType
+from app.api.problems import MEDIA_TYPE, ProblemError
+from app.schemas import FieldError, Problem
+
+Responses = dict[int | str, dict[str, Any]]
+
+_REFERENCE: Final = "#/components/schemas/{model}"
+_REQUEST_ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
+_ERRORS: Final = {
+    catalogue.INVALID_REQUEST: [
+        FieldError(pointer="#/objects/1/confidence", message="Input should be greater than 0")
+    ],
+    catalogue.UNKNOWN_LABELS: [
+        FieldError(
+            pointer="#/objects/0",
+            message="the model does not know this label",
+            suggestions=["nightstand"],
+        )
+    ],
+    catalogue.CONTRADICTORY_EVIDENCE: [
+        FieldError(
+            pointer="#/relations/1",
+            message="contradicts an earlier relation, which says the opposite of this pair",
+        )
+    ],
+}
+TAGS: Final = [
+    {"name": "questions", "description": "The four questions about one scene."},
+    {"name": "batches", "description": "The same about many scenes, each answered on its own."},
+    {"name": "models", "description": "What can be asked, and what each model knows."},
+    {"name": "administration", "description": "Changing what is served; needs the admin key."},
+    {"name": "health", "description": "For orchestrators."},
+    {"name": "inference protocol", "description": "Open Inference Protocol spellings."},
+]
+
+
+def problems(*kinds: ProblemType) -> Responses:
+    """The ``responses`` of a route that may answer with these problems, or fail."""
+    responses: Responses = {}
+    for kind in (*kinds, catalogue.INTERNAL_ERROR):
+        response = responses.setdefault(
+            kind.status,
+            {
+                "description": kind.title,
+                "content": {
+                    MEDIA_TYPE: {
+                        "schema": {"$ref": _REFERENCE.format(model="Problem")},
+                        "examples": {},
+                    }
+                },
+            },
+        )
+        example = ProblemError(kind, kind.title + ".", errors=_ERRORS.get(kind, ()))
+        response["content"][MEDIA_TYPE]["examples"][kind.slug] = {
+            "summary": kind.title,
+            "value": example.describe(_REQUEST_ID).model_dump(mode="json", exclude_none=True),
+        }
+    return responses
+
+
+def operation_id(route: APIRoute) -> str:
+    """The name of the route's function: generated clients call the operation by it."""
+    return route.name
+
+
+class DocumentedAPI(FastAPI):
+    """FastAPI, whose document tells what the service really answers."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The framework's document, with examples, and problems in place of validation errors."""
+        if self.openapi_schema is None:
+            document = super().openapi()
+            schemas = document["components"]["schemas"]
+            problem = Problem.model_json_schema(mode="serialization", ref_template=_REFERENCE)
+            schemas |= problem.pop("$defs") | {"Problem": problem}
+            for path in document["paths"].values():
+                for operation in path.values():
+                    ok = operation["responses"]["200"]["content"]["application/json"]
+                    ok["example"] = examples.ANSWERS[operation["operationId"]]
+                    content = operation["responses"].get("422", {}).get("content", {})
+                    if "application/json" in content:
+                        del operation["responses"]["422"]
+            schemas.pop("HTTPValidationError", None)
+            schemas.pop("ValidationError", None)
+        return super().openapi()

@@ -1,0 +1,108 @@
+"""Pages for people: interactive documentation and one page a problem type, none of it from outside.
+
+The policy sent with each page lets a browser load from this service alone, so a forgotten link to
+another host fails visibly instead of leaking who reads the documentation.
+"""
+
+from __future__ import annotations
+
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Final
+
+from fastapi import APIRouter, FastAPI
+from starlette.responses import HTMLResponse, RedirectResponse
+from starlette.staticfiles import StaticFiles
+
+from app.api import catalogue
+from app.api.problems import ProblemError
+
+STATIC: Final = Path(__file__).parents[1] / "static"
+
+# Swagger UI and Redoc style their elements inline and Redoc searches in a worker made from a blob;
+# neither needs inline script.
+_POLICY: Final = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self' 'unsafe-inline'",
+        "img-src 'self' data:",
+        "font-src 'self' data:",
+        "connect-src 'self'",
+        "worker-src blob:",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+_HEADERS: Final = {"Content-Security-Policy": _POLICY, "X-Content-Type-Options": "nosniff"}
+
+_PAGE: Final = """<!doctype html>
+<html lang="en">
+  <head>
+    <meta charset="utf-8">
+    <meta name="viewport" content="width=device-width, initial-scale=1">
+    <title>{title}</title>
+    <link rel="icon" href="{root}static/icon.svg" type="image/svg+xml">
+    <link rel="stylesheet" href="{root}static/pages.css">
+  </head>
+  <body>
+    <h1>{title}</h1>
+    {body}
+  </body>
+</html>
+"""
+
+problems = APIRouter(include_in_schema=False)
+
+
+def _page(title: str, body: str, *, root: str) -> HTMLResponse:
+    return HTMLResponse(_PAGE.format(title=escape(title), body=body, root=root), headers=_HEADERS)
+
+
+@problems.get("/problems")
+async def list_problem_types() -> HTMLResponse:
+    """Every problem type, with links."""
+    entries = "\n".join(
+        f'<dt><a href="problems/{kind.slug}"><code>{kind.slug}</code></a> ({kind.status})</dt>'
+        f"<dd>{escape(kind.title)}</dd>"
+        for kind in catalogue.PROBLEM_TYPES.values()
+    )
+    return _page("Problems", f"<dl>{entries}</dl>", root="")
+
+
+@problems.get("/problems/{slug}")
+async def show_problem_type(slug: str) -> HTMLResponse:
+    """What a problem type means and what to do about it."""
+    kind = catalogue.PROBLEM_TYPES.get(slug)
+    if kind is None:
+        raise ProblemError(catalogue.NOT_FOUND, "There is no problem type of this name.")
+    body = (
+        f"<p><code>{kind.uri}</code>, status {kind.status}</p><p>{escape(kind.explanation)}</p>"
+        '<p><a href="../problems">All problems</a></p>'
+    )
+    return _page(kind.title, body, root="../")
+
+
+def install(app: FastAPI, *, docs: bool) -> None:
+    """Serve the pages and their assets; ``docs`` False leaves out /docs and /redoc."""
+    app.include_router(problems)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    if not docs:
+        return
+    assets = Path(str(files("fastapi_standalone_docs"))) / "static"
+    for name, folder in (("docs", "swagger"), ("redoc", "redoc")):
+        _serve_document(app, f"/{name}", (STATIC / f"{name}.html").read_text(encoding="utf-8"))
+        app.mount(f"/{name}", StaticFiles(directory=assets / folder), name=f"{name} assets")
+
+    @app.get("/", include_in_schema=False)
+    async def home() -> RedirectResponse:
+        return RedirectResponse("docs")
+
+
+def _serve_document(app: FastAPI, path: str, html: str) -> None:
+    async def document() -> HTMLResponse:
+        return HTMLResponse(html, headers=_HEADERS)
+
+    app.add_api_route(path, document, include_in_schema=False)

@@ -1,0 +1,228 @@
+"""Every failure as problem details (RFC 9457): no traceback, no file, no copy of the input."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, Final
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from app import schemas
+from app.api import catalogue
+from app.api.catalogue import ProblemType
+from app.api.pointers import pointer
+from app.schemas import Failure, FieldError, Problem
+from app.serving.errors import (
+    AliasConflictError,
+    Location,
+    ModelUnavailableError,
+    ModelUnusableError,
+    NotReadyError,
+    Reason,
+    RefreshRefusedError,
+    RequestError,
+    ServingError,
+    StoreBusyError,
+    StoreNotWritableError,
+    UnknownModelError,
+)
+
+MEDIA_TYPE: Final = "application/problem+json"
+MAX_ERRORS: Final = 100
+
+_logger = logging.getLogger("app.api")
+
+_OF_STATUS: Final = {
+    400: catalogue.BAD_REQUEST,
+    404: catalogue.NOT_FOUND,
+    405: catalogue.METHOD_NOT_ALLOWED,
+    413: catalogue.BODY_TOO_LARGE,
+}
+_OF_REASON: Final = {
+    Reason.INVALID: catalogue.INVALID_REQUEST,
+    Reason.UNKNOWN_LABELS: catalogue.UNKNOWN_LABELS,
+    Reason.CONTRADICTION: catalogue.CONTRADICTORY_EVIDENCE,
+}
+_FIELDS: Final = sorted(
+    {
+        name
+        for value in vars(schemas).values()
+        if isinstance(value, type) and issubclass(value, schemas.Request)
+        for name in value.model_fields
+    }
+)
+
+
+class ProblemError(HTTPException):
+    """A failure with a name.
+
+    Starlette hands `HTTPException` through where it wraps anything else, which a failure in the
+    middle of reading a body relies on.
+    """
+
+    def __init__(
+        self,
+        kind: ProblemType,
+        detail: str,
+        *,
+        errors: Sequence[FieldError] = (),
+        failures: Sequence[Failure] = (),
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(kind.status, detail, dict(headers) if headers else None)
+        self.kind = kind
+        self.errors = list(errors[:MAX_ERRORS])
+        self.failures = list(failures)
+
+    def describe(self, request_id: str) -> Problem:
+        """The problem as it is sent."""
+        return Problem(
+            type=self.kind.uri,
+            title=self.kind.title,
+            status=self.kind.status,
+            detail=self.detail,
+            instance=f"{self.kind.uri}#{request_id}",
+            request_id=request_id,
+            errors=self.errors or None,
+            failures=self.failures or None,
+        )
+
+
+# Where pydantic's own words would puzzle a reader who does not write Python.
+_MESSAGES: Final = {
+    "extra_forbidden": "unknown field",
+    "missing": "required",
+    "model_attributes_type": "must be an object",
+    "model_type": "must be an object",
+    "dict_type": "must be an object",
+    "list_type": "must be an array",
+}
+
+
+def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
+    """The problem that an exception stands for; anything unforeseen is an internal error.
+
+    Args:
+        error: what was raised.
+        at: where in the body the failing request stands (an entry of a batch).
+    """
+    match error:
+        case ProblemError():
+            return error
+        case RequestValidationError():
+            return unfit(error, error.body)
+        case RequestError():
+            kind = _OF_REASON[error.reason]
+            errors = [
+                FieldError(
+                    pointer=pointer((*at, *fault.location)),
+                    message=fault.message,
+                    suggestions=list(fault.suggestions),
+                )
+                for fault in error.faults
+            ]
+            return _faulty(kind, errors)
+        case UnknownModelError():
+            return ProblemError(catalogue.MODEL_NOT_FOUND, str(error))
+        case ModelUnavailableError():
+            return ProblemError(catalogue.MODEL_UNAVAILABLE, str(error))
+        case NotReadyError():
+            return ProblemError(catalogue.NOT_READY, str(error))
+        case AliasConflictError():
+            return ProblemError(catalogue.ALIAS_CONFLICT, str(error))
+        case ModelUnusableError():
+            return ProblemError(catalogue.MODEL_UNUSABLE, str(error))
+        case StoreNotWritableError():
+            return ProblemError(catalogue.STORE_NOT_WRITABLE, str(error))
+        case StoreBusyError():
+            return ProblemError(catalogue.STORE_BUSY, str(error))
+        case RefreshRefusedError():
+            detail = "What is served stays as it was; see failures."
+            return ProblemError(catalogue.REFRESH_REFUSED, detail, failures=error.failures)
+        case HTTPException() if error.status_code in _OF_STATUS:
+            kind = _OF_STATUS[error.status_code]
+            return ProblemError(kind, kind.title + ".", headers=error.headers)
+        case _:
+            return ProblemError(
+                catalogue.INTERNAL_ERROR, "The request failed; the service's log says why."
+            )
+
+
+def _faulty(kind: ProblemType, errors: list[FieldError]) -> ProblemError:
+    count = f"{len(errors)} fault{'' if len(errors) == 1 else 's'}"
+    return ProblemError(kind, f"The request has {count}; see errors.", errors=errors)
+
+
+def unfit(
+    error: RequestValidationError | ValidationError, body: Any, *, at: Location = ()
+) -> ProblemError:
+    """The problem of a body that does not fit its schema.
+
+    Args:
+        error: what validation found.
+        body: what was validated.
+        at: where in the request ``body`` stands.
+    """
+    of_framework = isinstance(error, RequestValidationError)
+    errors = []
+    for entry in error.errors():
+        location: Location = tuple(entry["loc"])[1:] if of_framework else entry["loc"]
+        unknown = str(location[-1]) if entry["type"] == "extra_forbidden" else ""
+        errors.append(
+            FieldError(
+                pointer=pointer(at) + pointer(location, body)[1:],
+                message=_MESSAGES.get(entry["type"], entry["msg"]),
+                suggestions=get_close_matches(unknown[:64], _FIELDS) if unknown else [],
+            )
+        )
+    return _faulty(catalogue.INVALID_REQUEST, errors)
+
+
+def report_defect(error: Exception, request_id: str) -> None:
+    """Log what a client is told nothing about."""
+    _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
+
+
+def _request_id(request: Request) -> str:
+    return str(request.scope.get("state", {}).get("request_id", ""))
+
+
+def respond(request: Request, problem: ProblemError) -> Response:
+    """The problem as a response."""
+    headers = dict(problem.headers or {})
+    if problem.status_code == 503:
+        headers["Retry-After"] = str(request.app.state.settings.retry_after)
+    request_id = _request_id(request)
+    return Response(
+        problem.describe(request_id).model_dump_json(exclude_none=True),
+        problem.status_code,
+        # The last resort answers outside every middleware, so it must add the id itself.
+        headers=headers | {"X-Request-Id": request_id},
+        media_type=MEDIA_TYPE,
+    )
+
+
+async def _handle(request: Request, error: Exception) -> Response:
+    return respond(request, from_exception(error))
+
+
+async def _handle_defect(request: Request, error: Exception) -> Response:
+    report_defect(error, _request_id(request))
+    return respond(request, from_exception(error))
+
+
+Handler = Callable[[Request, Exception], Any]
+
+
+def install(app: FastAPI) -> None:
+    """Answer every failure of ``app`` with a problem, in place of the framework's own handlers."""
+    for kind in (HTTPException, RequestValidationError, ServingError):
+        app.add_exception_handler(kind, _handle)
+    app.add_exception_handler(Exception, _handle_defect)

@@ -1,0 +1,44 @@
+"""The four questions, as functions of a published model and a scene.
+
+    relations   How do these objects stand to each other?
+    missing     What else should be here, and where?
+    outliers    What does not belong here, or stands in the wrong place?
+    generate    What would a scene like this look like?
+
+All but the last are expectations, in closed form or estimated with fixed random numbers: the same
+scene gets the same answer. Objects are named by their position in the scene.
+"""
+
+from __future__ import annotations
+
+from app.reasoning.answers import (
+    Because,
+    ContextUnit,
+    GeneratedScene,
+    MisplacedAnswer,
+    MissingAnswer,
+    OutlierAnswer,
+    Placement,
+    RelationAnswer,
+)
+from app.reasoning.contexts import contexts
+from app.reasoning.generate import generate
+from app.reasoning.missing import missing
+from app.reasoning.outliers import outliers
+from app.reasoning.relations import relations
+
+__all__ = [
+    "Because",
+    "ContextUnit",
+    "GeneratedScene",
+    "MisplacedAnswer",
+    "MissingAnswer",
+    "OutlierAnswer",
+    "Placement",
+    "RelationAnswer",
+    "contexts",
+    "generate",
+    "missing",
+    "outliers",
+    "relations",
+]

@@ -1,0 +1,151 @@
+"""A scene as evidence for one machine: names and positions end here, tensors begin.
+
+Presence is soft: a class seen with confidence c < 1 enters as v = c. That is a first-order
+treatment: the energy is linear in v_i, so v = c stands for its mean over v_i ~ Bernoulli(c), but
+what the context makes of either value is not averaged. Classes that nobody saw enter as v = 0.
+
+Relations: what the scene states or shows is observed, everything else is unobserved. In the local
+form unobserved relations drop out, so only classes that an observed relation touches get units. A
+relation that has no unit in the machine carries no evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine, Triway
+from app.boltzmann.draws import HiddenDraws, draw_hidden
+from app.boltzmann.mean_field import Evidence
+from app.reasoning.units import Units, units_between
+from app.scene.evidence import class_evidence
+from app.scene.scene import Scene
+
+DRAWS = 64
+"""Draws of the context behind an estimate; a power of two keeps the Sobol sequence balanced."""
+
+
+def draw_context(machine: BoltzmannMachine, evidence: Evidence) -> HiddenDraws:
+    """The fixed, weighted draws of h1 that every estimate uses."""
+    return draw_hidden(machine, evidence, draws=DRAWS)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One scene, for one machine.
+
+    Attributes:
+        machine: whose units these are.
+        classes, counts: (n,) int64, the distinct classes, ascending, and their instances.
+        row: (N,) int64, for each object of the scene the place of its class in `classes`.
+        first: (n,) int64, position of the first object of each class.
+        holds, observed: (A, n, n) bool.
+        evidence: the same in the machine's layout, one row.
+        units: layout of the evidence's relations; None where relations say nothing.
+        touched: (n,) bool, the classes that `units` speak of.
+    """
+
+    machine: BoltzmannMachine
+    classes: Tensor
+    counts: Tensor
+    row: Tensor
+    first: Tensor
+    holds: Tensor
+    observed: Tensor
+    evidence: Evidence
+    units: Units | None
+    touched: Tensor
+
+    @property
+    def present(self) -> Tensor:
+        """(V,) bool."""
+        present = torch.zeros(self.machine.spec.V, dtype=torch.bool)
+        present[self.classes] = True
+        return present
+
+    def without(self, removed: Tensor) -> Evidence:
+        """The scene with some classes, and every relation that touches them, taken out.
+
+        Args:
+            removed: (B, n) bool, one row for each way of taking out.
+        """
+        evidence, size = self.evidence, len(removed)
+        v = evidence.v.repeat(size, 1)
+        v[:, self.classes] = torch.where(removed, 0.0, v[:, self.classes])
+        room = None if evidence.room is None else evidence.room.expand(size)
+        if self.units is None or evidence.r is None or evidence.observed is None:
+            return Evidence(v, room=room)
+        gone = removed[:, self.touched]
+        kept = ~(gone.unsqueeze(2) | gone.unsqueeze(1)).unsqueeze(1)
+        kept = kept.expand(-1, self.machine.spec.A, -1, -1)
+        observed = evidence.observed & self.units.flat(kept)
+        edges = self.units.edges
+        if isinstance(self.machine, Triway) and self.machine.spec.form == "seed":
+            # Unobserved relations attract there, and a candidate's anchors go row by row.
+            shape = (size, int(self.touched.sum()))
+            classes, counts = self.classes[self.touched], self.counts[self.touched]
+            edges = self.machine.edges(classes.expand(shape), counts.expand(shape))
+        return Evidence(v, edges, evidence.r.expand(size, -1), observed, room)
+
+
+def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
+    """Read a scene.
+
+    Raises:
+        ValueError: an object outside the machine's classes, or a room type it does not have.
+    """
+    spec = machine.spec
+    for thing in scene.objects:
+        if thing.class_index is None or thing.class_index >= spec.V:
+            raise ValueError(
+                f"class_index of {thing.id!r} is {thing.class_index}, must be below V = {spec.V}"
+            )
+    if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
+        raise ValueError(f"room_type is {scene.room_type}, must be below C = {spec.C}")
+    found = class_evidence(scene)
+    labels = np.array([thing.class_index for thing in scene.objects], dtype=np.int64)
+    row = np.searchsorted(found.classes, labels)
+    first = np.searchsorted(row[order := row.argsort(kind="stable")], np.arange(len(found.classes)))
+    classes, counts = torch.from_numpy(found.classes), torch.from_numpy(found.counts)
+    v = torch.zeros(1, spec.V, dtype=machine.b.dtype)
+    v[0, classes] = torch.from_numpy(found.confidence).to(v.dtype)
+    room = None if scene.room_type is None else torch.tensor([scene.room_type])
+    # A machine may know fewer relations than there are.
+    holds = torch.from_numpy(found.holds[: spec.A])
+    observed = torch.from_numpy(found.observed[: spec.A])
+    observation = Observation(
+        machine=machine,
+        classes=classes,
+        counts=counts,
+        row=torch.from_numpy(row),
+        first=torch.from_numpy(order[first]),
+        holds=holds,
+        observed=observed,
+        evidence=Evidence(v, room=room),
+        units=None,
+        touched=torch.ones(len(classes), dtype=torch.bool),
+    )
+    return _with_relations(observation)
+
+
+def _with_relations(scene: Observation) -> Observation:
+    touched, machine = scene.touched, scene.machine
+    if machine.spec.form == "local":
+        pairs = scene.observed.any(0)
+        touched = pairs.any(0) | pairs.any(1)
+        if not bool(touched.any()):
+            return scene
+    classes, counts = scene.classes[touched], scene.counts[touched]
+    units = units_between(machine, classes, classes, counts, counts)
+    holds = units.flat(scene.holds[:, touched][:, :, touched])
+    observed = units.flat(scene.observed[:, touched][:, :, touched])
+    evidence = replace(
+        scene.evidence,
+        edges=units.edges,
+        r=holds.unsqueeze(0).to(scene.evidence.v.dtype),
+        observed=observed.unsqueeze(0),
+    )
+    return replace(scene, evidence=evidence, units=units, touched=touched)

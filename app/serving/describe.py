@@ -1,0 +1,161 @@
+"""What there is to know about the models being served."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import cast
+
+from app.registry import AliasTarget
+from app.scene.relations import opposite
+from app.schemas import (
+    ContextsAnswer,
+    ContextUnit,
+    Metric,
+    ModelList,
+    ModelSummary,
+    RelationName,
+    TrainingSource,
+    VersionDetails,
+    VersionSummary,
+    VocabularyAnswer,
+    VocabularyEntry,
+    WeightedLabel,
+)
+from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
+from app.serving.models import ServedModel, ServedModels
+
+
+def everything(models: ServedModels) -> ModelList:
+    """All models, versions, aliases and failures."""
+    return ModelList(
+        models=[_summary(models, name) for name in models.store.versions],
+        aliases={alias: str(target) for alias, target in sorted(models.store.aliases.items())},
+        failures=list(models.failures.values()),
+    )
+
+
+def model(models: ServedModels, reference: str) -> ModelSummary:
+    """The model that a name or an alias leads to, whether or not it is usable.
+
+    Raises:
+        UnknownModelError: there is none.
+    """
+    return _summary(models, _name(models, reference))
+
+
+def version(models: ServedModels, reference: str, number: str) -> VersionDetails:
+    """One version of the model that a name or an alias leads to.
+
+    Raises:
+        UnknownModelError: there is none.
+    """
+    name = _name(models, reference)
+    if number not in models.store.versions[name]:
+        raise UnknownModelError("The model has no such version.")
+    summary = _version_summary(models, name, number)
+    served = models.served.get((name, number))
+    if served is None:
+        return VersionDetails(name=name, **dict(summary))
+    manifest = served.artifact.manifest
+    return VersionDetails(
+        name=name,
+        **dict(summary),
+        created=manifest.created,
+        parameters=sum(math.prod(tensor.shape) for tensor in manifest.tensors.values()),
+        metrics=[Metric(**metric.model_dump()) for metric in manifest.metrics],
+        data=[TrainingSource(**source.model_dump()) for source in manifest.data],
+        terms=manifest.terms,
+        card=served.artifact.card,
+    )
+
+
+def vocabulary(served: ServedModel) -> VocabularyAnswer:
+    """The words of a model."""
+    canonical = served.artifact.manifest.vocabulary.relations
+    names = (*canonical, *map(opposite, canonical))
+    return VocabularyAnswer(
+        model=served.reference,
+        objects=[
+            VocabularyEntry(
+                label=entry.label, aliases=list(entry.aliases), structure=entry.structure
+            )
+            for entry in served.vocabulary.objects
+        ],
+        relations=[cast("RelationName", name) for name in names],
+        room_types=list(served.vocabulary.room_types),
+    )
+
+
+def contexts(served: ServedModel) -> ContextsAnswer:
+    """The hidden units of a model by their strongest objects."""
+    return ContextsAnswer(
+        model=served.reference,
+        layers={
+            layer: [
+                ContextUnit(
+                    unit=unit.unit,
+                    objects=_weighted(unit.objects),
+                    room_types=_weighted(unit.room_types),
+                )
+                for unit in units
+            ]
+            for layer, units in served.contexts.items()
+        },
+    )
+
+
+def _weighted(pairs: Sequence[tuple[str, float]]) -> list[WeightedLabel]:
+    return [WeightedLabel(label=label, weight=weight) for label, weight in pairs]
+
+
+def _name(models: ServedModels, reference: str) -> str:
+    """A model's name from a reference, which may lead to a version that was refused."""
+    name = reference.partition("@")[0]
+    target: AliasTarget | None = models.store.aliases.get(name)
+    if target is not None:
+        name = target.name
+    if name not in models.store.versions:
+        raise UnknownModelError("There is no such alias or model.")
+    return name
+
+
+def _summary(models: ServedModels, name: str) -> ModelSummary:
+    return ModelSummary(
+        name=name,
+        versions=[
+            _version_summary(models, name, number)
+            for number in reversed(models.store.versions[name])
+        ],
+    )
+
+
+def _version_summary(models: ServedModels, name: str, number: str) -> VersionSummary:
+    served = models.served.get((name, number))
+    if served is None:
+        failure = models.failures[f"{name}@{number}"]
+        return VersionSummary(
+            version=number,
+            status="refused",
+            aliases=[],
+            reason=failure.reason,
+            detail=failure.detail,
+        )
+    return VersionSummary(
+        version=number,
+        status="ready",
+        aliases=_aliases(models, served),
+        variant=served.reference.variant,
+        digest=served.reference.digest,
+    )
+
+
+def _aliases(models: ServedModels, served: ServedModel) -> list[str]:
+    found = []
+    for alias in sorted(models.store.aliases):
+        try:
+            if models.resolve(alias) is served:
+                found.append(alias)
+        except (UnknownModelError, ModelUnavailableError, NotReadyError):
+            continue
+    return found

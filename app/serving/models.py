@@ -1,0 +1,159 @@
+"""The models being served: verified by the registry, warmed here, swapped as a whole.
+
+A snapshot never changes, so a request that holds one sees one state of the world from beginning to
+end. Nothing that was refused hides: it stays listed with its reason, and no older version answers
+in its place.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
+
+from app import reasoning
+from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
+from app.scene.vocabulary import Vocabulary
+from app.schemas import Failure, ModelReference
+from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
+from app.serving.warm_up import warm_up
+
+DEFAULT = "default"
+Key = tuple[str, str]
+
+_logger = logging.getLogger("app.serving")
+_UNKNOWN = {"unknown_model", "unknown_version", "invalid_reference"}
+
+
+@dataclass(frozen=True, eq=False)
+class ServedModel:
+    """A model that has answered.
+
+    Attributes:
+        artifact: what the reasoning works with.
+        contexts: its hidden units by their strongest objects, layer by layer.
+    """
+
+    artifact: Artifact
+    contexts: Mapping[str, tuple[reasoning.ContextUnit, ...]]
+
+    @cached_property
+    def reference(self) -> ModelReference:
+        """How answers name it."""
+        manifest = self.artifact.manifest
+        return ModelReference(
+            name=manifest.name,
+            version=manifest.version,
+            variant=manifest.variant,
+            digest=self.artifact.digest,
+        )
+
+    @property
+    def vocabulary(self) -> Vocabulary:
+        """Its words."""
+        return self.artifact.vocabulary
+
+    @cached_property
+    def context_sizes(self) -> Mapping[str, int]:
+        """How many units each layer has."""
+        return {layer: len(units) for layer, units in self.contexts.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class ServedModels:
+    """A snapshot: what is served, what was refused, and the aliases.
+
+    Attributes:
+        store: the registry's snapshot.
+        served: the models that have answered, by (name, version).
+        warm_up_failures: verified models that could not answer, and why.
+    """
+
+    store: ModelSet
+    served: Mapping[Key, ServedModel]
+    warm_up_failures: Mapping[Key, Failure]
+
+    def resolve(self, reference: str) -> ServedModel:
+        """The model that an alias, `name` or `name@version` leads to.
+
+        Raises:
+            UnknownModelError: no such model or version.
+            ModelUnavailableError: it was refused, or the alias leads nowhere.
+            NotReadyError: the same of the default.
+        """
+        try:
+            artifact = self.store.resolve(reference)
+            return self.served[artifact.manifest.name, artifact.manifest.version]
+        except (StoreError, ArtifactError, KeyError) as error:
+            if reference == DEFAULT:
+                raise NotReadyError("The default model is not usable.") from None
+            if isinstance(error, StoreError) and error.code in _UNKNOWN:
+                raise UnknownModelError("There is no such alias, model or version.") from None
+            raise ModelUnavailableError("This model was refused when it was loaded.") from None
+
+    def with_alias(self, alias: str, target: AliasTarget) -> ServedModels:
+        """The same snapshot with one alias moved."""
+        aliases = MappingProxyType({**self.store.aliases, alias: target})
+        return replace(self, store=replace(self.store, aliases=aliases))
+
+    @cached_property
+    def failures(self) -> Mapping[str, Failure]:
+        """Everything that cannot be used, by subject: versions, aliases, the store itself."""
+        found = {
+            f"{name}@{version}": Failure(
+                subject=f"{name}@{version}", reason=refused.code, detail=refused.reason
+            )
+            for (name, version), refused in self.store.failures.items()
+        }
+        found |= {failure.subject: failure for failure in self.warm_up_failures.values()}
+        for alias in sorted({DEFAULT, *self.store.aliases}):
+            try:
+                self.resolve(alias)
+            except (UnknownModelError, ModelUnavailableError, NotReadyError):
+                found[alias] = self._alias_failure(alias)
+        if self.store.failure is not None:
+            found["store"] = Failure(
+                subject="store", reason=self.store.failure.code, detail=self.store.failure.reason
+            )
+        return found
+
+    def _alias_failure(self, alias: str) -> Failure:
+        try:
+            artifact = self.store.resolve(alias)
+        except (StoreError, ArtifactError) as error:
+            return Failure(subject=alias, reason=error.code, detail=error.reason)
+        name, version = artifact.manifest.name, artifact.manifest.version
+        cause = self.warm_up_failures[name, version]
+        return Failure(subject=alias, reason=cause.reason, detail=f"{name}@{version}")
+
+
+def prepare(store: ModelSet, previous: ServedModels | None = None) -> ServedModels:
+    """Let every verified model answer one question of each kind.
+
+    A model that ``previous`` serves from the same artifact has answered already.
+    """
+    served: dict[Key, ServedModel] = {}
+    failures: dict[Key, Failure] = {}
+    for key, artifact in store.entries.items():
+        if not isinstance(artifact, Artifact):
+            continue
+        known = previous.served.get(key) if previous is not None else None
+        if known is not None and known.artifact is artifact:
+            served[key] = known
+            continue
+        try:
+            contexts = warm_up(artifact)
+        except Exception:
+            # Whatever a broken model raises, it must not take the others down with it.
+            subject = f"{key[0]}@{key[1]}"
+            _logger.exception("%s did not answer its warm-up", subject)
+            failures[key] = Failure(
+                subject=subject,
+                reason="warm_up_failed",
+                detail="it verified, but could not answer a question",
+            )
+        else:
+            served[key] = ServedModel(artifact, contexts)
+    return ServedModels(store, MappingProxyType(served), MappingProxyType(failures))

@@ -1,0 +1,203 @@
+"""What the process serves: one snapshot of models, and the ways to change it."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from app.registry import AliasTarget, Store, StoreError, load_model_set
+from app.schemas import AliasAnswer, AliasRequest, RefreshAnswer
+from app.serving.errors import (
+    AliasConflictError,
+    Fault,
+    ModelUnavailableError,
+    ModelUnusableError,
+    NotReadyError,
+    Reason,
+    RefreshRefusedError,
+    RequestError,
+    StoreBusyError,
+    StoreNotWritableError,
+    UnknownModelError,
+)
+from app.serving.models import DEFAULT, ServedModels, prepare
+from app.serving.reading import Limits
+from app.serving.session import Session
+
+_logger = logging.getLogger("app.serving")
+
+# An administrator waits this long for another writer; the requests of robots never do.
+_LOCK_TIMEOUT = 5.0
+
+
+class Runtime:
+    """The one holder of the current snapshot.
+
+    Args:
+        store: directory of published models.
+        limits: what one scene may hold.
+    """
+
+    def __init__(self, store: Path, limits: Limits) -> None:
+        self._store = Store(store, lock_timeout=_LOCK_TIMEOUT)
+        self._limits = limits
+        self._models: ServedModels | None = None
+        self._changing = asyncio.Lock()
+
+    @property
+    def models(self) -> ServedModels:
+        """The current snapshot.
+
+        Raises:
+            NotReadyError: nothing has been loaded yet.
+        """
+        if self._models is None:
+            raise NotReadyError("The service is starting.")
+        return self._models
+
+    def session(self, request_id: str) -> Session:
+        """The view of one request, which keeps the snapshot it starts with.
+
+        Raises:
+            NotReadyError: nothing has been loaded yet.
+        """
+        return Session(self.models, self._limits, request_id)
+
+    def check_ready(self) -> None:
+        """Return if requests that name no model can be answered.
+
+        Raises:
+            NotReadyError: they cannot.
+        """
+        self.models.resolve(DEFAULT)
+
+    async def start(self) -> None:
+        """Load, verify and warm everything in the store; `models` tells what is wrong."""
+        # Serving scales by processes: threads within one would fight over the same cores.
+        torch.set_num_threads(1)
+        self._models = prepare(load_model_set(self._store))
+        for failure in self._models.failures.values():
+            _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
+        _settle_memory()
+
+    async def refresh(self, request_id: str) -> RefreshAnswer:
+        """Take over what the store holds now, or leave everything as it is.
+
+        Refused is what makes the service worse: anything that fails and did not before, and any
+        state whose default model is not usable.
+
+        Raises:
+            RefreshRefusedError: nothing has changed.
+            NotReadyError: nothing has been loaded yet.
+        """
+        async with self._changing:
+            old = self.models
+            # In a thread, so that the old snapshot goes on answering.
+            new = await asyncio.to_thread(self._load, old)
+            worse = [
+                failure
+                for subject, failure in new.failures.items()
+                if subject == DEFAULT or subject not in old.failures
+            ]
+            if worse:
+                raise RefreshRefusedError(worse)
+            self._models = new
+            answer = RefreshAnswer(
+                request_id=request_id,
+                default=new.resolve(DEFAULT).reference,
+                added=_names(new, but_not=old),
+                removed=_names(old, but_not=new),
+                failures=list(new.failures.values()),
+            )
+            del old
+            _settle_memory()
+            return answer
+
+    def _load(self, old: ServedModels) -> ServedModels:
+        return prepare(load_model_set(self._store, old.store), old)
+
+    async def move_alias(self, alias: str, request: AliasRequest, request_id: str) -> AliasAnswer:
+        """Let an alias lead to a version that is served, here at once and in the store for good.
+
+        Raises:
+            RequestError: no alias can have this name.
+            UnknownModelError: no such model or version is served.
+            ModelUnusableError: the version was refused.
+            AliasConflictError: the alias leads elsewhere than expected, or is a model's name.
+            StoreNotWritableError, StoreBusyError: the store cannot be changed (now).
+            NotReadyError: nothing has been loaded yet.
+        """
+        async with self._changing:
+            target = self._target(request.model)
+            expected = _expected(request)
+            try:
+                previous = self._store.aliases().get(alias)
+                await asyncio.to_thread(self._store.set_alias, alias, target, expected=expected)
+            except StoreError as error:
+                raise _refusal(error) from None
+            self._models = self.models.with_alias(alias, target)
+            return AliasAnswer(
+                request_id=request_id,
+                alias=alias,
+                model=str(target),
+                previous=None if previous is None else str(previous),
+            )
+
+    def _target(self, reference: str) -> AliasTarget:
+        try:
+            found = self.models.resolve(reference).reference
+        except (ModelUnavailableError, NotReadyError):
+            raise ModelUnusableError("This version was refused when it was loaded.") from None
+        # A model's bare name stays one, so that the alias follows its newest version.
+        newest = reference == found.name
+        return AliasTarget(name=found.name, version=None if newest else found.version)
+
+
+def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
+    if "expected" not in request.model_fields_set:
+        return "any"
+    if request.expected is None:
+        return None
+    name, at, version = request.expected.partition("@")
+    try:
+        return AliasTarget(name=name, version=version if at else None)
+    except ValueError:
+        raise AliasConflictError("No alias leads where the request expected.") from None
+
+
+def _refusal(error: StoreError) -> Exception:
+    match error.code:
+        case "alias_conflict":
+            return AliasConflictError("The alias does not lead where the request expected.")
+        case "name_conflict":
+            return AliasConflictError("A model has this name, so no alias can.")
+        case "invalid_reference":
+            return RequestError(Reason.INVALID, [Fault((), error.reason)])
+        case "unknown_model" | "unknown_version":
+            return UnknownModelError("The store no longer has this version.")
+        case "locked":
+            return StoreBusyError("Another process is writing to the store.")
+        case _:
+            return StoreNotWritableError(f"The store's aliases cannot be changed: {error.reason}.")
+
+
+def _names(models: ServedModels, *, but_not: ServedModels) -> list[str]:
+    return [
+        f"{name}@{version}" for name, version in sorted(set(models.served) - set(but_not.served))
+    ]
+
+
+def _settle_memory() -> None:
+    """Take what is long-lived out of the collector's sight.
+
+    With torch imported a full collection stops the world for some 90 ms. What a replaced snapshot
+    left frozen must be thawed first, or its cycles would never be freed.
+    """
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()

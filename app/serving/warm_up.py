@@ -1,0 +1,51 @@
+"""One real question of each kind to a model before anybody depends on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from app import reasoning
+from app.registry import Artifact
+from app.scene.scene import Scene, SceneObject
+from app.scene.vocabulary import Vocabulary
+
+STEPS = 4
+"""Gibbs sweeps of the drawing; a full one takes half a second and warms nothing further."""
+
+
+def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...]]:
+    """Ask everything once; the first call of a kernel costs many times the later ones.
+
+    Returns:
+        The model's contexts, which never change.
+
+    Raises:
+        ValueError: an answer is not finite.
+        Exception: whatever the model raises.
+    """
+    scene = _scene(artifact.vocabulary)
+    relations = reasoning.relations(artifact, scene)
+    missing = reasoning.missing(artifact, scene)
+    if len(scene.objects) > 1:
+        reasoning.missing(artifact, scene, at=("on-top", 0))
+    outliers, misplaced = reasoning.outliers(artifact, scene)
+    generated = reasoning.generate(artifact, scene, count=2, seed=0, steps=STEPS)
+    numbers = [entry.probability for entry in relations]
+    numbers += [number for entry in missing for number in (entry.probability, entry.log_odds)]
+    numbers += [number for entry in outliers for number in (entry.probability, entry.log_odds)]
+    numbers += [entry.probability for entry in misplaced]
+    numbers += [entry.log_score for entry in generated]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("the model gives answers that are not finite")
+    return reasoning.contexts(artifact)
+
+
+def _scene(vocabulary: Vocabulary) -> Scene:
+    """Three kinds of things, or as many as there are, one of them on another."""
+    proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
+    objects = tuple(
+        SceneObject(str(place), vocabulary.labels[index], index)
+        for place, index in enumerate((proposable or [0])[:3])
+    )
+    return Scene(objects, ((2, 1, 0),) if len(objects) > 1 else None)

@@ -1,0 +1,84 @@
+"""Every knob of the service, typed, read from the environment (prefix ``SCENE_``)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, SecretStr, field_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+MAX_OBJECTS = 256
+"""The contract's limit on objects in one scene; settings may lower it, never raise it."""
+
+
+def _lower(value: object) -> object:
+    return value.strip().lower() if isinstance(value, str) else value
+
+
+class Settings(BaseSettings):
+    """What an operator may choose. The defaults are safe: loopback only, no admin routes.
+
+    Raises:
+        pydantic.ValidationError: a value makes no sense; every message names its variable.
+    """
+
+    model_config = SettingsConfigDict(
+        env_prefix="SCENE_",
+        env_ignore_empty=True,
+        frozen=True,
+        extra="forbid",
+        validate_default=True,
+        hide_input_in_errors=True,
+    )
+
+    host: Annotated[str, Field(min_length=1, description="address to listen on")] = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535, description="0 = any free port")] = 8000
+    store: Annotated[Path, Field(description="directory of published models")] = Path("model_store")
+    admin_key: Annotated[
+        SecretStr | None,
+        Field(
+            description="key of the admin routes, at least 16 characters; without it they are off"
+        ),
+    ] = None
+    max_body_bytes: Annotated[
+        int, Field(ge=1024, le=64 * 2**20, description="largest request body")
+    ] = 2 * 2**20
+    max_objects: Annotated[
+        int, Field(ge=1, le=MAX_OBJECTS, description="most objects in one scene")
+    ] = MAX_OBJECTS
+    max_relations: Annotated[
+        int, Field(ge=0, le=65536, description="most relations given in one scene")
+    ] = 4096
+    retry_after: Annotated[
+        int, Field(ge=1, le=3600, description="seconds named in Retry-After when not ready")
+    ] = 2
+    docs: Annotated[bool, Field(description="serve /docs and /redoc")] = True
+    root_path: Annotated[
+        str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")
+    ] = ""
+    log_level: Annotated[
+        Literal["debug", "info", "warning", "error", "critical"], BeforeValidator(_lower)
+    ] = "info"
+    log_format: Annotated[Literal["json", "plain"], BeforeValidator(_lower)] = "json"
+    access_log: Annotated[bool, Field(description="one line a request, never its payload")] = True
+
+    @field_validator("store")
+    @classmethod
+    def _is_directory(cls, value: Path) -> Path:
+        if not value.is_dir():
+            raise ValueError(f"SCENE_STORE must be an existing directory, and {value} is none")
+        return value
+
+    @field_validator("admin_key")
+    @classmethod
+    def _is_strong(cls, value: SecretStr | None) -> SecretStr | None:
+        if value is None:
+            return None
+        key = value.get_secret_value()
+        # The key travels in a header, so it must survive one; a short one can be tried out.
+        if len(key) < 16 or not (key.isascii() and key.isprintable()) or " " in key:
+            raise ValueError(
+                "SCENE_ADMIN_KEY must have at least 16 printable ASCII characters and no space"
+            )
+        return value

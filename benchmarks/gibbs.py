@@ -1,0 +1,71 @@
+"""Gibbs sampling of an RBM over objects: sweeps of many chains a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import torch
+
+from app.boltzmann import MachineSpec
+from app.boltzmann.gibbs import State, gibbs_step, initial_state
+from benchmarks.report import Result
+from benchmarks.timing import interleave
+from benchmarks.yardsticks import object_machine, presence, random_scenes, rbms, scikit_learn
+
+OURS, SKLEARN, RBMS = "ours", "scikit-learn BernoulliRBM", "rbms"
+PRODUCTS = "two bare matrix products"
+
+S = TypeVar("S")
+
+
+class Chains(Generic[S]):
+    """A state that every call moves on by one sweep."""
+
+    def __init__(self, state: S, sweep: Callable[[S], S]) -> None:
+        self.state, self.sweep = state, sweep
+
+    def __call__(self) -> None:
+        self.state = self.sweep(self.state)
+
+
+@torch.no_grad()
+def gibbs(
+    *, V: int = 417, H: int = 200, chains: int = 512, objects: int = 12, rounds: int = 41
+) -> Result:
+    """Sweeps over all chains; every sampler holds the same weights and starts at the same scenes."""
+    machine = object_machine(MachineSpec("rbm", V=V, A=4, H1=H), objects)
+    generator = torch.Generator().manual_seed(1)
+    v = presence(random_scenes(chains, V, objects, generator), V)
+    h = (torch.rand(chains, H, generator=generator) < 0.5).float()
+    W = machine.W
+
+    def sweep(state: State) -> State:
+        # No relation unit exists, so there is none to draw.
+        return gibbs_step(machine, state, generator, relations=False)
+
+    sklearn_rbm, rbms_rbm = scikit_learn(machine), rbms(machine)
+    ours = Chains(initial_state(machine, v, generator), sweep)
+    sklearn = Chains(v.numpy(), sklearn_rbm.gibbs)
+    other = Chains(
+        rbms_rbm.init_chains(chains, start_v=v),
+        lambda state: rbms_rbm.sample_visibles(rbms_rbm.sample_hiddens(state)),
+    )
+    timings = interleave(
+        {OURS: ours, SKLEARN: sklearn, RBMS: other, PRODUCTS: lambda: (v @ W, h @ W.T)},
+        rounds=rounds,
+    )
+    return Result(
+        name="gibbs",
+        title=f"Gibbs sweeps of a {V} × {H} RBM, {chains} chains, one thread",
+        subject=OURS,
+        timings=timings,
+        work=chains,
+        unit="chain-sweeps/s",
+        targets={SKLEARN: 2, RBMS: 2, PRODUCTS: 0.45},
+        facts={
+            "objects present a chain, ours": float(ours.state.v.sum(1).mean()),
+            "objects present a chain, scikit-learn": float(sklearn.state.sum(1).mean()),
+            "objects present a chain, rbms": float(other.state["visible"].sum(1).mean()),
+        },
+    )

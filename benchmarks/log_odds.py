@@ -1,0 +1,63 @@
+"""Log-odds of every object class for one scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.boltzmann import MachineSpec
+from app.boltzmann.log_odds import object_log_odds
+from app.boltzmann.mean_field import Evidence, mean_field
+from app.boltzmann.scoring import ContextScorer
+from benchmarks.report import Result
+from benchmarks.timing import interleave
+from benchmarks.yardsticks import object_machine, presence, random_scenes, scikit_learn
+
+OURS, UNPREPARED = "ours, exp(W) precomputed", "ours, from the weights alone"
+TWO_COPIES = "scikit-learn, V copies with and without each object"
+ONE_COPY = "scikit-learn, V copies against the scene once"
+
+
+@torch.no_grad()
+def log_odds(
+    *, V: int = 417, H: int = 200, objects: int = 12, K: int = 32, rounds: int = 31
+) -> Result:
+    """The local Triway machine's closed form, and free energies of scikit-learn on copied scenes."""
+    spec = MachineSpec("triway", V=V, A=4, H1=H, K=K, form="local")
+    machine = object_machine(spec, objects)
+    scorer, rbm = ContextScorer(machine), scikit_learn(machine)
+    v = presence(random_scenes(1, V, objects, torch.Generator().manual_seed(1)), V)
+
+    def prepared() -> Tensor:
+        return machine.b + scorer.gain(mean_field(machine, Evidence(v)).y)
+
+    def unprepared() -> Tensor:
+        return object_log_odds(machine, Evidence(v))
+
+    def two_copies() -> np.ndarray:
+        present = np.repeat(v.numpy(), V, axis=0)
+        absent = present.copy()
+        np.fill_diagonal(present, 1)
+        np.fill_diagonal(absent, 0)
+        return rbm._free_energy(absent) - rbm._free_energy(present)
+
+    def one_copy() -> np.ndarray:
+        present = np.repeat(v.numpy(), V, axis=0)
+        np.fill_diagonal(present, 1)
+        return rbm._free_energy(v.numpy()) - rbm._free_energy(present)
+
+    timings = interleave(
+        {OURS: prepared, UNPREPARED: unprepared, TWO_COPIES: two_copies, ONE_COPY: one_copy},
+        rounds=rounds,
+    )
+    absent = v[0] == 0
+    difference = prepared()[0, absent] - torch.from_numpy(two_copies())[absent]
+    return Result(
+        name="log-odds",
+        title=f"Log-odds of {V} objects for one scene, {H} hidden units, one thread",
+        subject=OURS,
+        timings=timings,
+        targets={TWO_COPIES: 50},
+        facts={"largest difference from scikit-learn": float(difference.abs().max())},
+    )

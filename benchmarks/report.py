@@ -1,0 +1,131 @@
+"""Results as tables and as JSON, with the machine that they were taken on."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from benchmarks.timing import Timings
+
+Fact = str | int | float
+
+_PACKAGES = ("torch", "numpy", "scikit-learn", "rbms", "fastapi", "uvicorn", "pydantic")
+
+
+@dataclass(frozen=True)
+class Result:
+    """One benchmark's outcome.
+
+    Attributes:
+        name: of the benchmark.
+        title: what was measured, in words.
+        subject: the contender that is ours.
+        timings: of every contender.
+        work, unit: a call does `work` of `unit`; None where the time of a call says it all.
+        targets: at least so many times faster than this yardstick is what we aim at.
+        facts: whatever else belongs to the outcome.
+    """
+
+    name: str
+    title: str
+    subject: str
+    timings: Timings
+    work: int = 1
+    unit: str | None = None
+    targets: Mapping[str, float] = field(default_factory=dict)
+    facts: Mapping[str, Fact] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, object]:
+        """Every sample, and the ratios that follow from them."""
+        return {
+            "name": self.name,
+            "title": self.title,
+            "subject": self.subject,
+            "work": self.work,
+            "unit": self.unit,
+            "seconds": dict(self.timings.seconds),
+            "ratios": {
+                name: asdict(self.timings.ratio(self.subject, name))
+                for name in self.timings.seconds
+                if name != self.subject
+            },
+            "targets": dict(self.targets),
+            "facts": dict(self.facts),
+        }
+
+    def table(self) -> Group:
+        """Contenders by row; the last columns compare ours with each."""
+        table = Table(title=self.title, title_justify="left")
+        table.add_column("")
+        table.add_column("a call", justify="right")
+        if self.unit:
+            table.add_column(self.unit, justify="right")
+        table.add_column("ours is faster by", justify="right")
+        table.add_column("aim", justify="right")
+        for name in self.timings.seconds:
+            seconds = self.timings.median(name)
+            row = [name, duration(seconds)]
+            if self.unit:
+                row.append(f"{self.work / seconds:,.0f}")
+            table.add_row(*row, *self._comparison(name))
+        facts = [Text(f"  {name}: {_show(value)}") for name, value in self.facts.items()]
+        return Group(table, *facts)
+
+    def _comparison(self, name: str) -> tuple[str, str]:
+        if name == self.subject:
+            return "", ""
+        ratio = self.timings.ratio(self.subject, name)
+        target = self.targets.get(name)
+        text = f"{ratio.median:.3g}× ({ratio.low:.3g}–{ratio.high:.3g})"
+        return text, "" if target is None else f"≥ {target:g}×"
+
+
+def duration(seconds: float) -> str:
+    """Seconds in the unit that reads best."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 1e-9:.3g} ns"
+
+
+def document(results: Sequence[Result], machine: Mapping[str, object]) -> dict[str, object]:
+    """The JSON document of a run."""
+    return {"machine": dict(machine), "results": [result.to_dict() for result in results]}
+
+
+def describe_machine() -> dict[str, object]:
+    """The machine as it is now, its load included."""
+    load = os.getloadavg() if hasattr(os, "getloadavg") else ()
+    return {
+        "taken": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "load": [round(value, 2) for value in load],
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        **{package: version(package) for package in _PACKAGES},
+    }
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown"
+
+
+def _show(value: Fact) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) else value

@@ -1,0 +1,114 @@
+"""One step of contrastive divergence: active pairs and shared weights against the dense machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+
+from app.boltzmann import MachineSpec, build
+from app.boltzmann.bernoulli import bernoulli
+from benchmarks.report import Result
+from benchmarks.timing import interleave
+from benchmarks.yardsticks import frequencies, presence, random_scenes
+from training.batches import Batch
+from training.config import ObjectiveConfig
+from training.objectives import ContrastiveDivergence
+
+OURS, DENSE = "ours, active pairs", "dense RBM"
+
+_RATE = 0.01
+_HOLDS = 0.1
+
+
+def training_step(
+    *,
+    V: int = 417,
+    A: int = 4,
+    H1: int = 200,
+    H2: int = 100,
+    K: int = 32,
+    scenes: int = 32,
+    objects: int = 12,
+    rounds: int = 5,
+) -> Result:
+    """CD-1 of the Triway machine (seed form) and of a dense RBM over all V + A·V² units."""
+    generator = torch.Generator().manual_seed(0)
+    classes = random_scenes(scenes, V, objects, generator)
+    pairs = (scenes, A, objects, objects)
+    batch = Batch(
+        v=presence(classes, V),
+        classes=classes,
+        counts=torch.ones_like(classes),
+        holds=(torch.rand(pairs, generator=generator) < _HOLDS).float(),
+        observed=torch.ones(pairs, dtype=torch.bool),
+        room=torch.full((scenes,), -1),
+        annotated=torch.ones(scenes, V, dtype=torch.bool),
+    )
+    spec = MachineSpec("triway", V=V, A=A, H1=H1, H2=H2, K=K, form="seed")
+    dense_units = V + A * V * V
+    timings = interleave(
+        {
+            OURS: _triway_step(spec, batch, objects, generator),
+            DENSE: _dense_step(batch, A, H1, generator),
+        },
+        rounds=rounds,
+        slice_seconds=0.3,
+    )
+    return Result(
+        name="training",
+        title=f"One CD-1 step, {scenes} scenes of {objects} objects, {V} classes, one thread",
+        subject=OURS,
+        timings=timings,
+        targets={DENSE: 200},
+        facts={
+            "weights, ours": build(spec).parameter_count,
+            "weights, dense": dense_units * H1 + dense_units + H1,
+        },
+    )
+
+
+def _triway_step(
+    spec: MachineSpec, batch: Batch, objects: int, generator: torch.Generator
+) -> Callable[[], None]:
+    """Forward, gradients by autograd and update, with the objective that training uses."""
+    machine = build(spec).initialise(generator, scale=0.05)
+    with torch.no_grad():
+        machine.b.copy_(frequencies(spec.V, objects).logit())
+        machine.get_parameter("d").fill_(math.log(_HOLDS))
+    config = ObjectiveConfig(name="contrastive_divergence", k=1)
+    objective = ContrastiveDivergence(config, machine)
+    trained = [parameter for parameter in machine.parameters() if parameter.requires_grad]
+    optimiser = torch.optim.SGD(trained, lr=_RATE)
+
+    def step() -> None:
+        optimiser.zero_grad(set_to_none=True)
+        objective.loss(machine, batch, generator).backward()  # type: ignore[no-untyped-call]
+        objective.adjust_gradients(machine)
+        optimiser.step()
+
+    return step
+
+
+def _dense_step(batch: Batch, A: int, H: int, generator: torch.Generator) -> Callable[[], None]:
+    """Plain torch over (v, r) as one visible layer; gradients are added to W as they are formed."""
+    scenes, V = batch.v.shape
+    x = torch.zeros(scenes, V + A * V * V)
+    x[:, :V] = batch.v
+    for row, classes in enumerate(batch.classes):
+        grid = x[row, V:].view(A, V, V)
+        grid[:, classes[:, None], classes[None, :]] = batch.holds[row]
+    W = torch.randn(x.shape[1], H, generator=generator).mul_(0.001)
+    b, c = torch.full((x.shape[1],), -4.0), torch.zeros(H)
+
+    @torch.no_grad()
+    def step() -> None:
+        data = torch.addmm(c, x, W).sigmoid_()
+        y = bernoulli(torch.addmm(b, bernoulli(data, generator), W.T).sigmoid_(), generator)
+        model = torch.addmm(c, y, W).sigmoid_()
+        W.addmm_(x.T, data, alpha=_RATE / scenes).addmm_(y.T, model, alpha=-_RATE / scenes)
+        b.add_((x - y).mean(0), alpha=_RATE)
+        c.add_((data - model).mean(0), alpha=_RATE)
+
+    return step

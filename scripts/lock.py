@@ -1,0 +1,84 @@
+"""Write requirements*.lock from pyproject.toml: the exact versions that are tested together.
+
+pip resolves the development set first, downloads nothing it can read the metadata of, and installs
+nothing; the smaller sets are then resolved inside those pins, so that the files never disagree.
+
+Usage: python scripts/lock.py   (or `make lock`; any further arguments go to pip)
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+HEADER = "# {what}. Written by `make lock` from pyproject.toml; do not edit.\n"
+
+# Packages that torch's CUDA builds ask for. Which build is installed is up to the machine, so its
+# companions cannot be pinned here: a pin would drag them onto machines without a GPU.
+CUDA_COMPANION = re.compile(r"^(cuda-|nvidia-|triton$)")
+
+
+def resolve(requirements: list[str], pins: Path | None, pip_arguments: list[str]) -> dict[str, str]:
+    """Name → line `name==version` of everything that `requirements` pull in."""
+    command = [
+        *(sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "-qq"),
+        *("--dry-run", "--ignore-installed", "--report", "-"),
+        *(("--constraint", str(pins)) if pins else ()),
+        *pip_arguments,
+        *requirements,
+    ]
+    report = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
+    locked: dict[str, str] = {}
+    for item in report["install"]:
+        name, version = item["metadata"]["name"], item["metadata"]["version"]
+        key = re.sub(r"[-_.]+", "-", name).lower()
+        if not CUDA_COMPANION.match(key):
+            # A local version (2.13.0+cpu) names one build of one index; the public one fits all.
+            locked[key] = f"{key}=={version.partition('+')[0]}"
+    return locked
+
+
+def with_markers(locked: dict[str, str], requirements: list[str]) -> list[str]:
+    """The pins in order, carrying over the environment markers that pyproject.toml states."""
+    markers = {"uvloop": "sys_platform != 'win32'"}
+    for requirement in requirements:
+        name, _, marker = requirement.partition(";")
+        if marker:
+            key = re.split(r"[<>=!~\[ ]", name.strip(), maxsplit=1)[0]
+            markers[re.sub(r"[-_.]+", "-", key).lower()] = marker.strip()
+    return [
+        f"{pin}; {markers[key]}" if key in markers else pin for key, pin in sorted(locked.items())
+    ]
+
+
+def main(pip_arguments: list[str]) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    runtime = project["dependencies"]
+    training = runtime + extras["training"]
+    development = training + extras["dev"]
+
+    with tempfile.TemporaryDirectory() as scratch:
+        pins = Path(scratch) / "constraints.txt"
+        locked = resolve(development, None, pip_arguments)
+        pins.write_text("\n".join(locked.values()), "utf-8")
+        for path, what, wanted in (
+            ("requirements-dev.lock", "Everything: service, training, checks", development),
+            ("requirements-training.lock", "The service and training", training),
+            ("requirements.lock", "The service alone", runtime),
+        ):
+            if wanted is not development:
+                locked = resolve(wanted, pins, pip_arguments)
+            text = HEADER.format(what=what) + "\n".join(with_markers(locked, wanted)) + "\n"
+            (ROOT / path).write_text(text, "utf-8")
+            print(f"{path}: {len(locked)} packages")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

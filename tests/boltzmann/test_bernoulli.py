@@ -1,0 +1,57 @@
+"""Draws have the probabilities asked for, well below the 8 bits that decide most of them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from app.boltzmann.bernoulli import bernoulli
+
+DRAWS = 2_000_000
+# The middle of a byte, its edges, a tie's fraction alone, and the least float32 below one.
+PROBABILITIES = [1e-6, 1e-4, 1 / 256, 0.1, 0.5, 0.7312, 255.5 / 256, 1 - 2**-24]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("p", PROBABILITIES)
+def test_frequency(p, dtype):
+    """Within 6 standard deviations and 10: by Bernstein fails by chance with probability < 1e-6."""
+    generator = torch.Generator().manual_seed(3)
+    drawn = bernoulli(torch.full((DRAWS,), p, dtype=dtype), generator)
+    deviation = math.sqrt(DRAWS * p * (1 - p))
+    assert drawn.dtype == dtype
+    assert abs(float(drawn.double().sum()) - DRAWS * p) < 6 * deviation + 10
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_certain_units_are_certain(dtype):
+    generator = torch.Generator().manual_seed(4)
+    assert float(bernoulli(torch.zeros(DRAWS, dtype=dtype), generator).max()) == 0
+    assert float(bernoulli(torch.ones(DRAWS, dtype=dtype), generator).min()) == 1
+
+
+def test_neighbouring_draws_are_independent():
+    """Draws share 64-bit words: no correlation at any lag within one, to 5 standard deviations."""
+    generator = torch.Generator().manual_seed(5)
+    drawn = bernoulli(torch.full((DRAWS,), 0.3), generator) - 0.3
+    for lag in range(1, 17):
+        correlation = float((drawn[:-lag] * drawn[lag:]).mean()) / 0.21
+        assert abs(correlation) < 5 / math.sqrt(DRAWS)
+
+
+def test_a_seed_repeats_and_each_row_follows_its_own_probability():
+    p = torch.tensor([0.0, 1.0, 0.5]).expand(1000, 3)
+    first, second = (bernoulli(p, torch.Generator().manual_seed(6)) for _ in range(2))
+    assert torch.equal(first, second)
+    assert first[:, :2].mean(0).tolist() == [0, 1]
+    assert 0.4 < float(first[:, 2].mean()) < 0.6
+
+
+def test_no_unit_gives_no_draw():
+    assert bernoulli(torch.zeros(3, 0)).shape == (3, 0)
+
+
+def test_probabilities_with_a_gradient_are_drawn_from():
+    assert not bernoulli(torch.full((4,), 0.5, requires_grad=True)).requires_grad

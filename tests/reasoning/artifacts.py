@@ -1,0 +1,99 @@
+"""Small artifacts for the four questions: one entry here puts a machine through every test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from app.boltzmann import BoltzmannMachine, MachineSpec, build
+from app.registry.artifact import Artifact
+from app.registry.description import Calibration, CountSlope, Slope
+from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
+from tests.enumeration.small_machines import SMALL
+
+# Three classes, so that a present one leaves two to choose from; few enough states to enumerate.
+EXACT: dict[str, MachineSpec] = {
+    "rbm": SMALL["rbm-three-classes"],
+    "gbm": SMALL["gbm-one-layer"],
+    "triway-seed": MachineSpec("triway", V=3, A=1, H1=2, K=2, T=2, form="seed"),
+    "triway-local": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, form="local"),
+}
+# Too large to enumerate; with structure, four relations and two layers.
+LARGER: dict[str, MachineSpec] = {
+    "rbm": MachineSpec("rbm", V=9, A=4, H1=6, T=40, C=2),
+    "gbm": MachineSpec("gbm", V=9, A=4, H1=6, H2=3, T=40),
+    "triway-seed": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, form="seed"),
+    "triway-local": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, form="local"),
+}
+LABELS = ("bed", "lamp", "desk", "chair", "sofa", "vase", "shelf", "rug", "wall")
+STRUCTURE = {"wall"}
+ROOMS = ("bedroom", "office")
+
+
+def calibration(relations: int, **changes: object) -> Calibration:
+    """Changes nothing but the signs: unlikely objects are intruders, unlikely relations false."""
+    neutral = {
+        "relation": (CountSlope(),) * relations,
+        "outlier": CountSlope(slope=-1.0),
+        "misplaced": Slope(slope=-1.0),
+    }
+    return Calibration(**(neutral | changes))
+
+
+def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
+    spec = machine.spec
+    vocabulary = Vocabulary(
+        [ObjectClass(label, structure=label in STRUCTURE) for label in LABELS[: spec.V]],
+        ROOMS[: spec.C],
+    )
+    return Artifact(
+        manifest=None,
+        machine=machine,
+        vocabulary=vocabulary,
+        calibration=calibration(spec.A, **changes),
+        digest="",
+        card="",
+        path=Path(),
+    )
+
+
+def exact_artifact(name: str, **changes: object) -> Artifact:
+    """Float64, every weight drawn from N(0, .6²)."""
+    return artifact_of(_random(EXACT[name], torch.float64, 0.6), **changes)
+
+
+def larger_artifact(name: str, **changes: object) -> Artifact:
+    """Float32, every weight drawn from N(0, .7²)."""
+    return artifact_of(_random(LARGER[name], torch.float32, 0.7), **changes)
+
+
+def _random(spec: MachineSpec, dtype: torch.dtype, scale: float) -> BoltzmannMachine:
+    generator = torch.Generator().manual_seed(3)
+    machine = build(spec).to(dtype)
+    if spec.T:
+        units = spec.A * spec.V**2
+        keys = torch.randperm(units, generator=generator)[: spec.T].sort().values
+        machine.set_triples(
+            torch.stack([keys // spec.V**2, keys // spec.V % spec.V, keys % spec.V], 1)
+        )
+    with torch.no_grad():
+        for parameter in machine.parameters():
+            noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+            parameter.copy_(noise * scale)
+        if hasattr(machine, "kappa"):
+            machine.kappa.zero_()
+    return machine.eval().requires_grad_(False)
+
+
+def scene_of(
+    classes: list[int],
+    relations: list[tuple[int, int, int]] | None = None,
+    room: int | None = None,
+    *,
+    complete: bool = False,
+) -> Scene:
+    """Objects named by their place; relations are canonical triples over places."""
+    objects = tuple(SceneObject(f"{LABELS[c]}_{k}", LABELS[c], c) for k, c in enumerate(classes))
+    triples = None if relations is None else tuple(relations)
+    return Scene(objects, triples, complete, room)

@@ -1,0 +1,225 @@
+"""Every scoring answer against the enumerated joint of a small machine."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from app.reasoning import missing, outliers, relations
+from app.scene import CANONICAL, OPPOSITES
+from tests.enumeration.small_machines import Joint, enumerate_joint
+from tests.reasoning.artifacts import EXACT, LABELS, exact_artifact, scene_of
+
+# Estimates use 2^13 fixed draws here. With two or three hidden units and weights of .6 a log-odds
+# then has a standard error of about .01 (of independent draws; the Sobol sequence does better).
+DRAWS = 1 << 13
+TOLERANCE = 0.04
+
+
+@pytest.fixture(autouse=True)
+def _many_draws(monkeypatch):
+    monkeypatch.setattr("app.reasoning.evidence.DRAWS", DRAWS)
+
+
+@dataclass(frozen=True)
+class Exact:
+    """Conditional probabilities of a machine by summing its joint."""
+
+    joint: Joint
+
+    def unit(self, triple) -> torch.Tensor | None:
+        """(N,) values of a relation unit; None where the machine has none."""
+        e = self.joint.edges
+        a, i, j = triple
+        match = (e.relation[0] == a) & (e.subject[0] == i) & (e.object[0] == j)
+        return self.joint.r[:, match.nonzero().item()] > 0 if bool(match.any()) else None
+
+    def given(self, present, absent, observed=()):
+        """(N,) bool: states with these classes on and off, and these triples on."""
+        where = torch.ones(len(self.joint.v), dtype=torch.bool)
+        for i in present:
+            where &= self.joint.v[:, i] > 0
+        for i in absent:
+            where &= self.joint.v[:, i] == 0
+        for triple in observed:
+            unit = self.unit(triple)
+            if unit is not None:
+                where &= unit
+        return where
+
+    def object(self, i, present, observed=()) -> float:
+        """Log-odds of class i given that all others are as stated and some relations on."""
+        rest = set(present) - {i}
+        others = set(range(self.joint.machine.spec.V)) - rest - {i}
+        touching = [t for t in observed if i in t[1:]]
+        kept = [t for t in observed if t not in touching]
+        return self.joint.log_odds(self.joint.v[:, i] > 0, self.given(rest, others, kept))
+
+    def relation(self, triple, present, observed=()) -> float:
+        """p(r_e = 1) given the classes and the other observed relations."""
+        unit = self.unit(triple)
+        if unit is None:
+            return 0.0
+        absent = set(range(self.joint.machine.spec.V)) - set(present)
+        kept = [t for t in observed if t != triple]
+        return 1 / (1 + math.exp(-self.joint.log_odds(unit, self.given(present, absent, kept))))
+
+
+@pytest.fixture(scope="module", params=EXACT)
+def case(request):
+    artifact = exact_artifact(request.param)
+    return artifact, Exact(enumerate_joint(artifact.machine))
+
+
+# Classes of a scene and the canonical triples stated of them (classes are places here).
+SCENES = [
+    ([0], None),
+    ([2], None),
+    ([0, 1], None),
+    ([0, 1], [(0, 0, 1)]),
+    ([1, 2], [(0, 1, 0)]),
+    ([0, 1, 2], [(0, 2, 0), (0, 0, 1)]),
+]
+
+
+def triples(classes, stated):
+    return [(a, classes[i], classes[j]) for a, i, j in stated or ()]
+
+
+def is_exact(artifact, stated):
+    return artifact.machine.spec.form == "local" and not stated
+
+
+@pytest.mark.parametrize(("classes", "stated"), SCENES[:5])
+def test_missing(case, classes, stated):
+    artifact, exact = case
+    answers = missing(artifact, scene_of(classes, stated))
+    absent = set(range(3)) - set(classes)
+    assert {answer.label for answer in answers} == {LABELS[i] for i in absent}
+    truth = {LABELS[i]: exact.object(i, classes, triples(classes, stated)) for i in absent}
+    total = sum(map(math.exp, truth.values()))
+    near = 1e-9 if is_exact(artifact, stated) else TOLERANCE
+    for answer in answers:
+        assert answer.log_odds == pytest.approx(truth[answer.label], abs=near)
+        expected = math.exp(truth[answer.label]) / total
+        assert answer.probability == pytest.approx(expected, abs=near)
+
+
+@pytest.mark.parametrize(("classes", "stated"), SCENES[:5])
+def test_placements(case, classes, stated):
+    """p(r_e = 1 | the candidate is there too), then made exclusive; the best three."""
+    artifact, exact = case
+    A = artifact.machine.spec.A
+    observed = triples(classes, stated)
+    for answer in missing(artifact, scene_of(classes, stated)):
+        i = LABELS.index(answer.label)
+        truth = {}
+        for anchor, x in enumerate(classes):
+            for a in range(A):
+                p = exact.relation((a, i, x), [*classes, i], observed)
+                q = exact.relation((a, x, i), [*classes, i], observed)
+                truth[CANONICAL[a], anchor] = p / max(1, p + q)
+                truth[OPPOSITES[CANONICAL[a]], anchor] = q / max(1, p + q)
+        best = sorted(truth.values(), reverse=True)[:3]
+        assert [place.probability for place in answer.placements] == pytest.approx(
+            best, abs=TOLERANCE
+        )
+        for place in answer.placements:
+            expected = truth[place.relation, place.object]
+            assert place.probability == pytest.approx(expected, abs=TOLERANCE)
+
+
+@pytest.mark.parametrize("relation", ["left", "right"])
+@pytest.mark.parametrize("anchor", [0, 1, 2])
+def test_missing_at_a_place(case, relation, anchor):
+    artifact, exact = case
+    scene = scene_of([anchor])
+    answers = missing(artifact, scene, at=(relation, 0))
+    scores = {}
+    for i in set(range(3)) - {anchor}:
+        triple = (0, i, anchor) if relation == "left" else (0, anchor, i)
+        p = exact.relation(triple, [anchor, i])
+        scores[LABELS[i]] = math.exp(exact.object(i, [anchor])) * max(p, math.exp(-30))
+    total = sum(scores.values())
+    for answer in answers:
+        assert answer.probability == pytest.approx(scores[answer.label] / total, abs=TOLERANCE)
+
+
+def test_the_place_counts_by_the_calibration(case):
+    """Without weight the place says nothing; the log-odds never change."""
+    name = case[0].machine.spec.variant
+    name = name if name in EXACT else f"triway-{case[0].machine.spec.form}"
+    unweighted = exact_artifact(name, placed_relation_weight=0.0, placed_temperature=2.0)
+    cooled = exact_artifact(name, missing_temperature=2.0)
+    there = missing(unweighted, scene_of([0]), at=("left", 0))
+    anywhere = missing(cooled, scene_of([0]))
+    assert [a.probability for a in there] == pytest.approx([a.probability for a in anywhere])
+    assert [a.log_odds for a in there] == [a.log_odds for a in anywhere]
+
+
+@pytest.mark.parametrize(("classes", "stated"), SCENES[2:])
+def test_relations(case, classes, stated):
+    """Each relation given the others, itself left out, made exclusive."""
+    artifact, exact = case
+    answers = relations(artifact, scene_of(classes, stated), top_k=100)
+    observed = triples(classes, stated)
+    n = len(classes)
+    assert len(answers) == n * (n - 1) * artifact.machine.spec.A
+    for answer in answers:
+        a = CANONICAL.index(answer.relation)
+        i, j = classes[answer.subject], classes[answer.object]
+        p = exact.relation((a, i, j), classes, observed)
+        q = exact.relation((a, j, i), classes, observed)
+        assert answer.probability == pytest.approx(p / max(1, p + q), abs=TOLERANCE)
+
+
+@pytest.mark.parametrize(("classes", "stated"), SCENES)
+def test_outliers(case, classes, stated):
+    artifact, exact = case
+    found, misplaced = outliers(artifact, scene_of(classes, stated))
+    observed = triples(classes, stated)
+    near = 1e-9 if is_exact(artifact, stated) else TOLERANCE
+    for answer in found:
+        truth = exact.object(classes[answer.object], classes, observed)
+        assert answer.log_odds == pytest.approx(truth, abs=near)
+        assert answer.probability == pytest.approx(1 / (1 + math.exp(truth)), abs=near)
+    assert len(misplaced) == len(observed)
+    for answer in misplaced:
+        a = CANONICAL.index(answer.relation)
+        triple = (a, classes[answer.subject], classes[answer.object])
+        p = exact.relation(triple, classes, observed)
+        assert answer.probability == pytest.approx(1 - p, abs=TOLERANCE)
+
+
+def test_reasons(case):
+    """What each other object adds to the log-odds: exact where the log-odds are."""
+    artifact, exact = case
+    classes = [0, 1, 2]
+    found, _ = outliers(artifact, scene_of(classes))
+    near = 1e-9 if is_exact(artifact, None) else 0.15
+    for answer in found:
+        i = classes[answer.object]
+        truth = {
+            j: exact.object(i, classes) - exact.object(i, [c for c in classes if c != j])
+            for j in classes
+            if j != i
+        }
+        assert {b.object for b in answer.because} == set(truth)
+        for because in answer.because:
+            assert because.log_odds_change == pytest.approx(truth[because.object], abs=near)
+        sizes = [abs(because.log_odds_change) for because in answer.because]
+        assert sizes == sorted(sizes, reverse=True)
+
+
+@pytest.mark.parametrize("name", [name for name in EXACT if EXACT[name].C])
+def test_the_room_type_counts(name):
+    artifact = exact_artifact(name)
+    for room in range(2):
+        exact = Exact(enumerate_joint(artifact.machine, room))
+        near = 1e-9 if is_exact(artifact, None) else TOLERANCE
+        for answer in missing(artifact, scene_of([0], room=room)):
+            truth = exact.object(LABELS.index(answer.label), [0])
+            assert answer.log_odds == pytest.approx(truth, abs=near)
