@@ -33,7 +33,7 @@ class Chains(Generic[S]):
 def gibbs(
     *, V: int = 417, H: int = 200, chains: int = 512, objects: int = 12, rounds: int = 41
 ) -> Result:
-    """Sweeps over all chains; every sampler holds the same weights and starts at the same scenes."""
+    """Sweeps over all chains; every sampler has the same weights and starts at the same scenes."""
     machine = object_machine(MachineSpec("rbm", V=V, A=4, H1=H), objects)
     generator = torch.Generator().manual_seed(1)
     v = presence(random_scenes(chains, V, objects, generator), V)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,7 +25,7 @@ ONE_COPY = "scikit-learn, V copies against the scene once"
 def log_odds(
     *, V: int = 417, H: int = 200, objects: int = 12, K: int = 32, rounds: int = 31
 ) -> Result:
-    """The local Triway machine's closed form, and free energies of scikit-learn on copied scenes."""
+    """The local Triway machine in closed form; scikit-learn by free energies of copied scenes."""
     spec = MachineSpec("triway", V=V, A=4, H1=H, K=K, form="local")
     machine = object_machine(spec, objects)
     scorer, rbm = ContextScorer(machine), scikit_learn(machine)
@@ -35,14 +37,14 @@ def log_odds(
     def unprepared() -> Tensor:
         return object_log_odds(machine, Evidence(v))
 
-    def two_copies() -> np.ndarray:
+    def two_copies() -> Any:
         present = np.repeat(v.numpy(), V, axis=0)
         absent = present.copy()
         np.fill_diagonal(present, 1)
         np.fill_diagonal(absent, 0)
         return rbm._free_energy(absent) - rbm._free_energy(present)
 
-    def one_copy() -> np.ndarray:
+    def one_copy() -> Any:
         present = np.repeat(v.numpy(), V, axis=0)
         np.fill_diagonal(present, 1)
         return rbm._free_energy(v.numpy()) - rbm._free_energy(present)

@@ -63,13 +63,13 @@ class Result:
         }
 
     def table(self) -> Group:
-        """Contenders by row; the last columns compare ours with each."""
+        """Contenders by row; the ratio is our speed over theirs, with its quartiles over rounds."""
         table = Table(title=self.title, title_justify="left")
         table.add_column("")
         table.add_column("a call", justify="right")
         if self.unit:
             table.add_column(self.unit, justify="right")
-        table.add_column("ours is faster by", justify="right")
+        table.add_column("speed ratio (quartiles)", justify="right")
         table.add_column("aim", justify="right")
         for name in self.timings.seconds:
             seconds = self.timings.median(name)

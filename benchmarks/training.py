@@ -8,7 +8,6 @@ from collections.abc import Callable
 import torch
 
 from app.boltzmann import MachineSpec, build
-from app.boltzmann.bernoulli import bernoulli
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import frequencies, presence, random_scenes
@@ -84,7 +83,7 @@ def _triway_step(
 
     def step() -> None:
         optimiser.zero_grad(set_to_none=True)
-        objective.loss(machine, batch, generator).backward()  # type: ignore[no-untyped-call]
+        objective.loss(machine, batch, generator).backward()
         objective.adjust_gradients(machine)
         optimiser.step()
 
@@ -105,7 +104,8 @@ def _dense_step(batch: Batch, A: int, H: int, generator: torch.Generator) -> Cal
     @torch.no_grad()
     def step() -> None:
         data = torch.addmm(c, x, W).sigmoid_()
-        y = bernoulli(torch.addmm(b, bernoulli(data, generator), W.T).sigmoid_(), generator)
+        h = torch.bernoulli(data, generator=generator)
+        y = torch.bernoulli(torch.addmm(b, h, W.T).sigmoid_(), generator=generator)
         model = torch.addmm(c, y, W).sigmoid_()
         W.addmm_(x.T, data, alpha=_RATE / scenes).addmm_(y.T, model, alpha=-_RATE / scenes)
         b.add_((x - y).mean(0), alpha=_RATE)

@@ -12,9 +12,9 @@ from app.boltzmann import BoltzmannMachine, MachineSpec, build
 
 
 def frequencies(V: int, objects: float) -> Tensor:
-    """(V,) how often each class is present: a Zipf–Mandelbrot law, as in rooms, adding to `objects`.
+    """(V,) how often each class is present, by a Zipf–Mandelbrot law; adds to `objects`.
 
-    The few most frequent classes are in most scenes, the many others in hardly any.
+    As in rooms, a few classes are in most scenes and the many others in hardly any.
     """
     share = 1 / torch.arange(3.0, V + 3)
     return (objects * share / share.sum()).clamp(max=0.95)

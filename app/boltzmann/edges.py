@@ -123,5 +123,5 @@ def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
     """Positions of keys in a sorted table of keys, and whether each is there."""
     if not table.numel():
         return torch.zeros_like(keys), torch.zeros_like(keys, dtype=torch.bool)
-    position = torch.searchsorted(table, keys).clamp(max=table.numel() - 1)
+    position = torch.searchsorted(table, keys.contiguous()).clamp(max=table.numel() - 1)
     return position, table[position] == keys

@@ -27,10 +27,27 @@ from app.scene.scene import Scene
 DRAWS = 64
 """Draws of the context behind an estimate; a power of two keeps the Sobol sequence balanced."""
 
+# Evidence of very many relations gets fewer draws, down to a few, so that a question stays bounded.
+_FEWEST_DRAWS = 8
+_RELATION_DRAWS = 1 << 25
 
-def draw_context(machine: BoltzmannMachine, evidence: Evidence) -> HiddenDraws:
-    """The fixed, weighted draws of h1 that every estimate uses."""
-    return draw_hidden(machine, evidence, draws=DRAWS)
+
+def draw_context(
+    machine: BoltzmannMachine, evidence: Evidence, *, rows: int | None = None
+) -> HiddenDraws:
+    """The fixed, weighted draws of h1 that every estimate uses.
+
+    `DRAWS` of them, or fewer where rows × relation units × draws would exceed a bound.
+
+    Args:
+        rows: how many rows the question has in all; those of the evidence by default.
+    """
+    units = 0 if evidence.edges is None else evidence.edges.shape[-1]
+    size = (len(evidence.v) if rows is None else rows) * units
+    draws = DRAWS
+    while draws > _FEWEST_DRAWS and draws * size > _RELATION_DRAWS:
+        draws //= 2
+    return draw_hidden(machine, evidence, draws=draws)
 
 
 @dataclass(frozen=True)
@@ -65,6 +82,11 @@ class Observation:
         present = torch.zeros(self.machine.spec.V, dtype=torch.bool)
         present[self.classes] = True
         return present
+
+    @property
+    def unit_count(self) -> int:
+        """E, the relation units of the evidence."""
+        return 0 if self.units is None else self.units.edges.shape[-1]
 
     def without(self, removed: Tensor) -> Evidence:
         """The scene with some classes, and every relation that touches them, taken out.

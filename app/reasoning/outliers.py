@@ -8,7 +8,7 @@ from torch import Tensor
 from app.boltzmann.log_odds import object_log_odds
 from app.reasoning.answers import Because, MisplacedAnswer, OutlierAnswer
 from app.reasoning.calibration import false_log_odds, intruder_log_odds
-from app.reasoning.evidence import DRAWS, Observation, observe
+from app.reasoning.evidence import DRAWS, Observation, draw_context, observe
 from app.reasoning.objects import presence_log_odds
 from app.reasoning.relations import class_log_odds
 from app.registry.artifact import Artifact
@@ -19,7 +19,11 @@ REASONS = 3
 """How many other objects an answer names as reasons."""
 
 EXPLAINED = 32
-"""Reasons are given for so many objects, the least fitting ones: they cost n rows each."""
+"""Reasons are given for so many objects at most, the least fitting ones: each costs n rows."""
+
+# Where a scene shows very many relations, reasons are given for fewer objects, so that their rows
+# hold about so many relation units in all.
+_REASON_UNITS = 1 << 22
 
 # Rows are taken in blocks of about so many relation units times draws, to bound memory.
 _BLOCK = 1 << 22
@@ -52,8 +56,8 @@ def outliers(
     log_odds = log_odds_given_rest(observation)
     intruder = intruder_log_odds(calibration, log_odds, len(log_odds))
     order = intruder[observation.row].sort(descending=True, stable=True).indices
-    explained = list(dict.fromkeys(observation.row[order[:EXPLAINED]].tolist()))
-    reasons = _reasons(observation, explained)
+    explained = order[: _affordable(observation)]
+    reasons = _reasons(observation, list(dict.fromkeys(observation.row[explained].tolist())))
     rows, values = observation.row.tolist(), log_odds.tolist()
     probability = torch.sigmoid(intruder).tolist()
     labels = artifact.vocabulary.labels
@@ -65,28 +69,35 @@ def outliers(
             probability=probability[row],
             log_odds=values[row],
             is_outlier=probability[row] >= threshold,
-            because=reasons[row] if rank < EXPLAINED else (),
+            because=reasons.get(row, ()),
         )
-        for rank, position in enumerate(order.tolist())
+        for position in order.tolist()
     )
     return found, _misplaced(artifact, observation, scene)
 
 
 def log_odds_given_rest(observation: Observation) -> Tensor:
     """Log-odds of each present class given the scene without it, (n,)."""
-    alone = torch.eye(len(observation.classes), dtype=torch.bool)
-    units = 0 if observation.units is None else observation.units.edges.shape[-1]
-    block = max(1, _BLOCK // max(1, units * DRAWS))
-    return torch.cat(
-        [
-            presence_log_odds(
-                observation.machine, observation.without(removed), classes.unsqueeze(1)
-            ).squeeze(1)
-            for removed, classes in zip(
-                alone.split(block), observation.classes.split(block), strict=True
-            )
-        ]
-    )
+    machine, n = observation.machine, len(observation.classes)
+    alone = torch.eye(n, dtype=torch.bool)
+    parts = []
+    for classes in torch.arange(n).split(_rows(observation.unit_count * DRAWS)):
+        rest = observation.without(alone[classes])
+        draws = None if rest.edges is None else draw_context(machine, rest, rows=n)
+        candidates = observation.classes[classes].unsqueeze(1)
+        parts.append(presence_log_odds(machine, rest, candidates, draws).squeeze(1))
+    return torch.cat(parts)
+
+
+def _rows(size: int) -> int:
+    """How many rows of that size to take at a time."""
+    return max(1, _BLOCK // max(1, size))
+
+
+def _affordable(observation: Observation) -> int:
+    """For how many objects to give reasons."""
+    per_object = len(observation.classes) * max(1, observation.unit_count)
+    return min(EXPLAINED, max(1, _REASON_UNITS // per_object))
 
 
 def _reasons(observation: Observation, explained: list[int]) -> dict[int, tuple[Because, ...]]:
@@ -116,20 +127,17 @@ def _leave_one_out(observation: Observation, rows: Tensor) -> Tensor:
     machine, n = observation.machine, len(observation.classes)
     wanted = torch.zeros(n, dtype=torch.bool)
     wanted[rows] = True
-    pairs = (wanted.unsqueeze(1) | wanted).triu().nonzero()
+    pairs = (wanted.unsqueeze(1) | wanted).triu().nonzero().contiguous()
     alone = torch.eye(n, dtype=torch.bool)
-    units = 0 if observation.units is None else observation.units.edges.shape[-1]
-    block = max(1, _BLOCK // max(1, units))
-    log_odds = torch.cat(
-        [
-            object_log_odds(
-                machine,
-                observation.without(alone[part].any(1)),
-                candidates=observation.classes[part],
-            )
-            for part in pairs.split(block)
-        ]
-    )
+    parts = [
+        object_log_odds(
+            machine,
+            observation.without(alone[part].any(1)),
+            candidates=observation.classes[part],
+        )
+        for part in pairs.split(_rows(observation.unit_count))
+    ]
+    log_odds = torch.cat(parts)
     without = log_odds.new_zeros(n, n)
     i, j = pairs.unbind(1)
     without[i, j], without[j, i] = log_odds.unbind(1)

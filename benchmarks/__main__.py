@@ -1,0 +1,70 @@
+"""``python -m benchmarks``: run them all, or those named."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from benchmarks.gibbs import gibbs
+from benchmarks.log_odds import log_odds
+from benchmarks.report import Result, describe_machine, document
+from benchmarks.service import NoModelError, service
+from benchmarks.training import training_step
+
+
+class Name(StrEnum):
+    """The benchmarks, in the order in which they run."""
+
+    GIBBS = "gibbs"
+    TRAINING = "training"
+    LOG_ODDS = "log-odds"
+    SERVICE = "service"
+
+
+def main(
+    names: Annotated[list[Name] | None, typer.Argument(help="all of them by default")] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", help="also write every sample here")
+    ] = None,
+    store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
+) -> None:
+    """Measure ratios against yardsticks that run in turns with what is measured."""
+    console = Console()
+    machine = describe_machine()
+    for key, value in machine.items():
+        console.print(f"{key}: {value}", highlight=False)
+    results: list[Result] = []
+    for name in names or list(Name):
+        console.print()
+        try:
+            outcome = _run(name, store)
+        except NoModelError as error:
+            console.print(f"{name}: skipped, {error}", highlight=False)
+            continue
+        for result in outcome:
+            console.print(result.table())
+        results += outcome
+    if json_path is not None:
+        text = json.dumps(document(results, machine), indent=2, ensure_ascii=False)
+        json_path.write_text(text + "\n", encoding="utf-8")
+
+
+def _run(name: Name, store: Path) -> list[Result]:
+    match name:
+        case Name.GIBBS:
+            return [gibbs()]
+        case Name.TRAINING:
+            return [training_step()]
+        case Name.LOG_ODDS:
+            return [log_odds()]
+        case Name.SERVICE:
+            return service(store=store)
+
+
+if __name__ == "__main__":
+    typer.run(main)

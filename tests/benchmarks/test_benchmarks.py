@@ -1,0 +1,133 @@
+"""Every benchmark at a tiny size: complete results, finite ratios, yardsticks doing the same work.
+
+No test here looks at speed: that is what the benchmarks are for.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+
+import pytest
+import torch
+import typer
+from rich.console import Console
+from typer.testing import CliRunner
+
+from benchmarks.__main__ import main
+from benchmarks.gibbs import gibbs
+from benchmarks.log_odds import log_odds
+from benchmarks.report import Result, describe_machine, document, duration
+from benchmarks.service import MISSING, NoModelError, service
+from benchmarks.timing import Timings, interleave
+from benchmarks.training import training_step
+from benchmarks.yardsticks import frequencies, random_scenes
+from tests.http.stores import make_store, publish
+
+
+def check_complete(result: Result, rounds: int) -> None:
+    """Every contender in every round, a positive finite ratio to each, and all of it printable."""
+    seconds = result.timings.seconds
+    assert result.subject in seconds
+    assert set(result.targets) <= set(seconds) - {result.subject}
+    for values in seconds.values():
+        assert len(values) == rounds
+        assert all(0 < value < math.inf for value in values)
+    parsed = json.loads(json.dumps(document([result], describe_machine()), allow_nan=False))
+    assert set(parsed["results"][0]["ratios"]) == set(seconds) - {result.subject}
+    for ratio in parsed["results"][0]["ratios"].values():
+        assert 0 < ratio["low"] <= ratio["median"] <= ratio["high"] < math.inf
+    console = Console(width=200, file=io.StringIO())
+    with console.capture() as capture:
+        console.print(result.table())
+    text = capture.get()
+    assert all(name in text for name in [*seconds, *result.facts])
+
+
+def test_gibbs_yardsticks_sample_the_same_machine():
+    """Means over 4,000 chains within more than 6 standard errors: chance fails below 1e-8."""
+    result = gibbs(V=20, H=10, chains=4000, objects=4, rounds=4)
+    check_complete(result, 4)
+    ours, sklearn, other = result.facts.values()
+    # The variance of 20 bits is at most 5; ten leaves room for what the context ties together.
+    error = 6 * math.sqrt(10 / 4000)
+    assert ours == pytest.approx(sklearn, abs=error)
+    assert ours == pytest.approx(other, abs=error)
+    assert ours == pytest.approx(4, abs=1)
+
+
+def test_training_step():
+    result = training_step(V=12, H1=6, H2=3, K=2, scenes=3, objects=4, rounds=2)
+    check_complete(result, 2)
+    assert result.facts["weights, dense"] == (12 + 4 * 144) * 6 + 12 + 4 * 144 + 6
+
+
+def test_log_odds_agree_with_those_of_the_yardstick():
+    result = log_odds(V=30, H=12, objects=5, K=2, rounds=2)
+    check_complete(result, 2)
+    assert result.facts["largest difference from scikit-learn"] < 1e-4
+
+
+def test_service(tmp_path):
+    started, asked = service(store=make_store(tmp_path), objects=3, requests=5, rounds=1)
+    check_complete(started, 1)
+    check_complete(asked, 5)
+    assert asked.subject == MISSING
+    assert asked.facts["model"] == "home 1.0.0 (triway)"
+
+
+def test_service_without_a_store_is_refused(tmp_path):
+    with pytest.raises(NoModelError, match="does not exist"):
+        service(store=tmp_path / "none")
+
+
+def test_service_without_a_default_model_is_refused(tmp_path):
+    publish(tmp_path, "one", "1.0.0")
+    publish(tmp_path, "two", "1.0.0")
+    with pytest.raises(NoModelError, match="not ready"):
+        service(store=tmp_path, rounds=1)
+
+
+def test_command_says_what_it_skips_and_writes_the_rest(tmp_path):
+    path = tmp_path / "results.json"
+    arguments = ["service", "--store", str(tmp_path / "none"), "--json", str(path)]
+    app = typer.Typer()
+    app.command()(main)
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "service: skipped" in result.output
+    written = json.loads(path.read_text())
+    assert written["results"] == []
+    assert written["machine"]["cores"] >= 1
+
+
+def test_contenders_take_turns_and_start_in_turns():
+    calls: list[str] = []
+    contenders = {name: lambda name=name: calls.append(name) for name in "abc"}
+    interleave(contenders, rounds=4, slice_seconds=0.0)
+    warm_up = ["a", "a", "b", "b", "c", "c"]
+    assert calls == warm_up + list("abc") + list("bca") + list("cab") + list("abc")
+
+
+def test_a_ratio_is_taken_within_each_round():
+    """The machine slows down tenfold in the last two rounds; the ratio does not notice."""
+    timings = Timings({"ours": [1.0, 1.0, 10.0, 10.0], "other": [3.0, 3.0, 30.0, 30.0]})
+    ratio = timings.ratio("ours", "other")
+    assert (ratio.low, ratio.median, ratio.high) == (3, 3, 3)
+    assert timings.ratio("other", "ours").median == pytest.approx(1 / 3)
+
+
+def test_no_round_is_refused():
+    with pytest.raises(ValueError, match="rounds must be at least 1, not 0"):
+        interleave({"a": list}, rounds=0)
+
+
+def test_durations_read_well():
+    assert [duration(s) for s in (2.0, 0.0123, 4.5e-5, 7e-9)] == ["2 s", "12.3 ms", "45 µs", "7 ns"]
+
+
+def test_scenes_have_as_many_objects_as_asked_for():
+    assert float(frequencies(417, 12).sum()) == pytest.approx(12)
+    scenes = random_scenes(50, 417, 12, torch.Generator().manual_seed(0))
+    assert all(len(set(scene.tolist())) == 12 for scene in scenes)

@@ -1,0 +1,82 @@
+"""What the shipped store promises: which models, how large, how quickly loaded, which words."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from app.registry import Artifact, Store, load_model_set
+from app.scene import CANONICAL
+
+STORE = Store(Path(__file__).resolve().parents[2] / "model_store")
+SHIPPED = ["indoor-gbm", "indoor-rbm", "indoor-triway", "procthor-triway"]
+
+
+@pytest.fixture(scope="module")
+def models():
+    return load_model_set(STORE)
+
+
+@pytest.fixture(params=SHIPPED)
+def artifact(request, models) -> Artifact:
+    found = models.resolve(request.param)
+    assert isinstance(found, Artifact)
+    return found
+
+
+def test_every_shipped_model_verifies(models):
+    assert not models.failures()
+    assert sorted({name for name, _ in models.entries}) == SHIPPED
+    assert models.ready
+
+
+def test_the_default_is_the_indoor_triway(models):
+    assert models.resolve("default").manifest.name == "indoor-triway"
+
+
+def test_only_the_current_version_of_each_is_shipped(models):
+    assert len(models.entries) == len(SHIPPED)
+
+
+def test_an_artifact_is_small(artifact):
+    size = sum(path.stat().st_size for path in artifact.path.iterdir())
+    assert size <= 12_000_000
+
+
+def test_an_artifact_loads_in_under_a_second(artifact):
+    """A bound with a margin of ten on what was measured, not a measurement."""
+    began = time.perf_counter()
+    STORE.load(artifact.manifest.name, artifact.manifest.version)
+    assert time.perf_counter() - began < 1.0
+
+
+def test_the_structure_is_the_seed_paper_s(artifact):
+    spec = artifact.machine.spec
+    assert spec.H1 == 200
+    assert (0 if spec.variant == "rbm" else 100) == spec.H2
+    assert len(CANONICAL) == spec.A
+
+
+def test_the_card_names_the_data_and_its_terms(artifact):
+    for source in artifact.manifest.data:
+        assert source.source in artifact.card
+        assert source.terms in artifact.card
+    commercial = all(not source.research_only for source in artifact.manifest.data)
+    assert commercial == (artifact.manifest.name == "procthor-triway")
+
+
+def test_the_indoor_vocabulary_is_large_enough(artifact):
+    if not artifact.manifest.name.startswith("indoor"):
+        return
+    assert len(artifact.vocabulary) >= 417
+    for words in ("TV", "garbage_bin", "trash cans", "night stand", "refrigerator"):
+        assert artifact.vocabulary.index(words) is not None
+
+
+def test_the_training_configuration_is_stored(artifact):
+    from training.config import Config, shipped_configs
+
+    config = Config.model_validate(artifact.manifest.training["config"])
+    assert config.name in shipped_configs()
