@@ -13,8 +13,8 @@ from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, rbms, scikit_learn
 
-OURS, SKLEARN, RBMS = "ours", "scikit-learn BernoulliRBM", "rbms"
-PRODUCTS = "two bare matrix products"
+OURS, SKLEARN, RBMS = "ours", "scikit-learn", "rbms"
+PRODUCTS = "two bare products"
 
 S = TypeVar("S")
 

@@ -17,8 +17,8 @@ from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, scikit_learn
 
 OURS, UNPREPARED = "ours, exp(W) precomputed", "ours, from the weights alone"
-TWO_COPIES = "scikit-learn, V copies with and without each object"
-ONE_COPY = "scikit-learn, V copies against the scene once"
+TWO_COPIES = "scikit-learn, 2 V copies"
+ONE_COPY = "scikit-learn, V + 1 copies"
 
 
 @torch.no_grad()
@@ -38,6 +38,7 @@ def log_odds(
         return object_log_odds(machine, Evidence(v))
 
     def two_copies() -> Any:
+        """Each class present against absent, which scores all classes alike."""
         present = np.repeat(v.numpy(), V, axis=0)
         absent = present.copy()
         np.fill_diagonal(present, 1)
@@ -45,6 +46,7 @@ def log_odds(
         return rbm._free_energy(absent) - rbm._free_energy(present)
 
     def one_copy() -> Any:
+        """Each class present against the scene as it is, which is enough for the absent ones."""
         present = np.repeat(v.numpy(), V, axis=0)
         np.fill_diagonal(present, 1)
         return rbm._free_energy(v.numpy()) - rbm._free_energy(present)

@@ -69,7 +69,7 @@ class Result:
         table.add_column("a call", justify="right")
         if self.unit:
             table.add_column(self.unit, justify="right")
-        table.add_column("speed ratio (quartiles)", justify="right")
+        table.add_column("ratio (quartiles)", justify="right")
         table.add_column("aim", justify="right")
         for name in self.timings.seconds:
             seconds = self.timings.median(name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 
@@ -15,7 +16,7 @@ from training.batches import Batch
 from training.config import ObjectiveConfig
 from training.objectives import ContrastiveDivergence
 
-OURS, DENSE = "ours, active pairs", "dense RBM"
+OURS, LOCAL, DENSE = "ours, seed form", "ours, local form", "dense RBM"
 
 _RATE = 0.01
 _HOLDS = 0.1
@@ -32,7 +33,7 @@ def training_step(
     objects: int = 12,
     rounds: int = 5,
 ) -> Result:
-    """CD-1 of the Triway machine (seed form) and of a dense RBM over all V + A·V² units."""
+    """CD-1 of the Triway machine on active pairs and of a dense RBM over all V + A·V² units."""
     generator = torch.Generator().manual_seed(0)
     classes = random_scenes(scenes, V, objects, generator)
     pairs = (scenes, A, objects, objects)
@@ -50,6 +51,7 @@ def training_step(
     timings = interleave(
         {
             OURS: _triway_step(spec, batch, objects, generator),
+            LOCAL: _triway_step(replace(spec, form="local"), batch, objects, generator),
             DENSE: _dense_step(batch, A, H1, generator),
         },
         rounds=rounds,

@@ -88,8 +88,6 @@ class Config(_Section):
     def _consistent(self) -> Config:
         if self.machine.variant == "rbm" and self.machine.H2:
             raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
-        if self.machine.variant != "triway" and self.machine.form != "seed":
-            raise ValueError("machine.form = 'local' is defined for the triway variant only")
         if "rooms" in self.data.sources and not self.data.rooms:
             raise ValueError("data.rooms must say how many rooms to generate")
         return self

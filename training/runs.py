@@ -55,13 +55,16 @@ def load_run(folder: Path) -> FinishedRun:
     """Read a finished run.
 
     Raises:
-        RunError: a file is missing.
+        RunError: a file is missing or unreadable.
     """
     for name in ("config.json", "model.safetensors", "result.json"):
         if not (folder / name).is_file():
             raise RunError(f"{folder} holds no finished run: {name} is missing")
-    config = Config.model_validate_json((folder / "config.json").read_text(encoding="utf-8"))
-    outcome = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    try:
+        config = Config.model_validate_json((folder / "config.json").read_text(encoding="utf-8"))
+        outcome = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise RunError(f"{folder} holds a run that this release cannot read: {error}") from error
     with safe_open(folder / "model.safetensors", "pt") as file:
         spec = MachineSpec.from_dict(json.loads(file.metadata()["spec"]))
         state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -41,7 +41,9 @@ class GBM(RBM):
         return result.index_add(-1, edges.object[0], r * self.g[:, 1])
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """sum over R_i of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0)."""
+        """sum over R_i of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0); 0 in the local form."""
+        if self.spec.form == "local":
+            return super().attraction(v, h1, edges, candidates)
         subject, object_ = edges.subject[0], edges.object[0]
         bare = RBM.relation_logits(self, edges, v, h1)
         g, g2 = self.g.unbind(1)

@@ -175,7 +175,7 @@ def sample_v(
     """v | h1, with unobserved relations summed out where `collapsed`, else v | h1, r; (B, V)."""
     # addmm: the bias enters with the product; memory is what a sweep waits for.
     logits = torch.addmm(machine.b, state.h1, machine.W.T)
-    if isinstance(machine, GBM):
+    if isinstance(machine, GBM) and machine.spec.form == "seed":
         logits = logits + machine.relation_input(state.edges, state.r)
     elif isinstance(machine, Triway) and machine.spec.form == "seed":
         if collapsed:

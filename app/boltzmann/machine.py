@@ -6,7 +6,7 @@ with the sum over the variant's relation units e = (a,i,j). A variant says which
 one may be on (its gate) and what its logit ℓ_e is; everything else is here. With a room type t
 given, c1 stands for c1 + Q[t]: the room type is a condition, not a unit of the model.
 
-Two forms of the relation part (Triway only; see `Form`):
+Two forms of the relation part, for every variant:
 
     seed    - r_e ℓ_e - κ_a         for every active unit
     local   - r_e ℓ_e + log(1 + exp ℓ_e)

@@ -64,7 +64,7 @@ def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> Bolt
 def base_log_partition(machine: BoltzmannMachine, base: BoltzmannMachine) -> float:
     """Exact log Z of `base`."""
     log_z = float(softplus(base.b).sum()) + (machine.spec.H1 + machine.spec.H2) * math.log(2)
-    if isinstance(base, RBM):
+    if isinstance(base, RBM) and base.spec.form == "seed":
         log_z += float(softplus(base.d).sum())
     return log_z
 

@@ -23,8 +23,7 @@ class MachineSpec:
         K: rank of the shared tri-way and relation-context weights (Triway).
         T: relation units with a weight of their own: all units of the RBM and GBM, the sparse
             residual of the Triway.
-        form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations,
-        Triway).
+        form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations).
     """
 
     variant: Variant
@@ -42,8 +41,6 @@ class MachineSpec:
             raise ValueError(f"variant must be one of {get_args(Variant)}, not {self.variant!r}")
         if self.form not in get_args(Form):
             raise ValueError(f"form must be one of {get_args(Form)}, not {self.form!r}")
-        if self.variant != "triway" and self.form != "seed":
-            raise ValueError(f"form {self.form!r} is defined for the triway variant only")
         for name in ("V", "A", "H1"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")

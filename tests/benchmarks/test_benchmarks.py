@@ -69,6 +69,7 @@ def test_log_odds_agree_with_those_of_the_yardstick():
     assert result.facts["largest difference from scikit-learn"] < 1e-4
 
 
+@pytest.mark.system
 def test_service(tmp_path):
     started, asked = service(store=make_store(tmp_path), objects=3, requests=5, rounds=1)
     check_complete(started, 1)
@@ -77,11 +78,13 @@ def test_service(tmp_path):
     assert asked.facts["model"] == "home 1.0.0 (triway)"
 
 
+@pytest.mark.system
 def test_service_without_a_store_is_refused(tmp_path):
     with pytest.raises(NoModelError, match="does not exist"):
         service(store=tmp_path / "none")
 
 
+@pytest.mark.system
 def test_service_without_a_default_model_is_refused(tmp_path):
     publish(tmp_path, "one", "1.0.0")
     publish(tmp_path, "two", "1.0.0")

@@ -16,6 +16,8 @@ SMALL: dict[str, MachineSpec] = {
     "rbm-three-classes": MachineSpec("rbm", V=3, A=2, H1=3, T=4, C=2),
     "gbm": MachineSpec("gbm", V=2, A=2, H1=2, H2=2, T=4),
     "gbm-one-layer": MachineSpec("gbm", V=3, A=2, H1=2, T=4, C=2),
+    "rbm-local": MachineSpec("rbm", V=2, A=2, H1=2, T=4, C=3, form="local"),
+    "gbm-local": MachineSpec("gbm", V=2, A=2, H1=2, H2=2, T=4, form="local"),
     "triway-seed": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, form="seed"),
     "triway-seed-two-layers": MachineSpec("triway", V=2, A=2, H1=2, H2=2, K=2, form="seed"),
     "triway-local": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, C=3, form="local"),
@@ -36,7 +38,7 @@ def small_machine(name: str, seed: int = 0, scale: float = 0.8) -> BoltzmannMach
         for parameter in machine.parameters():
             noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
             parameter.copy_(noise * scale)
-        if spec.form == "local":
+        if spec.variant == "triway" and spec.form == "local":
             machine.kappa.zero_()
     return machine.requires_grad_(False)
 

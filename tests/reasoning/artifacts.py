@@ -58,9 +58,9 @@ def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
     )
 
 
-def exact_artifact(name: str, **changes: object) -> Artifact:
-    """Float64, every weight drawn from N(0, .6²)."""
-    return artifact_of(_random(EXACT[name], torch.float64, 0.6), **changes)
+def exact_artifact(name: str, scale: float = 1.3, **changes: object) -> Artifact:
+    """Float64, every weight drawn from N(0, scale²)."""
+    return artifact_of(_random(EXACT[name], torch.float64, scale), **changes)
 
 
 def larger_artifact(name: str, **changes: object) -> Artifact:

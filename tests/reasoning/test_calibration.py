@@ -1,0 +1,89 @@
+"""The calibration's formulas, number by number, and that the answers go through them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from app.reasoning import missing, outliers, relations
+from app.reasoning.calibration import exclusive, relation_probability
+from app.registry.description import Calibration, CountSlope, Slope
+from tests.reasoning.artifacts import larger_artifact, scene_of
+
+
+def sigmoid(x: float) -> float:
+    return 1 / (1 + math.exp(-x))
+
+
+def test_relations_have_a_calibration_each():
+    entries = tuple(CountSlope(intercept=a, slope=1 + a, log_count=-a) for a in range(4))
+    calibration = Calibration(relation=entries)
+    log_odds = torch.arange(16.0).view(4, 2, 2) / 8 - 1
+    log_count = torch.tensor([[0.0, 0.5], [1.0, 2.0]])
+    p = relation_probability(calibration, log_odds, log_count)
+    for a in range(4):
+        for x in range(2):
+            for y in range(2):
+                z = a + (1 + a) * float(log_odds[a, x, y]) - a * float(log_count[x, y])
+                assert float(p[a, x, y]) == pytest.approx(sigmoid(z), abs=1e-6)
+
+
+def test_exclusive_scales_only_where_it_must():
+    forward, backward = exclusive(torch.tensor([0.9, 0.2, 1.0]), torch.tensor([0.6, 0.3, 1.0]))
+    assert forward.tolist() == pytest.approx([0.6, 0.2, 0.5])
+    assert backward.tolist() == pytest.approx([0.4, 0.3, 0.5])
+
+
+def test_instances_count_in_relations():
+    """Three chairs and two lamps: log 6 a pair of classes, log 9 among the chairs."""
+    entry = CountSlope(intercept=-2.0, slope=0.0, log_count=-0.5)
+    artifact = larger_artifact("triway-local", relation=(entry,) * 4)
+    answers = relations(artifact, scene_of([3, 3, 3, 1, 1]), top_k=100)
+    p = {(a.subject, a.object): a.probability for a in answers}
+    assert p[0, 3] == pytest.approx(sigmoid(-2 - 0.5 * math.log(6)), abs=1e-6)
+    assert p[0, 1] == pytest.approx(sigmoid(-2 - 0.5 * math.log(9)), abs=1e-6)
+
+
+def test_placements_use_the_calibration_of_relations():
+    entry = CountSlope(intercept=-1.0, slope=0.0, log_count=0.25)
+    artifact = larger_artifact("triway-local", relation=(entry,) * 4)
+    for answer in missing(artifact, scene_of([3, 3])):
+        for place in answer.placements:
+            assert place.probability == pytest.approx(sigmoid(-1 + 0.25 * math.log(2)), abs=1e-6)
+
+
+def test_intruders_by_log_odds_and_size():
+    entry = CountSlope(intercept=0.5, slope=-0.7, log_count=0.3)
+    artifact = larger_artifact("triway-local", outlier=entry)
+    found, _ = outliers(artifact, scene_of([0, 1, 1, 2]))
+    for answer in found:
+        z = 0.5 - 0.7 * answer.log_odds + 0.3 * math.log(3)
+        assert answer.probability == pytest.approx(sigmoid(z), abs=1e-5)
+    assert [a.probability for a in found] == sorted((a.probability for a in found), reverse=True)
+
+
+def test_false_relations():
+    scene = scene_of([0, 1, 2], [(2, 1, 0), (0, 1, 2)])
+    _, plain = outliers(larger_artifact("triway-local"), scene)
+    changed = larger_artifact("triway-local", misplaced=Slope(intercept=0.4, slope=-0.5))
+    _, scaled = outliers(changed, scene)
+    for one, other in zip(plain, scaled, strict=True):
+        assert (one.subject, one.relation, one.object) == (
+            other.subject,
+            other.relation,
+            other.object,
+        )
+        z = math.log(one.probability / (1 - one.probability))
+        assert other.probability == pytest.approx(sigmoid(0.4 + 0.5 * z), abs=1e-4)
+
+
+def test_missing_temperature_flattens():
+    scene = scene_of([0, 1])
+    plain = missing(larger_artifact("triway-local"), scene, top_k=9)
+    flat = missing(larger_artifact("triway-local", missing_temperature=3.0), scene, top_k=9)
+    assert [a.label for a in plain] == [a.label for a in flat]
+    weights = [math.exp(a.log_odds / 3) for a in flat]
+    for answer, weight in zip(flat, weights, strict=True):
+        assert answer.probability == pytest.approx(weight / sum(weights), abs=1e-5)
