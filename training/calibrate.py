@@ -29,7 +29,7 @@ from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject
 from training.batches import SceneTensors
 from training.datasets import EncodedScene
-from training.evaluation.missing import ObjectScore, leave_one_out, machine_score
+from training.evaluation.missing import ObjectScore, machine_score, removed_objects
 from training.evaluation.outliers import IntruderScores, intruder_scores
 from training.evaluation.relations import machine_score as relation_score
 from training.trainer import subset
@@ -79,10 +79,13 @@ def calibrate(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> Calibr
 def fit_missing(scenes: SceneTensors, structure: torch.Tensor, score: ObjectScore) -> float:
     """The temperature of least negative log-likelihood of the removed class."""
 
+    found_rows = list(removed_objects(scenes, structure, score))
+    target = torch.cat([block[1] for block in found_rows]).unsqueeze(1)
+    values = torch.cat([block[2] for block in found_rows])
+
     def nll(log_temperature: float) -> float:
-        temperature = float(np.exp(log_temperature))
-        result = leave_one_out(scenes, structure, lambda v: score(v) / temperature)
-        return -float(result.log_probability.mean())
+        log_p = (values / float(np.exp(log_temperature))).log_softmax(1)
+        return -float(log_p.gather(1, target).mean())
 
     found = minimize_scalar(nll, bounds=(-1.0, 1.5), method="bounded", options={"xatol": 0.02})
     return float(np.exp(found.x))

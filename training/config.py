@@ -52,6 +52,7 @@ class ObjectiveConfig(_Section):
     chains: int = Field(default=128, ge=1, description="persistent chains (PCD)")
     presence_weight: float = Field(default=0.1, ge=0, description="presence against absence")
     relation_weight: float = Field(default=0.05, ge=0)
+    generative_weight: float = Field(default=0.0, ge=0, description="of PCD within composite")
     room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of withheld room types")
     structure_dropout: float = Field(default=0.5, ge=0, le=1)
     object_dropout: float = Field(default=0.0, ge=0, lt=1)
@@ -90,6 +91,8 @@ class Config(_Section):
             raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
         if "rooms" in self.data.sources and not self.data.rooms:
             raise ValueError("data.rooms must say how many rooms to generate")
+        if self.objective.generative_weight and self.machine.form != "local":
+            raise ValueError("objective.generative_weight is defined for the local form only")
         return self
 
     @property

@@ -68,7 +68,7 @@ class MeanField:
 
 
 def mean_field(
-    machine: BoltzmannMachine, evidence: Evidence, *, iterations: int = SWEEPS, damping: float = 0.5
+    machine: BoltzmannMachine, evidence: Evidence, *, iterations: int = SWEEPS, damping: float = 0.8
 ) -> MeanField:
     """One fixed point of h1 and h2 given the evidence; differentiable in the weights.
 

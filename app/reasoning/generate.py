@@ -71,7 +71,7 @@ def generate(
     clamp = clamped(observation, held_units(machine, context or {}))
     stairs = cooling(machine, steps, temperature)
     shown = observation.present | ~torch.tensor(artifact.vocabulary.structure)
-    of = [thing.class_index or 0 for thing in scene.objects]
+    of = observation.classes[observation.row].tolist()
     given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
     drawn: list[GeneratedScene] = []
     block = 0

@@ -8,7 +8,7 @@ fewer than two other classes are skipped. A mention outside the vocabulary would
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,34 +90,47 @@ def machine_score(machine: BoltzmannMachine) -> ObjectScore:
 
 
 @torch.no_grad()
-def leave_one_out(
+def removed_objects(
     scenes: SceneTensors, structure: Tensor, score: ObjectScore, *, block: int = 256
-) -> LeaveOneOut:
-    """Remove every non-structure class of every scene in turn and rank it.
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Remove every non-structure class of every scene in turn, block by block.
 
     Args:
         structure: (V,) bool.
         score: log-odds of all classes, higher = likelier missing.
+
+    Yields:
+        Positions of the scenes (n,), the removed classes (n,), and the scores (n, V), -inf but for
+        candidates.
     """
     removable = (scenes.v > 0) & ~structure
     enough = removable.sum(1) >= 2
     row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
-    above, ties, log_p = [], [], []
     for start in range(0, len(row), block):
         r, t = row[start : start + block], target[start : start + block]
         v = scenes.v[r].scatter(1, t.unsqueeze(1), 0.0)
-        values = score(v).masked_fill((v > 0) | structure, -torch.inf)
-        chosen = values.gather(1, t.unsqueeze(1))
+        yield r, t, score(v).masked_fill((v > 0) | structure, -torch.inf)
+
+
+def leave_one_out(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> LeaveOneOut:
+    """Rank every removed object; see `removed_objects`."""
+    empty = torch.zeros(0, dtype=torch.int64)
+    rows, targets, above, ties = [empty], [empty], [empty], [empty]
+    log_p = [torch.zeros(0, dtype=torch.float64)]
+    for row, target, values in removed_objects(scenes, structure, score):
+        chosen = values.gather(1, target.unsqueeze(1))
+        rows.append(row)
+        targets.append(target)
         above.append((values > chosen).sum(1))
         ties.append((values == chosen).sum(1) - 1)
         log_p.append((chosen.squeeze(1) - values.logsumexp(1)).double())
-    empty = torch.zeros(0)
+    enough = ((scenes.v > 0) & ~structure).sum(1) >= 2
     return LeaveOneOut(
-        scene=row.numpy(),
-        target=target.numpy(),
-        above=torch.cat(above or [empty.long()]).numpy(),
-        ties=torch.cat(ties or [empty.long()]).numpy(),
-        log_probability=torch.cat(log_p or [empty.double()]).numpy(),
+        scene=torch.cat(rows).numpy(),
+        target=torch.cat(targets).numpy(),
+        above=torch.cat(above).numpy(),
+        ties=torch.cat(ties).numpy(),
+        log_probability=torch.cat(log_p).numpy(),
         scenes=len(scenes),
         skipped=int((~enough).sum()),
     )

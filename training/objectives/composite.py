@@ -33,8 +33,10 @@ from app.boltzmann import BoltzmannMachine, Triway
 from app.boltzmann.log_odds import object_log_odds
 from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, relation_units
+from training.config import ObjectiveConfig
 from training.objectives.base import Objective, withhold_rooms
 from training.objectives.contrastive import relation_nll
+from training.objectives.generative import ObjectChains
 
 
 @dataclass(frozen=True)
@@ -74,9 +76,25 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
 
 
 class CompositeLikelihood(Objective):
-    """Ranking + presence_weight · presence + relation_weight · relations."""
+    """Ranking + presence_weight · presence + relation_weight · relations.
+
+    With a generative_weight (local form), also that share of the persistent-chain gradient
+    (`ObjectChains`): conditionals alone leave a joint whose own samples drift from the data.
+    """
 
     structure: Tensor | None = None
+
+    def __init__(self, config: ObjectiveConfig, machine: BoltzmannMachine) -> None:
+        super().__init__(config, machine)
+        self.chains = ObjectChains(config.chains, config.k)
+
+    def state(self) -> dict[str, Tensor]:
+        """The persistent chains."""
+        return self.chains.blocks
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Put the chains back where they were."""
+        self.chains.blocks = dict(state)
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
         """Mean over scenes of the weighted parts."""
@@ -85,6 +103,10 @@ class CompositeLikelihood(Objective):
             total = total + self.config.relation_weight * self.relation_part(
                 machine, batch, generator
             )
+        if self.config.generative_weight:
+            room = withhold_rooms(batch, self.config.room_dropout, generator)
+            chains = self.chains.loss(machine, batch.v, room, generator)
+            total = total + self.config.generative_weight * chains
         structure = self.structure
         if structure is None:
             structure = torch.zeros(machine.spec.V, dtype=torch.bool)

@@ -1,0 +1,96 @@
+"""The command line end to end on generated rooms: train, publish, evaluate, list."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from app.reasoning import generate, missing, outliers, relations
+from app.registry import Store
+from app.scene import Scene, SceneObject
+from training.cli import app
+
+CONFIG = """
+name = "rooms-{variant}"
+[data]
+sources = ["rooms"]
+vocabulary = "rooms"
+rooms = 160
+[machine]
+variant = "{variant}"
+form = "local"
+H1 = 12
+H2 = {H2}
+K = {K}
+[objective]
+name = "composite"
+generative_weight = 0.05
+chains = 16
+[training]
+epochs = 3
+learning_rate = 0.03
+"""
+SHAPES = {"rbm": (0, 0), "gbm": (6, 0), "triway": (6, 4)}
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("variant", SHAPES)
+def test_from_rooms_to_answers(tmp_path, variant):
+    H2, K = SHAPES[variant]
+    config = tmp_path / "config.toml"
+    config.write_text(CONFIG.format(variant=variant, H2=H2, K=K))
+    folders = ("--runs", str(tmp_path / "runs"), "--store", str(tmp_path / "store"))
+    run("train", str(config), *folders, "--publish", "1.0.0", "--alias", "default")
+    run("publish", str(tmp_path / f"runs/rooms-{variant}/seed-0"), "1.0.1", *folders[2:])
+    assert "1.0.1" in run("list", *folders[2:])
+    figures = tmp_path / "figures.json"
+    run("evaluate", "default", *folders[2:], "--baseline", "--json", str(figures))
+    tables = json.loads(figures.read_text())
+    tasks = {row["task"] for row in tables["default"]}
+    assert tasks == {"T1a relations", "T2 missing", "T3 outliers, uniform"}
+    assert {row["metric"] for row in tables["BernoulliRBM"]} >= {"MRR", "top-10"}
+    artifact = Store(tmp_path / "store").load(f"rooms-{variant}", "1.0.1")
+    calibration = artifact.calibration
+    assert calibration.outlier.slope < 0  # the likelier an object, the less an intruder
+    assert 0 < calibration.outlier_threshold < 1
+    things = ("bed", "nightstand", "lamp")
+    scene = Scene(
+        tuple(SceneObject(name, name, artifact.vocabulary.index(name)) for name in things)
+    )
+    assert missing(artifact, scene)
+    assert relations(artifact, scene)
+    assert len(outliers(artifact, scene)[0]) == 3
+    assert len(generate(artifact, scene, seed=0, steps=5)) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("train", "nowhere.toml"), "no configuration"),
+        (("train", "indoor-triway", "--data", "nowhere"), "name its folder with --data"),
+        (("publish", "nowhere", "1.0.0"), "no finished run"),
+        (("evaluate", "nowhere", "--store", "nowhere"), "error"),
+    ],
+)
+def test_errors_are_one_clear_line(arguments, message):
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exit_code == 1
+    assert message in " ".join(result.output.split())
+
+
+def test_a_bad_configuration_names_its_entry(tmp_path):
+    config = tmp_path / "config.toml"
+    text = CONFIG.format(variant="triway", H2=0, K=4)
+    config.write_text(text.replace("epochs = 3", "epochs = 0"))
+        CONFIG.format(variant="triway", H2=0, K=4).replace("epochs = 3", "epochs = 0")
+    )
+    result = CliRunner().invoke(app, ["train", str(config)])
+    assert result.exit_code == 1
+    assert "training.epochs" in result.output
