@@ -1,18 +1,25 @@
-"""The README's questions, asked of the shipped models: `python scripts/answers.py` fills them in.
+"""The README's questions, asked of the shipped models: `python -m scripts.answers` fills them in.
 
 Every `sh` block that calls curl is followed by a `json` block with the answer as the service gives
-it; `request_id`, which differs from call to call, is left out. tests/shipped holds the README to it.
+it; `request_id`, which differs from call to call, is left out. tests/shipped holds the README to
+it.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import httpx
+from fastapi import FastAPI
+
+from app.main import create_app
 
 README = Path(__file__).resolve().parent.parent / "README.md"
 _PAIR = re.compile(r"```sh\n(curl .*?)```\n\n```json\n(.*?)```", re.DOTALL)
@@ -36,13 +43,21 @@ def examples(text: str) -> Iterator[Example]:
         yield Example("/" + url.split("/", 3)[3], body, match[2])
 
 
-def ask(client: Any, example: Example) -> dict[str, Any]:
-    """The service's answer without its request id."""
-    response = client.post(example.path, json=example.body)
-    response.raise_for_status()
-    answer: dict[str, Any] = response.json()
-    del answer["request_id"]
-    return answer
+async def ask_all(app: FastAPI, asked: Sequence[Example]) -> list[dict[str, Any]]:
+    """The service's answers, in process, without their request ids."""
+    transport = httpx.ASGITransport(app)
+    answers = []
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(transport=transport, base_url="http://robot") as client,
+    ):
+        for example in asked:
+            response = await client.post(example.path, json=example.body)
+            response.raise_for_status()
+            answer: dict[str, Any] = response.json()
+            del answer["request_id"]
+            answers.append(answer)
+    return answers
 
 
 def pretty(answer: dict[str, Any]) -> str:
@@ -59,16 +74,11 @@ def pretty(answer: dict[str, Any]) -> str:
 
 def main() -> None:
     """Rewrite the answers of the README in place."""
-    from fastapi.testclient import TestClient
-
-    from app.main import create_app
-
     text = README.read_text(encoding="utf-8")
-    with TestClient(create_app()) as client:
-        answers = iter([pretty(ask(client, example)) for example in examples(text)])
+    answers = iter(asyncio.run(ask_all(create_app(), list(examples(text)))))
 
     def fill(match: re.Match[str]) -> str:
-        return f"```sh\n{match[1]}```\n\n```json\n{next(answers)}```"
+        return f"```sh\n{match[1]}```\n\n```json\n{pretty(next(answers))}```"
 
     README.write_text(_PAIR.sub(fill, text), encoding="utf-8")
 

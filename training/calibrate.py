@@ -15,7 +15,6 @@ Weinberger, "On calibration of modern neural networks" (2017).
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,7 +23,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from sklearn.linear_model import LogisticRegression
 
-from app.reasoning import missing, outliers
+from app.reasoning import outliers
+from app.reasoning.evidence import draw_context, observe
+from app.reasoning.objects import presence_log_odds
+from app.reasoning.placements import log_p_at
 from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject
 from training.batches import SceneTensors
@@ -148,50 +150,47 @@ def _fit_relation(examples: NDArray[np.float64]) -> CountSlope:
     return CountSlope(intercept=intercept, slope=slope, log_count=count)
 
 
+@torch.no_grad()
 def fit_placed(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[float, float]:
     """Temperature and relation weight for the missing object with a known place."""
     rng = np.random.default_rng(seed)
-    alone, both, targets = [], [], []
-    label = {name: k for k, name in enumerate(artifact.vocabulary.labels)}
+    structure = artifact.vocabulary.structure
+    cases: list[tuple[torch.Tensor, torch.Tensor, int]] = []
     for encoded in scenes:
-        case = placed_case(encoded, artifact.vocabulary.structure, rng)
+        case = placed_case(encoded, structure, rng)
         if case is None:
             continue
-        scene, at, target = case
-        columns = []
-        for weight in (0.0, 1.0):
-            answers = missing(_with(artifact, placed_relation_weight=weight), scene,
-                              top_k=len(label), at=at)  # fmt: skip
-            column = np.full(len(label), -np.inf)
-            for answer in answers:
-                column[label[answer.label]] = np.log(max(answer.probability, 1e-300))
-            columns.append(column)
-        alone.append(columns[0])
-        both.append(columns[1])
-        targets.append(target)
-    if len(targets) < 10:
+        scene, relation, anchor, target = case
+        seen = observe(artifact.machine, scene)
+        absent = (~seen.present & ~torch.from_numpy(structure.copy())).nonzero().squeeze(1)
+        draws = draw_context(artifact.machine, seen.evidence)
+        odds = presence_log_odds(artifact.machine, seen.evidence, absent.unsqueeze(0), draws)[0]
+        log_p = log_p_at(seen, draws, absent, relation, int(seen.row[anchor]), outgoing=True)
+        cases.append((odds.double(), log_p.double(), int((absent == target).nonzero())))
+    if len(cases) < 10:
         return 1.0, 1.0
-    base, joint, truth = np.stack(alone), np.stack(both), np.array(targets)
-    # Differences of the two softmaxes are the relation's log-probability, up to a constant a row.
-    finite = np.isfinite(base)
-    gain = np.where(finite, joint, 0.0) - np.where(finite, base, 0.0)
 
     def nll(x: NDArray[np.float64]) -> float:
-        logits = np.where(finite, np.where(finite, base, 0.0) / np.exp(x[0]) + x[1] * gain, -np.inf)
-        top = logits.max(1, keepdims=True)
-        total = np.log(np.exp(logits - top).sum(1)) + top[:, 0]
-        return float((total - logits[np.arange(len(truth)), truth]).mean())
+        losses = [
+            -(odds / float(np.exp(x[0])) + float(x[1]) * log_p).log_softmax(0)[target]
+            for odds, log_p, target in cases
+        ]
+        return float(torch.stack(losses).mean())
 
-    found = minimize(nll, np.array([0.0, 1.0]), method="Nelder-Mead")
+    found = minimize(nll, np.array([0.0, 1.0]), method="Nelder-Mead", options={"maxiter": 80})
     return float(np.exp(found.x[0])), float(found.x[1])
 
 
 def placed_case(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[Scene, tuple[str, int], int] | None:
-    """A scene with one class taken out, and one relation of it to something that stayed."""
+) -> tuple[Scene, int, int, int] | None:
+    """A scene with one class taken out that stood in a relation to something that stayed.
+
+    Returns:
+        The scene, the canonical relation, the position of its object, and the class taken out.
+    """
     evidence = encoded.evidence
     usable = ~structure[evidence.classes]
     pairs = evidence.holds & usable[:, None] & usable[None, :]
@@ -205,7 +204,7 @@ def placed_case(
     anchor = next(
         p for p, k in enumerate(kept) if encoded.instance_classes[k] == evidence.classes[y]
     )
-    return scene, (CANONICAL[a], anchor), int(evidence.classes[x])
+    return scene, int(a), anchor, int(evidence.classes[x])
 
 
 def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Slope:
@@ -270,11 +269,6 @@ def scene_of(
     )
     room = encoded.room_type
     return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
-
-
-def _with(artifact: Artifact, **changes: float) -> Artifact:
-    calibration = artifact.calibration.model_copy(update=changes)
-    return dataclasses.replace(artifact, calibration=calibration)
 
 
 def _logistic(features: NDArray[np.float64], truth: NDArray[np.bool_]) -> list[float]:

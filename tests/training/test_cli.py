@@ -89,8 +89,6 @@ def test_a_bad_configuration_names_its_entry(tmp_path):
     config = tmp_path / "config.toml"
     text = CONFIG.format(variant="triway", H2=0, K=4)
     config.write_text(text.replace("epochs = 3", "epochs = 0"))
-        CONFIG.format(variant="triway", H2=0, K=4).replace("epochs = 3", "epochs = 0")
-    )
     result = CliRunner().invoke(app, ["train", str(config)])
     assert result.exit_code == 1
     assert "training.epochs" in result.output
