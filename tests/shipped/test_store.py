@@ -27,7 +27,7 @@ def artifact(request, models) -> Artifact:
 
 
 def test_every_shipped_model_verifies(models):
-    assert not models.failures()
+    assert not models.failures
     assert sorted({name for name, _ in models.entries}) == SHIPPED
     assert models.ready
 
