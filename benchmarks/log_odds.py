@@ -21,7 +21,7 @@ TWO_COPIES = "scikit-learn, 2 V copies"
 ONE_COPY = "scikit-learn, V + 1 copies"
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def log_odds(
     *, V: int = 417, H: int = 200, objects: int = 12, K: int = 32, rounds: int = 31
 ) -> Result:

@@ -79,10 +79,10 @@ def mean_field(
     base = machine.context_bias(evidence.room) + evidence.v @ machine.W
     relations = evidence.relations(machine)
     two_layers = machine.spec.H2 > 0
+    if relations is None and not two_layers:
+        return MeanField(base, base, base.new_zeros(len(base), 0))
     h2 = machine.c2.sigmoid().expand(len(base), -1)
     x = base + h2 @ machine.J.T if two_layers else base
-    if relations is None and not two_layers:
-        return MeanField(x, x, h2)
     y, slopes = x, None
     for _ in range(iterations):
         if relations is not None:

@@ -50,6 +50,10 @@ class ContextScorer:
         limit = min(_LARGEST_GROUP, max(1, int(_LOG_RANGE / max(largest, 1.0))))
         groups = -(-self.H1 // limit)
         self._group = -(-self.H1 // groups)
+        # A divisor of H1 needs no padding, which costs more than some further logs.
+        divisor = max(size for size in range(1, limit + 1) if self.H1 % size == 0)
+        if 2 * divisor >= self._group:
+            self._group, groups = divisor, self.H1 // divisor
         # Units that fill up the last group have W = 0, so their factor is 1.
         self._padding = groups * self._group - self.H1
         self._exp = torch.ones(self.H1 + self._padding, self.V)
@@ -73,7 +77,7 @@ class ContextScorer:
         return gains
 
     def _multiply(self, row: Tensor, gain: Tensor) -> None:
-        row = pad(row, (0, self._padding)).unsqueeze(1)
+        row = (pad(row, (0, self._padding)) if self._padding else row).unsqueeze(1)
         factors = torch.mul(self._exp, row.sigmoid()).add_((-row).sigmoid())
         products = factors.view(self._group, -1).prod(0).log_()
         torch.sum(products.view(-1, self.V), 0, out=gain)
