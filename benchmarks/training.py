@@ -16,7 +16,7 @@ from training.batches import Batch
 from training.config import ObjectiveConfig
 from training.objectives import ContrastiveDivergence
 
-OURS, LOCAL, DENSE = "ours, seed form", "ours, local form", "dense RBM"
+OURS, LOCAL, DENSE = "ours, seed form", "ours, local form", "dense Triway"
 
 _RATE = 0.01
 _HOLDS = 0.1
@@ -33,7 +33,7 @@ def training_step(
     objects: int = 12,
     rounds: int = 5,
 ) -> Result:
-    """CD-1 of the Triway machine on active pairs and of a dense RBM over all V + A·V² units."""
+    """CD-1 of the Triway machine, on active pairs and over all V + A·V² units."""
     generator = torch.Generator().manual_seed(0)
     classes = random_scenes(scenes, V, objects, generator)
     pairs = (scenes, A, objects, objects)
@@ -81,7 +81,7 @@ def _triway_step(
     config = ObjectiveConfig(name="contrastive_divergence", k=1)
     objective = ContrastiveDivergence(config, machine)
     trained = [parameter for parameter in machine.parameters() if parameter.requires_grad]
-    optimiser = torch.optim.SGD(trained, lr=_RATE)
+    optimiser = torch.optim.SGD(trained, lr=_RATE, fused=True)
 
     def step() -> None:
         optimiser.zero_grad(set_to_none=True)
@@ -93,24 +93,35 @@ def _triway_step(
 
 
 def _dense_step(batch: Batch, A: int, H: int, generator: torch.Generator) -> Callable[[], None]:
-    """Plain torch over (v, r) as one visible layer; gradients are added to W as they are formed."""
+    """The same step with every unit and weight in memory, one hidden layer, plain torch.
+
+    Objects and all A·V² relations are one visible layer x; gates and held objects are products and
+    maxima over it. Gradients are added to the weights as they are formed, by hand.
+    """
     scenes, V = batch.v.shape
     x = torch.zeros(scenes, V + A * V * V)
     x[:, :V] = batch.v
+    grid = x[:, V:].view(scenes, A, V, V)
     for row, classes in enumerate(batch.classes):
-        grid = x[row, V:].view(A, V, V)
-        grid[:, classes[:, None], classes[None, :]] = batch.holds[row]
-    W = torch.randn(x.shape[1], H, generator=generator).mul_(0.001)
-    b, c = torch.full((x.shape[1],), -4.0), torch.zeros(H)
+        grid[row, :, classes[:, None], classes[None, :]] = batch.holds[row]
+    weights = torch.randn(x.shape[1], H, generator=generator).mul_(0.001)
+    bias, c = torch.full((x.shape[1],), -4.0), torch.zeros(H)
 
     @torch.no_grad()
     def step() -> None:
-        data = torch.addmm(c, x, W).sigmoid_()
+        data = torch.addmm(c, x, weights).sigmoid_()
         h = torch.bernoulli(data, generator=generator)
-        y = torch.bernoulli(torch.addmm(b, h, W.T).sigmoid_(), generator=generator)
-        model = torch.addmm(c, y, W).sigmoid_()
-        W.addmm_(x.T, data, alpha=_RATE / scenes).addmm_(y.T, model, alpha=-_RATE / scenes)
-        b.add_((x - y).mean(0), alpha=_RATE)
+        p = torch.addmm(bias, h, weights.T).sigmoid_()
+        related = grid.amax(1)
+        held = torch.maximum(related.amax(1), related.amax(2))
+        v = torch.bernoulli(p[:, :V], generator=generator).maximum(held)
+        pairs = v[:, :, None] * v[:, None, :]
+        p[:, V:].view(grid.shape).mul_(pairs.unsqueeze(1))
+        y = torch.bernoulli(p, generator=generator)
+        y[:, :V] = v
+        model = torch.addmm(c, y, weights).sigmoid_()
+        weights.addmm_(x.T, data, alpha=_RATE / scenes).addmm_(y.T, model, alpha=-_RATE / scenes)
+        bias.add_((x - y).mean(0), alpha=_RATE)
         c.add_((data - model).mean(0), alpha=_RATE)
 
     return step

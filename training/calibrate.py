@@ -25,7 +25,7 @@ from sklearn.linear_model import LogisticRegression
 
 from app.reasoning import outliers
 from app.reasoning.evidence import draw_context, observe
-from app.reasoning.objects import presence_log_odds
+from app.reasoning.objects import absent_log_odds
 from app.reasoning.placements import log_p_at
 from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject
@@ -166,7 +166,7 @@ def fit_placed(
         seen = observe(artifact.machine, scene)
         absent = (~seen.present & ~torch.from_numpy(structure.copy())).nonzero().squeeze(1)
         draws = draw_context(artifact.machine, seen.evidence)
-        odds = presence_log_odds(artifact.machine, seen.evidence, absent.unsqueeze(0), draws)[0]
+        odds = absent_log_odds(artifact, seen.evidence, absent, draws)
         log_p = log_p_at(seen, draws, absent, relation, int(seen.row[anchor]), outgoing=True)
         cases.append((odds.double(), log_p.double(), int((absent == target).nonzero())))
     if len(cases) < 10:

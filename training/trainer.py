@@ -162,8 +162,8 @@ class Trainer:
             {"params": relations, "weight_decay": t.relation_decay, "lr": rate},
         ]
         if t.optimiser == "sgd":
-            return torch.optim.SGD(groups, lr=t.learning_rate)
-        return torch.optim.AdamW(groups, lr=t.learning_rate)
+            return torch.optim.SGD(groups, lr=t.learning_rate, fused=True)
+        return torch.optim.AdamW(groups, lr=t.learning_rate, fused=True)
 
     def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
         """One cycle: a linear rise over a tenth of the updates, then a cosine down to zero."""

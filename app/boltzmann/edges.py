@@ -7,19 +7,19 @@ A row of `Edges` belongs to a scene; a unit outside the row is off.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 
-@dataclass(frozen=True)
-class Edges:
+class Edges(ABC):
     """Relation units, one row a scene (a single row is shared by all scenes).
 
-    Attributes:
-        relation, subject, object: (B or 1, E) int64, the a, i, j of each unit.
-        valid: (B or 1, E) bool; padding is False and such a unit is off.
+    `relation`, `subject` and `object` are (B or 1, E) int64, the a, i, j of each unit; `valid` is
+    (B or 1, E) bool: padding is False and such a unit is off.
     """
 
     relation: Tensor
@@ -28,16 +28,32 @@ class Edges:
     valid: Tensor
 
     @property
+    @abstractmethod
     def shape(self) -> torch.Size:
         """(B or 1, E)."""
+
+    @abstractmethod
+    def ends_present(self, v: Tensor) -> Tensor:
+        """(..., B, E) float: 1 where both ends of a unit are present in v (..., B, V)."""
+
+
+@dataclass(frozen=True)
+class TripleEdges(Edges):
+    """A table of units, the same for every scene; attributes as in `Edges`, (1, E)."""
+
+    relation: Tensor
+    subject: Tensor
+    object: Tensor
+    valid: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """(1, E)."""
         return self.valid.shape
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """(..., B, E) float: 1 where both ends of a unit are present in v (..., B, V)."""
-        shape = (*v.shape[:-1], self.valid.shape[-1])
-        subject = v.gather(-1, self.subject.expand(shape))
-        object_ = v.gather(-1, self.object.expand(shape))
-        present: Tensor = subject * object_ * self.valid
+        """(..., B, E) float: 1 where both ends of a unit are present."""
+        present: Tensor = v[..., self.subject[0]] * v[..., self.object[0]] * self.valid
         return present
 
 
@@ -45,25 +61,68 @@ class Edges:
 class PairEdges(Edges):
     """All A·n·m units between n subject classes and m object classes of each scene.
 
-    Units are laid out as (A, n, m), flattened, so that shared weights act by small matrix products.
+    Units are laid out as (A, n, m), flattened, so that shared weights act by small matrix products;
+    the index of each single unit is formed only when somebody asks.
 
     Attributes:
+        relations: A.
         subjects, objects: (B, n) and (B, m) int64, class indices (0 where padded).
-        valid_subjects: (B, n) bool, False where padded.
+        valid_subjects, valid_objects: (B, n) and (B, m) bool, False where padded.
         log_subjects, log_objects: (B, n) and (B, m), log of the number of instances of each class.
     """
 
+    relations: int
     subjects: Tensor
     objects: Tensor
     valid_subjects: Tensor
+    valid_objects: Tensor
     log_subjects: Tensor
     log_objects: Tensor
-    relations: int
+
+    @property
+    def shape(self) -> torch.Size:
+        """(B, A·n·m)."""
+        (B, n), m = self.subjects.shape, self.objects.shape[1]
+        return torch.Size((B, self.relations * n * m))
+
+    @cached_property
+    def relation(self) -> Tensor:  # type: ignore[override]
+        """(B, E) int64, a of each unit."""
+        axis = torch.arange(self.relations, device=self.subjects.device)
+        return self._flat(axis[:, None, None])
+
+    @cached_property
+    def subject(self) -> Tensor:  # type: ignore[override]
+        """(B, E) int64, i of each unit."""
+        return self._flat(self.subjects[:, None, :, None])
+
+    @cached_property
+    def object(self) -> Tensor:  # type: ignore[override]
+        """(B, E) int64, j of each unit."""
+        return self._flat(self.objects[:, None, None, :])
+
+    @cached_property
+    def valid(self) -> Tensor:  # type: ignore[override]
+        """(B, E) bool."""
+        pairs = self.valid_subjects.unsqueeze(-1) & self.valid_objects.unsqueeze(-2)
+        return self._flat(pairs.unsqueeze(1))
+
+    def ends_present(self, v: Tensor) -> Tensor:
+        """(..., B, E) float: 1 where both ends of a unit are present in v (..., B, V)."""
+        lead = v.shape[:-1]
+        subject = v.gather(-1, self.subjects.expand(*lead, -1)) * self.valid_subjects
+        object_ = v.gather(-1, self.objects.expand(*lead, -1)) * self.valid_objects
+        pairs = (subject.unsqueeze(-1) * object_.unsqueeze(-2)).unsqueeze(-3)
+        return pairs.expand(*lead, self.relations, -1, -1).flatten(-3)
 
     def unflatten(self, values: Tensor) -> Tensor:
         """(..., E) to (..., A, n, m)."""
         shape = (self.relations, self.subjects.shape[-1], self.objects.shape[-1])
         return values.reshape(*values.shape[:-1], *shape)
+
+    def _flat(self, values: Tensor) -> Tensor:
+        (B, n), m = self.subjects.shape, self.objects.shape[1]
+        return values.expand(B, self.relations, n, m).flatten(1)
 
 
 def pair_edges(
@@ -85,33 +144,27 @@ def pair_edges(
     """
     if objects is None:
         objects, log_objects = subjects, log_subjects
-    valid = (subjects >= 0)[:, :, None] & (objects >= 0)[:, None, :]
-    shape = (len(subjects), relations, *valid.shape[1:])
-    axis = torch.arange(relations, device=subjects.device)[:, None, None]
-    present = subjects >= 0
+    valid_subjects, valid_objects = subjects >= 0, objects >= 0
     subjects, objects = subjects.clamp(min=0), objects.clamp(min=0)
     if log_subjects is None:
         log_subjects = torch.zeros(subjects.shape, device=subjects.device)
     if log_objects is None:
         log_objects = torch.zeros(objects.shape, device=objects.device)
     return PairEdges(
-        relation=axis.expand(shape).flatten(1),
-        subject=subjects[:, None, :, None].expand(shape).flatten(1),
-        object=objects[:, None, None, :].expand(shape).flatten(1),
-        valid=valid[:, None].expand(shape).flatten(1),
+        relations=relations,
         subjects=subjects,
         objects=objects,
-        valid_subjects=present,
+        valid_subjects=valid_subjects,
+        valid_objects=valid_objects,
         log_subjects=log_subjects,
         log_objects=log_objects,
-        relations=relations,
     )
 
 
-def triple_edges(triples: Tensor) -> Edges:
+def triple_edges(triples: Tensor) -> TripleEdges:
     """One shared row of units from a (T, 3) table of (a, i, j)."""
     relation, subject, object_ = triples.long().T.unsqueeze(1).unbind(0)
-    return Edges(relation, subject, object_, torch.ones_like(subject, dtype=torch.bool))
+    return TripleEdges(relation, subject, object_, torch.ones_like(subject, dtype=torch.bool))
 
 
 def triple_keys(relation: Tensor, subject: Tensor, object_: Tensor, classes: int) -> Tensor:

@@ -111,6 +111,11 @@ class BoltzmannMachine(nn.Module, ABC):
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
         """sum_e weight_e U_e, (..., B, H1), for weight (..., B, E)."""
 
+    def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
+        """sum_e r_e ℓ_e(v, 0), (..., B), and sum_e r_e U_e, (..., B, H1): r·ℓ without and with h1."""
+        bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
+        return (r * bare).sum(-1), self.hidden_input(edges, r)
+
     @abstractmethod
     def relation_context(self, edges: Edges) -> Tensor:
         """The rows U_e, (B or 1, E, H1). Allocates them: for few units only."""
@@ -181,16 +186,16 @@ class BoltzmannMachine(nn.Module, ABC):
         logits = self.relation_logits(edges, v, h1)
         observed = torch.ones_like(gate, dtype=torch.bool)
         relation = self.relation_term(logits, gate, r, observed).sum(-1)
-        energy = -(self._object_part(v, h1, h2, room) + relation + self.pair_offset(edges, gate))
+        energy = -(self._object_part(v, h1, h2, room) + relation + self.pair_offset(edges, v))
         return torch.where((r > gate).any(-1), torch.inf, energy)
 
     def _object_part(self, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor | None) -> Tensor:
         context = (h1 * self.context_bias(room)).sum(-1) + ((v @ self.W) * h1).sum(-1)
         return v @ self.b + context + h2 @ self.c2 + ((h1 @ self.J) * h2).sum(-1)
 
-    def pair_offset(self, edges: Edges, gate: Tensor) -> Tensor:
+    def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
         """sum of κ_a over active units, (..., B); zero but for a compensated seed form."""
-        return gate.new_zeros(gate.shape[:-1])
+        return v.new_zeros(v.shape[:-1])
 
     def hidden_logits(
         self,
@@ -226,22 +231,28 @@ class BoltzmannMachine(nn.Module, ABC):
         """
         if self.spec.H2 and h2 is None:
             raise ValueError("F has no closed form over a second layer: give h2")
-        second = v.new_zeros(()) if h2 is None else h2 @ self.c2
-        x = self.context_bias(room) + v @ self.W
-        if h2 is not None:
-            x = x + h2 @ self.J.T
         if self.spec.form == "local":
             if r is not None:
                 raise ValueError("F has no closed form in the local form with relations observed")
-            return -(v @ self.b) - second - softplus(x).sum(-1)
+            return self.free_energy_given(v, v.new_zeros(()), h2, room)
         if r is None or edges is None:
             raise ValueError("F has no closed form in the seed form with relations unobserved")
-        gate = self.gate(edges, v)
-        bare = self.relation_logits(edges, v, x.new_zeros(x.shape))
-        x = x + self.hidden_input(edges, r)
-        free = -(v @ self.b) - second - (r * bare).sum(-1) - softplus(x).sum(-1)
-        free = free - self.pair_offset(edges, gate)
-        return torch.where((r > gate).any(-1), torch.inf, free)
+        bare, context = self.linear_relations(edges, v, r)
+        free = self.free_energy_given(v, context, h2, room) - bare - self.pair_offset(edges, v)
+        return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, free)
+
+    def free_energy_given(
+        self, v: Tensor, context: Tensor, h2: Tensor | None = None, room: Tensor | None = None
+    ) -> Tensor:
+        """-log sum_{h1} of the object part with h1's input raised by context (..., B, H1).
+
+        -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k, shape (..., B).
+        """
+        free = -(v @ self.b)
+        x = self.context_bias(room) + v @ self.W + context
+        if h2 is not None:
+            x, free = x + h2 @ self.J.T, free - h2 @ self.c2
+        return free - softplus(x).sum(-1)
 
     # -- conditionals of the other blocks -------------------------------------------------------
 

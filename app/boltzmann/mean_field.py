@@ -76,25 +76,27 @@ def mean_field(
         iterations: sweeps over both layers.
         damping: share of the old relation slopes kept in a sweep.
     """
-    base = machine.context_bias(evidence.room) + evidence.v @ machine.W
-    relations = evidence.relations(machine)
+    base = x = machine.context_bias(evidence.room) + evidence.v @ machine.W
     two_layers = machine.spec.H2 > 0
-    if relations is None and not two_layers:
-        return MeanField(base, base, base.new_zeros(len(base), 0))
-    h2 = machine.c2.sigmoid().expand(len(base), -1)
-    x = base + h2 @ machine.J.T if two_layers else base
-    y, slopes = x, None
-    for _ in range(iterations):
+    h2 = base.new_zeros(len(base), 0)
+    if two_layers:
+        h2 = machine.c2.sigmoid().expand(len(base), -1)
+        x = torch.addmm(base, h2, machine.J.T)
+    # What relations add to x; linear in r, whatever h1 is, where all of a seed form are observed.
+    pull, slopes = base.new_zeros(()), None
+    relations = evidence.relations(machine)
+    if relations is not None:
+        edges, r, observed = relations
+        gate = machine.gate(edges, evidence.v)
+        if machine.spec.form == "seed" and bool((observed | (gate == 0)).all()):
+            pull, relations = machine.hidden_input(edges, r * gate), None
+    for _ in range(iterations if two_layers or relations is not None else 0):
         if relations is not None:
-            edges, r, observed = relations
-            gate = machine.gate(edges, evidence.v)
-            logits = machine.relation_logits(edges, evidence.v, y.sigmoid())
+            logits = machine.relation_logits(edges, evidence.v, (x + pull).sigmoid())
             slope = machine.relation_slope(logits, gate, r, observed)
             slopes = slope if slopes is None else damping * slopes + (1 - damping) * slope
-            y = x + machine.hidden_input(edges, slopes)
+            pull = machine.hidden_input(edges, slopes)
         if two_layers:
-            h2 = machine.second_layer_logits(y.sigmoid()).sigmoid()
-            y = y - x
-            x = base + h2 @ machine.J.T
-            y = y + x
-    return MeanField(y, x, h2)
+            h2 = machine.second_layer_logits((x + pull).sigmoid()).sigmoid()
+            x = torch.addmm(base, h2, machine.J.T)
+    return MeanField(x + pull, x, h2)

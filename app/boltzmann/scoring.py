@@ -8,7 +8,7 @@ The context's part of an object's log-odds is a sum of logs,
 and every factor lies between 1 and exp(W_ik). So a group of factors can be multiplied before one
 log is taken, as long as the group's product stays within float32. Both terms of a factor are
 positive: nothing cancels, unlike in 1 + sigmoid(x) (exp(W) - 1), which is 0 for large x and a
-weight below -17.
+weight below -17. Weights in float64, or too large for float32, are summed log by log instead.
 """
 
 from __future__ import annotations
@@ -41,12 +41,14 @@ class ContextScorer:
     """
 
     def __init__(self, machine: BoltzmannMachine) -> None:
-        W = machine.W.detach().float()
+        W = machine.W.detach()
+        self._dtype = W.dtype
         if not bool(W.isfinite().all()):
             raise ValueError("W must be finite to score with")
         self.V, self.H1 = W.shape
         largest = float(W.abs().max())
-        self._weights = W.T.double() if largest > _LARGEST_WEIGHT else None
+        exact = W.dtype == torch.float64 or largest > _LARGEST_WEIGHT
+        self._weights = W.T.double() if exact else None
         limit = min(_LARGEST_GROUP, max(1, int(_LOG_RANGE / max(largest, 1.0))))
         groups = -(-self.H1 // limit)
         self._group = -(-self.H1 // groups)
@@ -60,16 +62,16 @@ class ContextScorer:
         torch.exp(W.T, out=self._exp[: self.H1])
 
     def gain(self, x: Tensor) -> Tensor:
-        """sum_k [softplus(x_k + W_ik) - softplus(x_k)], (B, V) float32, for x (B, H1).
+        """sum_k [softplus(x_k + W_ik) - softplus(x_k)], (B, V) in W's dtype, for x (B, H1).
 
         Raises:
             ValueError: x is not (B, H1).
         """
         if x.dim() != 2 or x.shape[1] != self.H1:
             raise ValueError(f"x must be (B, {self.H1}), not {tuple(x.shape)}")
-        gains = torch.empty(len(x), self.V)
+        gains = torch.empty(len(x), self.V, dtype=self._dtype)
         with torch.inference_mode():
-            for row, gain in zip(x.detach().float(), gains, strict=True):
+            for row, gain in zip(x.detach().to(self._dtype), gains, strict=True):
                 if self._weights is None:
                     self._multiply(row, gain)
                 else:
@@ -84,6 +86,6 @@ class ContextScorer:
 
 
 def _add_logs(row: Tensor, weights: Tensor, gain: Tensor) -> None:
-    """The same for weights (H1, V) whose exponentials float32 cannot hold."""
+    """The same by one log a factor, in float64, for weights (H1, V)."""
     row = row.double().unsqueeze(1)
     gain.copy_(torch.logaddexp(logsigmoid(-row), logsigmoid(row) + weights).sum(0))

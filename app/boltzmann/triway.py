@@ -22,7 +22,7 @@ from typing import Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import softplus
+from torch.nn.functional import embedding, softplus
 
 from app.boltzmann.edges import Edges, PairEdges, find_triples, pair_edges, triple_keys
 from app.boltzmann.machine import BoltzmannMachine
@@ -61,32 +61,68 @@ class Triway(BoltzmannMachine):
         """d_a + w_e + U_e·h1."""
         pairs = _pairs(edges)
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
-        left = self.S[pairs.subjects].unsqueeze(1) * shared.unsqueeze(-2)
-        product = left @ self.O[pairs.objects].unsqueeze(1).mT
-        bias = (self.d + h1 @ self.P.T)[..., None, None]
-        logits = product + bias + self._pair_weights(pairs)
+        left = embedding(pairs.subjects, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
+        product = left.flatten(-3, -2) @ embedding(pairs.objects, self.O).mT
+        product = product.unflatten(-2, left.shape[-3:-1])
+        bias = self.d + h1 @ self.P.T
+        subject, object_ = self._end_weights(pairs)
+        ends = (subject + bias.unsqueeze(-1)).unsqueeze(-1) + object_.unsqueeze(-2)
+        logits = product + ends
+        if self.spec.T:
+            logits = logits + self._residuals(pairs)
         return logits.flatten(-3)
 
-    def _pair_weights(self, pairs: PairEdges) -> Tensor:
-        """s[a,i] + o[a,j] + w_e' + n[a]·(log n_i, log n_j), (B, A, n, m)."""
+    def _end_weights(self, pairs: PairEdges) -> tuple[Tensor, Tensor]:
+        """s[a,i] + n[a,0] log n_i, (B, A, n), and o[a,j] + n[a,1] log n_j, (B, A, m)."""
         counts = self.n[:, 0, None] * pairs.log_subjects.unsqueeze(1)
         subject = self.s[:, pairs.subjects].transpose(0, 1) + counts
         counts = self.n[:, 1, None] * pairs.log_objects.unsqueeze(1)
-        object_ = self.o[:, pairs.objects].transpose(0, 1) + counts
-        weights = subject.unsqueeze(-1) + object_.unsqueeze(-2)
-        if not self.spec.T:
-            return weights
+        return subject, self.o[:, pairs.objects].transpose(0, 1) + counts
+
+    def _residuals(self, pairs: PairEdges) -> Tensor:
+        """w_e', (B, A, n, m); 0 for triples not seen in training."""
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, found = find_triples(self.triple_keys, keys)
-        return weights + pairs.unflatten(self.residual[position] * found)
+        return pairs.unflatten(self.residual[position] * found)
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
         """sum_e weight_e U_e through the factors, without forming U."""
         pairs = _pairs(edges)
-        weight = pairs.unflatten(weight)
-        product = weight @ self.O[pairs.objects].unsqueeze(1)
-        factor = (product * self.S[pairs.subjects].unsqueeze(1)).sum(-2)
-        return torch.einsum("...ak,akh->...h", factor, self.M) + weight.sum((-1, -2)) @ self.P
+        grid = pairs.unflatten(weight)
+        return self._context_input(self._factors(pairs, grid), grid.sum((-1, -2)))
+
+    def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
+        """sum_e r_e ℓ_e(0) and sum_e r_e U_e through the factors, without forming ℓ or U."""
+        pairs = _pairs(edges)
+        grid = pairs.unflatten(r)
+        factors, outgoing, incoming = self._factors(pairs, grid), grid.sum(-1), grid.sum(-2)
+        count = outgoing.sum(-1)
+        subject, object_ = self._end_weights(pairs)
+        bare = (factors * self.R).sum((-1, -2)) + count @ self.d
+        bare = bare + (outgoing * subject).sum((-1, -2)) + (incoming * object_).sum((-1, -2))
+        if self.spec.T:
+            bare = bare + (grid * self._residuals(pairs)).sum((-1, -2, -3))
+        return bare, self._context_input(factors, count)
+
+    def _factors(self, pairs: PairEdges, weight: Tensor) -> Tensor:
+        """sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., B, A, K)."""
+        # One (A·n, m) by (m, K) product a scene: a broadcast over a would copy O for each.
+        product = weight.flatten(-3, -2) @ embedding(pairs.objects, self.O)
+        product = product.unflatten(-2, weight.shape[-3:-1])
+        return (product * embedding(pairs.subjects, self.S).unsqueeze(-3)).sum(-2)
+
+    def _context_input(self, factors: Tensor, count: Tensor) -> Tensor:
+        """sum_{a,k} factors[a,k] M[a,k] + sum_a count_a P[a], (..., B, H1)."""
+        return factors.flatten(-2) @ self.M.flatten(0, 1) + count @ self.P
+
+    def held_objects(self, edges: Edges, r: Tensor) -> Tensor:
+        """(B, V) float: 1 for objects that a relation which is on holds present."""
+        pairs = _pairs(edges)
+        grid = pairs.unflatten(r).amax(-3)
+        held = r.new_zeros(len(r), self.spec.V)
+        held.scatter_reduce_(1, pairs.subjects.expand(len(r), -1), grid.amax(-1), "amax")
+        held.scatter_reduce_(1, pairs.objects.expand(len(r), -1), grid.amax(-2), "amax")
+        return held
 
     def relation_context(self, edges: Edges) -> Tensor:
         """U_e for each unit."""
@@ -159,9 +195,12 @@ class Triway(BoltzmannMachine):
             raise ValueError(f"observed relations need one row per chain: {rows}")
         return pairs
 
-    def pair_offset(self, edges: Edges, gate: Tensor) -> Tensor:
+    def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
         """sum of κ_a over active units."""
-        return (gate * self.kappa[edges.relation]).sum(-1)
+        if not bool(self.kappa.any()):
+            return super().pair_offset(edges, v)
+        gate = self.gate(edges, v)
+        return _pairs(edges).unflatten(gate).sum((-1, -2)) @ self.kappa
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:

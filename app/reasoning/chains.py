@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine
-from app.boltzmann.gibbs import Clamp, State, initial_state, run
+from app.boltzmann.gibbs import Clamp, State, initial_state, linear_schedule, run
 from app.reasoning.evidence import Observation
 
 CHAINS = 8
@@ -28,7 +27,7 @@ def cooling(machine: BoltzmannMachine, steps: int, temperature: float) -> Stairs
     """(tempered machine, sweeps) of each stair, the last one at the temperature itself."""
     annealed = steps // 2
     stairs = min(_STAIRS, annealed)
-    heats = np.linspace(_HOTTEST * temperature, temperature, stairs, endpoint=False).tolist()
+    heats = linear_schedule(stairs + 1, _HOTTEST * temperature, temperature)[:-1]
     sweeps = [annealed * (k + 1) // stairs - annealed * k // stairs for k in range(stairs)]
     return [
         (machine if heat == 1 else machine.scaled(1 / heat), count)

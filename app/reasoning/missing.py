@@ -11,7 +11,7 @@ from torch import Tensor
 from app.reasoning.answers import MissingAnswer
 from app.reasoning.calibration import missing_scores, placed_scores
 from app.reasoning.evidence import draw_context, observe
-from app.reasoning.objects import presence_log_odds
+from app.reasoning.objects import absent_log_odds
 from app.reasoning.placements import log_p_at, placements
 from app.reasoning.relations import best
 from app.registry.artifact import Artifact
@@ -54,7 +54,7 @@ def missing(
     if not bool(chosen.any()):
         return ()
     draws = draw_context(machine, observation.evidence)
-    log_odds = presence_log_odds(machine, observation.evidence, absent.unsqueeze(0), draws)[0]
+    log_odds = absent_log_odds(artifact, observation.evidence, absent, draws)
     scores = missing_scores(calibration, log_odds)
     if place is not None:
         relation, anchor, outgoing = place

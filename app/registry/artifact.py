@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +22,10 @@ from app.scene.vocabulary import Vocabulary
 
 if TYPE_CHECKING:  # importing torch takes seconds; writing and listing artifacts does without
     from app.boltzmann import BoltzmannMachine
+    from app.boltzmann.scoring import ContextScorer
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Artifact:
     """A verified model, ready to be asked.
 
@@ -44,6 +46,13 @@ class Artifact:
     digest: str
     card: str
     path: Path
+
+    @cached_property
+    def scorer(self) -> ContextScorer:
+        """Prepared scores of all objects; made when first asked for."""
+        from app.boltzmann.scoring import ContextScorer
+
+        return ContextScorer(self.machine)
 
 
 def write_artifact(

@@ -13,7 +13,7 @@ from training.datasets import EncodedScene
 from training.evaluation.intervals import bootstrap, ratio_figure
 from training.evaluation.missing import leave_one_out, machine_score, missing_figures, with_unknown
 from training.evaluation.outliers import intruder_scores
-from training.evaluation.relations import expected_hits, rank_relations
+from training.evaluation.relations import expected_hits, rank_relations, rank_scored, score_scenes
 from training.evaluation.relations import machine_score as relation_score
 
 V = 5
@@ -123,7 +123,8 @@ def test_r_precision_by_hand():
 
     ranking = rank_relations(data, NO_STRUCTURE, score)
     assert ranking.pooled().value == pytest.approx(0.5)
-    assert rank_relations(data, NO_STRUCTURE, score, relation=0).pooled().value == 1.0
+    left = rank_scored(score_scenes(data, score), NO_STRUCTURE, len(data), relation=0)
+    assert left.pooled().value == 1.0
 
 
 def test_expected_hits_shares_ties():

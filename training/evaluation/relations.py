@@ -8,7 +8,7 @@ skipped.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,28 +79,31 @@ class RelationRanking:
 
 
 @torch.no_grad()
-def rank_relations(
-    scenes: SceneTensors,
+def score_scenes(
+    scenes: SceneTensors, score: RelationScore, *, block: int = 64
+) -> list[tuple[Batch, Tensor]]:
+    """Batches of the scenes that have annotated triples, with their scores (B, A, n, n)."""
+    related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
+    batches = [scenes.batch(part) for part in torch.tensor(related).split(block) if len(part)]
+    return [(batch, score(batch)) for batch in batches]
+
+
+def rank_scored(
+    scored: Sequence[tuple[Batch, Tensor]],
     structure: Tensor,
-    score: RelationScore,
+    scenes: int,
     *,
     relation: int | None = None,
-    block: int = 64,
 ) -> RelationRanking:
-    """R-precision of a score.
+    """R-precision of scores.
 
     Args:
+        scored: see `score_scenes`.
+        scenes: how many there were, those without triples among them.
         relation: only this canonical relation.
     """
-    annotated, hits, skipped = [], [], 0
-    for start in range(0, len(scenes), block):
-        index = torch.arange(start, min(start + block, len(scenes)))
-        index = index[[bool(scenes.scenes[k].evidence.holds.any()) for k in index.tolist()]]
-        skipped += min(block, len(scenes) - start) - len(index)
-        if not len(index):
-            continue
-        batch = scenes.batch(index)
-        values = score(batch)
+    annotated, hits = [], []
+    for batch, values in scored:
         n = batch.classes.shape[1]
         usable = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
         pair = usable[:, :, None] & usable[:, None, :] & ~torch.eye(n, dtype=torch.bool)
@@ -111,12 +114,18 @@ def rank_relations(
         truth = (batch.holds > 0) & pair
         for row in range(len(batch)):
             count = int(truth[row].sum())
-            if not count:
-                skipped += 1
-                continue
-            annotated.append(count)
-            hits.append(expected_hits(values[row][pair[row]], truth[row][pair[row]], count))
+            if count:
+                annotated.append(count)
+                hits.append(expected_hits(values[row][pair[row]], truth[row][pair[row]], count))
+    skipped = scenes - len(annotated)
     return RelationRanking(np.array(annotated, dtype=np.int64), np.array(hits), skipped)
+
+
+def rank_relations(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore
+) -> RelationRanking:
+    """R-precision of a score on a set of scenes."""
+    return rank_scored(score_scenes(scenes, score), structure, len(scenes))
 
 
 def expected_hits(values: Tensor, truth: Tensor, count: int) -> float:

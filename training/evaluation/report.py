@@ -16,7 +16,7 @@ from training.evaluation.intervals import Figure
 from training.evaluation.missing import leave_one_out, machine_score, missing_figures, with_unknown
 from training.evaluation.outliers import intruder_scores
 from training.evaluation.relations import machine_score as relation_score
-from training.evaluation.relations import rank_relations
+from training.evaluation.relations import rank_relations, rank_scored, score_scenes
 from training.trainer import subset
 
 _OUTLIER_SCENES = 600
@@ -84,8 +84,8 @@ def relation_rows(
     """T1a on one source, with and without instance counts, and per relation."""
     task = "T1a relations"
     rows: list[Row] = []
-    score = relation_score(machine)
-    ranking = rank_relations(scenes, structure, score)
+    scored = score_scenes(scenes, relation_score(machine))
+    ranking = rank_scored(scored, structure, len(scenes))
     if not len(ranking.annotated):
         return rows
     plain = rank_relations(scenes, structure, relation_score(machine, counts=False))
@@ -93,7 +93,7 @@ def relation_rows(
     rows.append(Row(task, source, "R-precision, instance counts", ranking.pooled()))
     rows.append(Row(task, source, "R-precision, mean over scenes", ranking.per_scene()))
     for a, name in enumerate(CANONICAL):
-        ranking = rank_relations(scenes, structure, score, relation=a)
+        ranking = rank_scored(scored, structure, len(scenes), relation=a)
         if len(ranking.annotated):
             rows.append(Row(task, source, f"R-precision, {name}", ranking.pooled()))
     return rows

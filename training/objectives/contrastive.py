@@ -1,8 +1,8 @@
 """Contrastive divergence, plain and persistent, by differences of the energy.
 
 The gradient of the negative log-likelihood is <dE>_data - <dE>_model. Both terms are energies of
-sampled states, so autograd turns any variant's energy into its update; h1 enters by its mean given
-the rest (Rao–Blackwell), which is exact because the seed form's energy is linear in it.
+sampled states, so autograd turns any variant's energy into its update; in the seed form h1 is
+summed out (Rao–Blackwell), so the terms are free energies given v, r and h2.
 
 In the local form relations sum to one given (v, h1), so their model term has mean zero and is left
 out: what remains is the machine of (v, h1, h2) and log p(r | v, h1) on the data.
@@ -22,7 +22,7 @@ from torch.nn.functional import softplus
 from app.boltzmann import BoltzmannMachine
 from app.boltzmann.bernoulli import bernoulli
 from app.boltzmann.edges import Edges, PairEdges
-from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state
+from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state, reconstruct
 from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
@@ -43,8 +43,9 @@ def data_state(
     field = mean_field(machine, Evidence(batch.v, edges, r, observed, room), iterations=5)
     h1 = bernoulli(field.y.sigmoid(), generator)
     h2 = bernoulli(field.h2, generator)
-    p = machine.relation_logits(edges, batch.v, h1).sigmoid() * machine.gate(edges, batch.v)
-    r = torch.where(observed, r, bernoulli(p, generator))
+    if not bool((observed | ~edges.valid).all()):
+        p = machine.relation_logits(edges, batch.v, h1).sigmoid() * machine.gate(edges, batch.v)
+        r = torch.where(observed, r, bernoulli(p, generator))
     return State(batch.v, h1, h2, r, edges), observed
 
 
@@ -65,23 +66,30 @@ def relation_nll(
     return ((softplus(logits) - r * logits) * weight).sum(-1)
 
 
-def energy_of(machine: BoltzmannMachine, state: State, room: Tensor) -> Tensor:
-    """E of a seed-form state with h1 at its mean given the rest, (B,)."""
-    second = state.h2 if machine.spec.H2 else None
-    with torch.no_grad():
-        h1 = machine.hidden_logits(state.v, state.r, state.edges, second, room).sigmoid()
-    return machine.energy(state.v, state.r, h1, state.h2, state.edges, room)
-
-
 def energy_difference(
-    machine: BoltzmannMachine, data: State, observed: Tensor, model: State, room: Tensor
+    machine: BoltzmannMachine,
+    data: State,
+    observed: Tensor,
+    model: State,
+    data_room: Tensor,
+    model_room: Tensor,
 ) -> Tensor:
-    """mean E(data) - mean E(model), plus -log p(r | v, h1) in the local form."""
+    """mean F(data) - mean F(model); in the local form mean E, plus -log p(r | v, h1)."""
     if machine.spec.form == "local":
-        positive = object_energy(machine, data.v, data.h1, data.h2, room)
+        positive = object_energy(machine, data.v, data.h1, data.h2, data_room)
         positive = positive + relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
-        return positive.mean() - object_energy(machine, model.v, model.h1, model.h2, room).mean()
-    return energy_of(machine, data, room).mean() - energy_of(machine, model, room).mean()
+        negative = object_energy(machine, model.v, model.h1, model.h2, model_room)
+        return positive.mean() - negative.mean()
+    # Both in one pass: the states are reachable, so the gate need not be looked at.
+    bare, context = machine.linear_relations(data.edges, data.v, data.r)
+    model_bare, model_context = machine.linear_relations(model.edges, model.v, model.r)
+    free = machine.free_energy_given(
+        torch.cat([data.v, model.v]),
+        torch.cat([context, model_context]),
+        torch.cat([data.h2, model.h2]) if machine.spec.H2 else None,
+        torch.cat([data_room, model_room]),
+    ).split([len(data.v), len(model.v)])
+    return (free[0] - bare).mean() - (free[1] - model_bare).mean()
 
 
 class ContrastiveDivergence(Objective):
@@ -92,17 +100,16 @@ class ContrastiveDivergence(Objective):
         room = withhold_rooms(batch, self.config.room_dropout, generator)
         data, observed = data_state(machine, batch, room, generator)
         relations = machine.spec.form == "seed"
-        model = data
-        for _ in range(self.config.k):
+        clamp = Clamp(room=room)
+        # The data's own h1 starts the first reconstruction.
+        model = reconstruct(
+            machine, data, generator, clamp, collapsed=False, relations=relations
+        )
+        for _ in range(self.config.k - 1):
             model = gibbs_step(
-                machine,
-                model,
-                generator,
-                Clamp(room=room),
-                collapsed=False,
-                relations=relations,
+                machine, model, generator, clamp, collapsed=False, relations=relations
             )
-        return energy_difference(machine, data, observed, model, room)
+        return energy_difference(machine, data, observed, model, room, room)
 
 
 class PersistentCD(Objective):
@@ -128,12 +135,7 @@ class PersistentCD(Objective):
         for offset, block in zip(self.offsets, (data.v, data.h1, data.h2), strict=True):
             offset.lerp_(block.mean(0), 0.01)
         no_room = torch.full((len(chains.v),), -1)
-        if machine.spec.form == "local":
-            model = object_energy(machine, chains.v, chains.h1, chains.h2, no_room).mean()
-            positive = object_energy(machine, data.v, data.h1, data.h2, free)
-            nll = relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
-            return (positive + nll).mean() - model
-        return energy_of(machine, data, free).mean() - energy_of(machine, chains, no_room).mean()
+        return energy_difference(machine, data, observed, chains, free, no_room)
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:
         """The centred gradient: weights see (v - μ)(h - λ), biases make up for the offsets."""
