@@ -97,9 +97,7 @@ def gibbs_step(
     """
     h1 = sample_h1(machine, state, generator, clamp)
     state = replace(state, h1=h1)
-    return reconstruct(
-        machine, state, generator, clamp, collapsed=collapsed, relations=relations
-    )
+    return reconstruct(machine, state, generator, clamp, collapsed=collapsed, relations=relations)
 
 
 @torch.no_grad()

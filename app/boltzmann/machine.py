@@ -112,7 +112,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """sum_e weight_e U_e, (..., B, H1), for weight (..., B, E)."""
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """sum_e r_e ℓ_e(v, 0), (..., B), and sum_e r_e U_e, (..., B, H1): r·ℓ without and with h1."""
+        """sum_e r_e ℓ_e(v, 0), (..., B), and sum_e r_e U_e, (..., B, H1)."""
         bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 

@@ -85,6 +85,7 @@ def mean_field(
     # What relations add to x; linear in r, whatever h1 is, where all of a seed form are observed.
     pull, slopes = base.new_zeros(()), None
     relations = evidence.relations(machine)
+    gate = base.new_zeros(())
     if relations is not None:
         edges, r, observed = relations
         gate = machine.gate(edges, evidence.v)
@@ -92,6 +93,7 @@ def mean_field(
             pull, relations = machine.hidden_input(edges, r * gate), None
     for _ in range(iterations if two_layers or relations is not None else 0):
         if relations is not None:
+            edges, r, observed = relations
             logits = machine.relation_logits(edges, evidence.v, (x + pull).sigmoid())
             slope = machine.relation_slope(logits, gate, r, observed)
             slopes = slope if slopes is None else damping * slopes + (1 - damping) * slope

@@ -67,7 +67,7 @@ class Triway(BoltzmannMachine):
         bias = self.d + h1 @ self.P.T
         subject, object_ = self._end_weights(pairs)
         ends = (subject + bias.unsqueeze(-1)).unsqueeze(-1) + object_.unsqueeze(-2)
-        logits = product + ends
+        logits: Tensor = product + ends
         if self.spec.T:
             logits = logits + self._residuals(pairs)
         return logits.flatten(-3)
@@ -107,9 +107,10 @@ class Triway(BoltzmannMachine):
     def _factors(self, pairs: PairEdges, weight: Tensor) -> Tensor:
         """sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., B, A, K)."""
         # One (A·n, m) by (m, K) product a scene: a broadcast over a would copy O for each.
-        product = weight.flatten(-3, -2) @ embedding(pairs.objects, self.O)
+        product: Tensor = weight.flatten(-3, -2) @ embedding(pairs.objects, self.O)
         product = product.unflatten(-2, weight.shape[-3:-1])
-        return (product * embedding(pairs.subjects, self.S).unsqueeze(-3)).sum(-2)
+        subjects = embedding(pairs.subjects, self.S).unsqueeze(-3)
+        return (product * subjects).sum(-2)
 
     def _context_input(self, factors: Tensor, count: Tensor) -> Tensor:
         """sum_{a,k} factors[a,k] M[a,k] + sum_a count_a P[a], (..., B, H1)."""

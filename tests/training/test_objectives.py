@@ -227,8 +227,7 @@ def test_both_terms_of_the_seed_form_are_free_energies(name):
     joint = enumerate_joint(machine)
     some, others = slice(40, 60), slice(100, 120)
     states = [
-        State(joint.v[k], joint.h1[k], joint.h2[k], joint.r[k], joint.edges)
-        for k in (some, others)
+        State(joint.v[k], joint.h1[k], joint.h2[k], joint.r[k], joint.edges) for k in (some, others)
     ]
     room = torch.full((20,), -1)
     everything = torch.ones(20, joint.r.shape[1], dtype=torch.bool)
@@ -238,7 +237,6 @@ def test_both_terms_of_the_seed_form_are_free_energies(name):
         machine.free_energy(s.v, s.r, s.edges, h2) for s, h2 in zip(states, second, strict=True)
     ]
     torch.testing.assert_close(ours, free[0].mean() - free[1].mean())
-
 
 
 def test_evidence_is_the_scene_layer_s():

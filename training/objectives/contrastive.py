@@ -102,9 +102,7 @@ class ContrastiveDivergence(Objective):
         relations = machine.spec.form == "seed"
         clamp = Clamp(room=room)
         # The data's own h1 starts the first reconstruction.
-        model = reconstruct(
-            machine, data, generator, clamp, collapsed=False, relations=relations
-        )
+        model = reconstruct(machine, data, generator, clamp, collapsed=False, relations=relations)
         for _ in range(self.config.k - 1):
             model = gibbs_step(
                 machine, model, generator, clamp, collapsed=False, relations=relations
