@@ -77,15 +77,17 @@ def mean_field(
         damping: share of the old relation slopes kept in a sweep.
     """
     base = x = machine.context_bias(evidence.room) + evidence.v @ machine.W
+    relations = evidence.relations(machine)
     two_layers = machine.spec.H2 > 0
     h2 = base.new_zeros(len(base), 0)
+    if relations is None and not two_layers:
+        return MeanField(base, base, h2)
     if two_layers:
         h2 = machine.c2.sigmoid().expand(len(base), -1)
         x = torch.addmm(base, h2, machine.J.T)
     # What relations add to x; linear in r, whatever h1 is, where all of a seed form are observed.
-    pull, slopes = base.new_zeros(()), None
-    relations = evidence.relations(machine)
-    gate = base.new_zeros(())
+    pull = gate = base.new_zeros(())
+    slopes = None
     if relations is not None:
         edges, r, observed = relations
         gate = machine.gate(edges, evidence.v)

@@ -24,7 +24,7 @@ _LOG_RANGE = 80.0
 # Beyond it sigmoid(x) can underflow to 0 where sigmoid(x) exp(W) still counts.
 _LARGEST_WEIGHT = 64.0
 # More factors a log gain nothing: by then the products take all the time.
-_LARGEST_GROUP = 16
+_LARGEST_GROUP = 25
 
 
 class ContextScorer:
