@@ -1,12 +1,25 @@
-"""Bootstrap intervals over scenes."""
+"""Percentile bootstrap over scenes: intervals of a metric, and of the difference of two.
+
+A resample draws as many scenes as there are, with replacement; it is held as the number of times
+that each scene was drawn. The draws depend on the seed and the number of scenes alone, so two
+metrics of the same scenes are resampled alike, and their difference is a paired one.
+
+Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+RESAMPLES = 1000
 
 
 @dataclass(frozen=True)
@@ -27,40 +40,82 @@ class Figure:
     def __str__(self) -> str:
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
 
+    @property
+    def above_zero(self) -> bool:
+        """The whole interval is above zero: in a paired difference, the first is better."""
+        return self.low > 0
 
-def ratio_figure(
-    numerators: NDArray[np.float64],
-    denominators: NDArray[np.float64],
-    *,
-    resamples: int = 1000,
-    seed: int = 0,
-) -> Figure:
-    """sum(numerators) / sum(denominators) over scenes, as a micro-average is.
 
-    Args:
-        numerators, denominators: (scenes,); a scene with denominator 0 was skipped.
+class Metric(ABC):
+    """A metric over a set of scenes that can be resampled.
+
+    Attributes:
+        scenes: how many scenes were given, those that could not be scored among them.
+        n: scored items.
+        value: the metric over all of them.
+    """
+
+    @property
+    @abstractmethod
+    def scenes(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def n(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def value(self) -> float: ...
+
+    @abstractmethod
+    def resampled(self, resamples: int, seed: int) -> Floats:
+        """The metric over resampled scenes, (resamples,); nan where it is undefined."""
+
+    def draws(self, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
+        """`resampled`, computed once."""
+        if (resamples, seed) not in self._known:
+            self._known[resamples, seed] = self.resampled(resamples, seed)
+        return self._known[resamples, seed]
+
+    @cached_property
+    def _known(self) -> dict[tuple[int, int], Floats]:
+        return {}
+
+    def figure(self, *, resamples: int = RESAMPLES, seed: int = 0) -> Figure:
+        """The value with its interval."""
+        low, high = interval(self.draws(resamples, seed))
+        return Figure(self.value, low, high, self.n)
+
+
+def paired_difference(a: Metric, b: Metric, *, resamples: int = RESAMPLES, seed: int = 0) -> Figure:
+    """a minus b on the same scenes, with the interval of the difference.
 
     Raises:
-        ValueError: nothing was scored.
+        ValueError: the two were measured on different numbers of scenes.
     """
-    if not denominators.sum() > 0:
-        raise ValueError("no scene could be scored")
+    if a.scenes != b.scenes:
+        raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes}")
+    x, y = a.draws(resamples, seed), b.draws(resamples, seed)
+    both = min(len(x), len(y))
+    low, high = interval(x[:both] - y[:both])
+    return Figure(a.value - b.value, low, high, min(a.n, b.n))
 
-    def ratio(index: NDArray[np.int64]) -> float:
-        return float(numerators[index].sum() / max(denominators[index].sum(), 1e-12))
 
-    return bootstrap(ratio, len(numerators), int(denominators.sum()), resamples, seed)
+def interval(draws: Floats) -> tuple[float, float]:
+    """Percentiles 2.5 and 97.5, resamples without a value left out."""
+    low, high = np.nanpercentile(draws, [2.5, 97.5])
+    return float(low), float(high)
 
 
-def bootstrap(
-    statistic: Callable[[NDArray[np.int64]], float],
-    scenes: int,
-    n: int,
-    resamples: int = 1000,
-    seed: int = 0,
-) -> Figure:
-    """A statistic of scene positions with its percentile interval."""
+def scene_weights(scenes: int, resamples: int, seed: int) -> Iterator[Floats]:
+    """How often each scene is drawn, (scenes,), resample after resample."""
     rng = np.random.default_rng(seed)
-    draws = [statistic(rng.integers(scenes, size=scenes)) for _ in range(resamples)]
-    low, high = np.percentile(draws, [2.5, 97.5])
-    return Figure(statistic(np.arange(scenes)), float(low), float(high), n)
+    for _ in range(resamples):
+        yield np.bincount(rng.integers(scenes, size=scenes), minlength=scenes).astype(np.float64)
+
+
+def resample(
+    statistic: Callable[[Floats], float], scenes: int, resamples: int = RESAMPLES, seed: int = 0
+) -> Floats:
+    """A statistic of the scenes' weights over the resamples, (resamples,)."""
+    return np.array([statistic(weight) for weight in scene_weights(scenes, resamples, seed)])

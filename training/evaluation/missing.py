@@ -8,7 +8,7 @@ fewer than two other classes are skipped. A mention outside the vocabulary would
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,8 @@ from app.boltzmann.edges import Edges
 from app.boltzmann.log_odds import object_log_odds
 from app.boltzmann.mean_field import Evidence
 from training.batches import SceneTensors
-from training.evaluation.intervals import Figure, ratio_figure
+from training.evaluation.intervals import Figure
+from training.evaluation.metrics import Macro, Ratio
 
 # Log-odds (B, V) of every class given presence (B, V) and the counts of present classes (B, V).
 ObjectScore = Callable[[Tensor], Tensor]
@@ -34,8 +35,7 @@ class LeaveOneOut:
     Attributes:
         scene: (N,) position of the scene in the set.
         target: (N,) the removed class.
-        rank: (N,) expected reciprocal rank's ingredients: classes ranked above the target.
-        ties: (N,) other classes with exactly its score.
+        above: (N,) classes ranked above the target; ties: (N,) others with exactly its score.
         log_probability: (N,) of the target under a softmax over absent candidates.
         scenes, skipped: how many scenes were given, and how many had too few classes.
     """
@@ -62,11 +62,26 @@ class LeaveOneOut:
     def _length(self) -> int:
         return int((self.above + self.ties).max(initial=0)) + 1
 
+    def ratio(self, values: NDArray[np.float64]) -> Ratio:
+        """Mean of per-object values, (N,)."""
+        return Ratio.of_items(self.scene, values, self.scenes)
+
     def figure(self, values: NDArray[np.float64]) -> Figure:
-        """Mean of per-object values with a bootstrap interval over scenes."""
-        top = np.bincount(self.scene, weights=values, minlength=self.scenes)
-        count = np.bincount(self.scene, minlength=self.scenes)
-        return ratio_figure(top.astype(np.float64), count.astype(np.float64))
+        """The same with its interval."""
+        return self.ratio(values).figure()
+
+    def macro(self, values: NDArray[np.float64]) -> Macro:
+        """Mean over the removed classes of their mean value: rare ones count as frequent ones."""
+        return Macro(self.scene, self.target, values, self.scenes)
+
+    def with_unknown(self, unknown: NDArray[np.int64]) -> Ratio:
+        """MRR where mentions outside the vocabulary count as removed objects that score 0.
+
+        Args:
+            unknown: (scenes,) such mentions per scene.
+        """
+        known = self.ratio(self.reciprocal_rank())
+        return Ratio(known.numerators, known.denominators + unknown)
 
 
 def machine_score(machine: BoltzmannMachine) -> ObjectScore:
@@ -114,42 +129,42 @@ def removed_objects(
 
 def leave_one_out(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> LeaveOneOut:
     """Rank every removed object; see `removed_objects`."""
+    enough = ((scenes.v > 0) & ~structure).sum(1) >= 2
+    blocks = removed_objects(scenes, structure, score)
+    return rank_blocks(blocks, len(scenes), skipped=int((~enough).sum()))
+
+
+def rank_blocks(
+    blocks: Iterable[tuple[Tensor, Tensor, Tensor]], scenes: int, skipped: int
+) -> LeaveOneOut:
+    """Rank targets by scores, blocks as `removed_objects` yields them."""
     empty = torch.zeros(0, dtype=torch.int64)
     rows, targets, above, ties = [empty], [empty], [empty], [empty]
     log_p = [torch.zeros(0, dtype=torch.float64)]
-    for row, target, values in removed_objects(scenes, structure, score):
+    for row, target, values in blocks:
+        if bool(values.isnan().any()):
+            raise ValueError("a score is not a number")
         chosen = values.gather(1, target.unsqueeze(1))
         rows.append(row)
         targets.append(target)
         above.append((values > chosen).sum(1))
         ties.append((values == chosen).sum(1) - 1)
         log_p.append((chosen.squeeze(1) - values.logsumexp(1)).double())
-    enough = ((scenes.v > 0) & ~structure).sum(1) >= 2
     return LeaveOneOut(
         scene=torch.cat(rows).numpy(),
         target=torch.cat(targets).numpy(),
         above=torch.cat(above).numpy(),
         ties=torch.cat(ties).numpy(),
         log_probability=torch.cat(log_p).numpy(),
-        scenes=len(scenes),
-        skipped=int((~enough).sum()),
+        scenes=scenes,
+        skipped=skipped,
     )
 
 
-def with_unknown(result: LeaveOneOut, unknown: NDArray[np.int64]) -> Figure:
-    """MRR where mentions outside the vocabulary count as removed objects that score 0.
-
-    Args:
-        unknown: (scenes,) such mentions per scene.
-    """
-    top = np.bincount(result.scene, weights=result.reciprocal_rank(), minlength=result.scenes)
-    count = np.bincount(result.scene, minlength=result.scenes) + unknown
-    return ratio_figure(top.astype(np.float64), count.astype(np.float64))
-
-
-def missing_figures(result: LeaveOneOut) -> dict[str, Figure]:
-    """MRR and top-1/5/10, micro-averaged over removed objects."""
-    figures = {"mrr": result.figure(result.reciprocal_rank())}
+def missing_metrics(result: LeaveOneOut) -> dict[str, Ratio | Macro]:
+    """MRR and top-1/5/10, micro-averaged over removed objects, and MRR by class."""
+    reciprocal = result.reciprocal_rank()
+    metrics: dict[str, Ratio | Macro] = {"MRR": result.ratio(reciprocal)}
     for k in (1, 5, 10):
-        figures[f"top{k}"] = result.figure(result.top(k))
-    return figures
+        metrics[f"top-{k}"] = result.ratio(result.top(k))
+    return metrics | {"MRR, macro by class": result.macro(reciprocal)}

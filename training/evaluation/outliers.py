@@ -1,31 +1,34 @@
 """T3: one absent class added to a scene; is it the one that fits least?
 
-Every relation is unobserved. Scenes under three classes are skipped. The intruder is drawn
-uniformly from the absent, non-structure classes.
+Every relation is unobserved. Scenes under three classes are skipped. The intruder is drawn from the
+absent, non-structure classes by one of three laws: uniformly, by popularity in training, or
+uniformly from the classes that training saw in the same room type.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 from torch import Tensor
 
 from training.batches import SceneTensors
-from training.evaluation.intervals import Figure, bootstrap, ratio_figure
+from training.evaluation.cases import scene_rng
+from training.evaluation.metrics import Ratio, Scored
 from training.evaluation.missing import ObjectScore
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class IntruderScores:
     """Log-odds of each object given the rest, for clean scenes and for the same with an intruder.
 
     Attributes:
         scene: (N,) position of the scene; log_odds: (N,); intruder: (N,) bool; size: (N,) number of
             distinct classes in the scene as scored; clean: (N,) bool, scored without an intruder.
+        scenes: how many were given; skipped: too small, or without a class to add.
     """
 
     scene: NDArray[np.int64]
@@ -33,33 +36,89 @@ class IntruderScores:
     intruder: NDArray[np.bool_]
     size: NDArray[np.int64]
     clean: NDArray[np.bool_]
+    scenes: int
     skipped: int
 
-    def hit_at_1(self) -> Figure:
+    def hit_at_1(self) -> Ratio:
         """Share of scenes whose intruder has the lowest log-odds (ties in expectation)."""
-        hits = []
-        for scene in np.unique(self.scene):
-            rows = (self.scene == scene) & ~self.clean
-            lowest = self.log_odds[rows] == self.log_odds[rows].min()
-            hits.append(float((lowest & self.intruder[rows]).sum() / lowest.sum()))
-        return ratio_figure(np.array(hits), np.ones(len(hits)))
-
-    def auroc(self) -> Figure:
-        """Area under the ROC of -log-odds, intruders against the objects they joined."""
         rows = ~self.clean
         scene, odds, bad = self.scene[rows], self.log_odds[rows], self.intruder[rows]
-        names, place = np.unique(scene, return_inverse=True)
-        order = np.argsort(place, kind="stable")
-        bounds = np.searchsorted(place[order], np.arange(len(names) + 1))
+        lowest = np.full(self.scenes, np.inf)
+        np.minimum.at(lowest, scene, odds)
+        least = odds == lowest[scene]
+        ties = np.bincount(scene[least], minlength=self.scenes)
+        hits = np.bincount(scene[least & bad], minlength=self.scenes)
+        return Ratio(hits / np.maximum(ties, 1), (ties > 0).astype(np.float64))
 
-        def area(chosen: NDArray[np.int64]) -> float:
-            index = np.concatenate([order[bounds[k] : bounds[k + 1]] for k in chosen])
-            rank = rankdata(-odds[index])
-            positive = bad[index]
-            p, q = int(positive.sum()), int((~positive).sum())
-            return float((rank[positive].sum() - p * (p + 1) / 2) / (p * q))
+    def auroc(self) -> Scored:
+        """Area under the ROC of -log-odds, intruders against the objects they joined."""
+        return self._scored("AUROC")
 
-        return bootstrap(area, len(names), int(bad.sum()), resamples=200)
+    def average_precision(self) -> Scored:
+        """Average precision of the same ranking."""
+        return self._scored("average precision")
+
+    def _scored(self, statistic: str) -> Scored:
+        rows = ~self.clean
+        scene, score = self.scene[rows], -self.log_odds[rows]
+        return Scored(statistic, scene, score, self.intruder[rows], self.scenes)
+
+    def false_alarms(self, suspicion: NDArray[np.float64], threshold: float) -> Ratio:
+        """Share of untouched scenes in which something reaches the threshold.
+
+        Args:
+            suspicion: (N,) of each object; the higher, the more an intruder.
+        """
+        return self._alarms(suspicion, threshold, self.clean)
+
+    def caught(self, suspicion: NDArray[np.float64], threshold: float) -> Ratio:
+        """Share of intruders that reach the threshold."""
+        return self._alarms(suspicion, threshold, self.intruder)
+
+    def _alarms(
+        self, suspicion: NDArray[np.float64], threshold: float, judged: NDArray[np.bool_]
+    ) -> Ratio:
+        there = np.bincount(self.scene[judged], minlength=self.scenes) > 0
+        loud = judged & (suspicion >= threshold)
+        alarm = np.bincount(self.scene[loud], minlength=self.scenes) > 0
+        return Ratio(alarm.astype(np.float64), there.astype(np.float64))
+
+
+def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
+    """Weights (N, V): in how many training scenes of all sources each class is."""
+    return train.v.sum(0).expand(len(scenes), -1)
+
+
+def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
+    """Weights (N, V): 1 for classes that training saw in the scene's room type; 0 if unknown."""
+    weights = torch.zeros_like(scenes.v)
+    for room in scenes.room.unique().tolist():
+        if room >= 0:
+            seen = (train.v[train.room == room] > 0).any(0)
+            weights[scenes.room == room] = seen.to(weights.dtype)
+    return weights
+
+
+def draw_intruders(
+    scenes: SceneTensors, structure: Tensor, weights: Tensor | None = None, seed: int = 0
+) -> Tensor:
+    """An intruder for each scene, (N,) int64; -1 where a scene is skipped.
+
+    Args:
+        structure: (V,) bool.
+        weights: (N, V) or None for uniform, how likely each class is to be drawn if absent.
+    """
+    present = scenes.v > 0
+    absent = (~present & ~structure).double()
+    if weights is not None:
+        absent = absent * weights
+    enough = ((present & ~structure).sum(1) >= 3) & (absent.sum(1) > 0)
+    intruders = torch.full((len(scenes),), -1, dtype=torch.int64)
+    for k in enough.nonzero().squeeze(1).tolist():
+        p = absent[k].numpy()
+        rng = scene_rng(scenes.scenes[k], seed)
+        intruders[k] = int(rng.choice(len(p), p=p / p.sum()))
+    return intruders
 
 
 @torch.no_grad()
@@ -68,30 +127,41 @@ def intruder_scores(
     structure: Tensor,
     score: ObjectScore,
     *,
+    weights: Tensor | None = None,
     seed: int = 0,
     block: int = 32,
 ) -> IntruderScores:
-    """Score every object of every scene, clean and with one uniformly drawn intruder."""
-    generator = torch.Generator().manual_seed(seed)
-    kept = (((scenes.v > 0) & ~structure).sum(1) >= 3).nonzero().squeeze(1)
-    parts: list[tuple[Tensor, ...]] = []
-    for start in range(0, len(kept), block):
-        index = kept[start : start + block]
-        clean = scenes.v[index]
-        absent = ((clean == 0) & ~structure).float()
-        added = torch.multinomial(absent, 1, generator=generator)
-        dirty = clean.scatter(1, added, 1.0)
-        for v, is_clean in ((clean, True), (dirty, False)):
-            row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
-            rest = v[row].scatter(1, thing.unsqueeze(1), 0.0)
-            odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
-            bad = (thing == added[row, 0]) & (not is_clean)
-            size = (v > 0).sum(1)[row]
-            flag = torch.full_like(bad, is_clean)
-            parts.append((index[row], odds.double(), bad, size, flag))
+    """Score every object of every scene, clean and with one intruder; see `draw_intruders`."""
+    added = draw_intruders(scenes, structure, weights, seed)
+    kept = (added >= 0).nonzero().squeeze(1)
+    nothing = torch.zeros(0, dtype=torch.int64)
+    parts = [(nothing, nothing.double(), nothing.bool(), nothing, nothing.bool())]
+    for index in kept.split(block):
+        parts += _scored_blocks(scenes.v[index], index, added[index], structure, score)
     placed, log_odds, intruder, sizes, untouched = (
         torch.cat(column).numpy() for column in zip(*parts, strict=True)
     )
     return IntruderScores(
-        placed, log_odds, intruder, sizes, untouched, skipped=len(scenes) - len(kept)
+        placed,
+        log_odds,
+        intruder,
+        sizes,
+        untouched,
+        scenes=len(scenes),
+        skipped=len(scenes) - len(kept),
     )
+
+
+def _scored_blocks(
+    clean: Tensor, index: Tensor, added: Tensor, structure: Tensor, score: ObjectScore
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    if not len(index):
+        return
+    dirty = clean.scatter(1, added.unsqueeze(1), 1.0)
+    for v, is_clean in ((clean, True), (dirty, False)):
+        row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
+        rest = v[row].scatter(1, thing.unsqueeze(1), 0.0)
+        odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
+        bad = (thing == added[row]) & (not is_clean)
+        size = (v > 0).sum(1)[row]
+        yield index[row], odds.double(), bad, size, torch.full_like(bad, is_clean)

@@ -1,25 +1,41 @@
-"""The figures of one machine on one set of scenes, per source and pooled."""
+"""The figures of one contender, per source and pooled, stored so that they can be resumed.
+
+One `SourceReport` is one model, training seed and source. `measure` fills the file of one, task by
+task; what the file holds already is not computed again. Metrics are stored with what they were made
+of, so that reports can be pooled over sources and compared by paired resampling of scenes without
+the models.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine
-from app.scene import CANONICAL
 from training.batches import SceneTensors
-from training.evaluation.intervals import Figure
-from training.evaluation.missing import leave_one_out, machine_score, missing_figures, with_unknown
-from training.evaluation.outliers import intruder_scores
+from training.evaluation.contenders import Contender
+from training.evaluation.intervals import Figure, paired_difference
+from training.evaluation.metrics import metric_from_dict, metric_to_dict, pool
+from training.evaluation.missing import machine_score
 from training.evaluation.relations import machine_score as relation_score
-from training.evaluation.relations import rank_relations, rank_scored, score_scenes
+from training.evaluation.tasks import TASKS, Outcome, Setting
 from training.trainer import subset
 
-_OUTLIER_SCENES = 600
+_PUBLISHED = ("T2 missing", "T1a relations", "T3 outliers, uniform")
+
+Progress = Callable[[str], None]
+
+
+def silent(_: str) -> None:
+    """Progress that nobody hears of."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +48,54 @@ class Row:
     figure: Figure
 
 
+@dataclass
+class SourceReport:
+    """What is known of one contender on one source.
+
+    Attributes:
+        source: its name, or what the pool of several is called.
+        scenes: digest of the scenes that were asked about, the questions' seed and their limit.
+        outcomes: by task; None where the contender does not take part.
+        seconds: by task.
+    """
+
+    source: str
+    scenes: str
+    outcomes: dict[str, Outcome | None] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def rows(self) -> list[Row]:
+        """Every figure with its interval."""
+        return [
+            Row(task, self.source, name, metric.figure())
+            for task, outcome in self.outcomes.items()
+            if outcome is not None
+            for name, metric in outcome.metrics.items()
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; figures are written beside the metrics for whoever reads the file."""
+        return {
+            "source": self.source,
+            "scenes": self.scenes,
+            "tasks": {
+                task: {"seconds": self.seconds.get(task, 0.0), "outcome": _to_dict(outcome)}
+                for task, outcome in self.outcomes.items()
+            },
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> SourceReport:
+        """What `to_dict` wrote."""
+        tasks = values["tasks"].items()
+        return cls(
+            values["source"],
+            values["scenes"],
+            {task: _from_dict(entry["outcome"]) for task, entry in tasks},
+            {task: float(entry["seconds"]) for task, entry in tasks},
+        )
+
+
 def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
     """The scenes of each source."""
     for source in sorted({scene.source for scene in scenes.scenes}):
@@ -39,27 +103,140 @@ def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
         yield source, subset(scenes, torch.tensor(index))
 
 
+def settings_by_source(
+    scenes: SceneTensors,
+    structure: Tensor,
+    train: SceneTensors,
+    seen: Tensor | None,
+    *,
+    limit: int | None = 600,
+    seed: int = 0,
+) -> Iterator[tuple[str, Setting]]:
+    """The settings of each source, with the training scenes of the same one."""
+    training = dict(by_source(train))
+    for source, some in by_source(scenes):
+        yield source, Setting(some, structure, training.get(source), seen, limit, seed)
+
+
+def digest(setting: Setting) -> str:
+    """sha256 of what is asked: scenes, limit and seed."""
+    names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
+    asked = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}"])
+    return sha256(asked.encode()).hexdigest()
+
+
+def run(
+    contender: Contender,
+    setting: Setting,
+    report: SourceReport,
+    *,
+    tasks: Iterable[str] = tuple(TASKS),
+    progress: Progress = silent,
+) -> Iterator[str]:
+    """Fill in the tasks that a report lacks; yields each one's name when it is there.
+
+    Raises:
+        ValueError: an unknown task, or the report is of other scenes or questions.
+    """
+    if report.scenes != digest(setting):
+        raise ValueError(f"the report on {report.source} is of other scenes or questions")
+    wanted = list(tasks)
+    if unknown := sorted(set(wanted) - set(TASKS)):
+        raise ValueError(f"unknown tasks {unknown}, must be of {list(TASKS)}")
+    for task in wanted:
+        if task in report.outcomes:
+            continue
+        progress(f"{report.source}: {task}")
+        began = time.perf_counter()
+        report.outcomes[task] = TASKS[task](contender, setting)
+        report.seconds[task] = time.perf_counter() - began
+        yield task
+
+
+def measure(
+    path: Path,
+    contender: Contender,
+    setting: Setting,
+    source: str,
+    *,
+    tasks: Iterable[str] = tuple(TASKS),
+    progress: Progress = silent,
+) -> SourceReport:
+    """The report in the file at `path`, which is made or gone on with; written after every task.
+
+    Raises:
+        ValueError: see `run`.
+    """
+    report = SourceReport(source, digest(setting))
+    if path.exists():
+        report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    for _ in run(contender, setting, report, tasks=tasks, progress=progress):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_name(path.name + ".part")
+        draft.write_text(json.dumps(report.to_dict(), allow_nan=False), encoding="utf-8")
+        draft.replace(path)
+    return report
+
+
+def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceReport:
+    """One report over the scenes of several sources; the order of the reports is theirs.
+
+    Metrics of whole sets (T4) do not pool: `measure` the union of the scenes for these.
+    """
+    together = sha256("\n".join(report.scenes for report in reports).encode()).hexdigest()
+    joined = SourceReport(source, together)
+    for task in dict.fromkeys(task for report in reports for task in report.outcomes):
+        parts = [outcome for report in reports if (outcome := report.outcomes.get(task))]
+        names = dict.fromkeys(name for part in parts for name in part.metrics)
+        metrics = {
+            name: metric
+            for name in names
+            if (metric := pool([part.metrics[name] for part in parts if name in part.metrics]))
+        }
+        joined.seconds[task] = sum(report.seconds.get(task, 0.0) for report in reports)
+        joined.outcomes[task] = None
+        if metrics:
+            skipped = sum(part.skipped for part in parts)
+            joined.outcomes[task] = Outcome(metrics, sum(part.scenes for part in parts), skipped)
+    return joined
+
+
+def compare(a: SourceReport, b: SourceReport) -> list[Row]:
+    """a minus b in every metric that both have, with paired intervals.
+
+    Raises:
+        ValueError: the reports are of different scenes or questions.
+    """
+    if a.scenes != b.scenes:
+        raise ValueError(f"the two reports on {a.source} and {b.source} are of different questions")
+    rows = []
+    for task, ours in a.outcomes.items():
+        theirs = b.outcomes.get(task)
+        if ours is None or theirs is None:
+            continue
+        for name, metric in ours.metrics.items():
+            if name in theirs.metrics:
+                difference = paired_difference(metric, theirs.metrics[name])
+                rows.append(Row(task, a.source, name, difference))
+    return rows
+
+
 def evaluate(
     machine: BoltzmannMachine,
     scenes: SceneTensors,
     structure: Tensor,
     *,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = silent,
 ) -> list[Row]:
-    """T1a, T2 and T3 of a machine on every source of a set of scenes."""
+    """What is published with a model: T1a, T2 and T3 on every source of a set of scenes."""
+    contender = Contender(objects=machine_score(machine), relations=relation_score(machine))
     rows: list[Row] = []
     for source, some in by_source(scenes):
-        progress(f"{source}: missing objects")
-        rows += missing_rows(machine, some, structure, source)
-        related = [k for k, scene in enumerate(some.scenes) if scene.evidence.holds.any()]
-        if related:
-            progress(f"{source}: relations")
-            rows += relation_rows(machine, subset(some, torch.tensor(related)), structure, source)
-        progress(f"{source}: outliers")
-        sample = subset(some, torch.arange(min(len(some), _OUTLIER_SCENES)))
-        scores = intruder_scores(sample, structure, machine_score(machine))
-        rows.append(Row("T3 outliers, uniform", source, "hit@1", scores.hit_at_1()))
-        rows.append(Row("T3 outliers, uniform", source, "AUROC", scores.auroc()))
+        setting = Setting(some, structure)
+        report = SourceReport(source, digest(setting))
+        for _ in run(contender, setting, report, tasks=_PUBLISHED, progress=progress):
+            pass
+        rows += report.rows()
     return rows
 
 
@@ -67,33 +244,35 @@ def missing_rows(
     machine: BoltzmannMachine, scenes: SceneTensors, structure: Tensor, source: str
 ) -> list[Row]:
     """T2 on one source."""
-    result = leave_one_out(scenes, structure, machine_score(machine))
-    names = {"mrr": "MRR", "top1": "top-1", "top5": "top-5", "top10": "top-10"}
-    rows = [
-        Row("T2 missing", source, names[metric], figure)
-        for metric, figure in missing_figures(result).items()
-    ]
-    unknown = np.array([scene.unknown for scene in scenes.scenes], dtype=np.int64)
-    every = with_unknown(result, unknown)
-    return [*rows, Row("T2 missing", source, "MRR, unknown labels score 0", every)]
+    setting = Setting(scenes, structure)
+    report = SourceReport(source, digest(setting))
+    contender = Contender(objects=machine_score(machine))
+    for _ in run(contender, setting, report, tasks=("T2 missing",)):
+        pass
+    return report.rows()
 
 
-def relation_rows(
-    machine: BoltzmannMachine, scenes: SceneTensors, structure: Tensor, source: str
-) -> list[Row]:
-    """T1a on one source, with and without instance counts, and per relation."""
-    task = "T1a relations"
-    rows: list[Row] = []
-    scored = score_scenes(scenes, relation_score(machine))
-    ranking = rank_scored(scored, structure, len(scenes))
-    if not len(ranking.annotated):
-        return rows
-    plain = rank_relations(scenes, structure, relation_score(machine, counts=False))
-    rows.append(Row(task, source, "R-precision, distinct classes", plain.pooled()))
-    rows.append(Row(task, source, "R-precision, instance counts", ranking.pooled()))
-    rows.append(Row(task, source, "R-precision, mean over scenes", ranking.per_scene()))
-    for a, name in enumerate(CANONICAL):
-        ranking = rank_scored(scored, structure, len(scenes), relation=a)
-        if len(ranking.annotated):
-            rows.append(Row(task, source, f"R-precision, {name}", ranking.pooled()))
-    return rows
+def _to_dict(outcome: Outcome | None) -> dict[str, Any] | None:
+    if outcome is None:
+        return None
+    return {
+        "scenes": outcome.scenes,
+        "skipped": outcome.skipped,
+        "notes": outcome.notes,
+        "metrics": {
+            name: {"figure": asdict(metric.figure()), "made_of": metric_to_dict(metric)}
+            for name, metric in outcome.metrics.items()
+        },
+    }
+
+
+def _from_dict(values: dict[str, Any] | None) -> Outcome | None:
+    if values is None:
+        return None
+    metrics = values["metrics"].items()
+    return Outcome(
+        {name: metric_from_dict(entry["made_of"]) for name, entry in metrics},
+        values["scenes"],
+        values["skipped"],
+        values["notes"],
+    )

@@ -1,0 +1,201 @@
+"""What every baseline of the registry promises, on scenes whose structure is known."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+import torch
+
+from tests.training.baselines.furnished import (
+    BEDROOM,
+    FLOOR,
+    KITCHEN,
+    LEFT,
+    STRUCTURE,
+    V,
+    furnished,
+    scene,
+    tensors,
+)
+from training.baselines import COMPLETIONS, OBJECTS, PLACED, RELATIONS, Baseline, placed_product
+from training.batches import Batch
+from training.evaluation.completion import complete_scenes
+from training.evaluation.placed import removed_places
+from training.evaluation.relations import rank, telling
+
+EVERY = (*OBJECTS, *RELATIONS, *COMPLETIONS, *PLACED)
+
+
+def named(baselines):
+    return pytest.mark.parametrize("baseline", baselines, ids=lambda baseline: baseline.name)
+
+
+@cache
+def fitted(baseline: Baseline):
+    """One fit of each, shared by the tests."""
+    return baseline.fit(furnished(300, seed=1), furnished(60, seed=2), STRUCTURE, seed=0)
+
+
+@named(EVERY)
+def test_every_trial_is_recorded(baseline):
+    result = fitted(baseline)
+    assert result.name == baseline.name
+    assert result.best.validation == max(trial.validation for trial in result.trials)
+    assert len({str(trial.parameters) for trial in result.trials}) == len(result.trials)
+    assert all(trial.seconds > 0 for trial in result.trials)
+    assert result.seconds == pytest.approx(sum(trial.seconds for trial in result.trials))
+
+
+@named(EVERY)
+def test_the_chosen_score_is_that_of_the_best_trial(baseline, validation):
+    result = fitted(baseline)
+    again = baseline.judge(validation, STRUCTURE, result.score)
+    assert again == pytest.approx(result.best.validation)
+
+
+@named(OBJECTS[1:])
+def test_objects_beat_popularity(baseline):
+    """Popularity cannot tell a kitchen from a bedroom: of 8 classes alike it finds 1 in 4 or so."""
+    assert fitted(baseline).best.validation > fitted(OBJECTS[0]).best.validation + 0.1
+
+
+@named(OBJECTS)
+def test_objects_belong_to_their_room(baseline):
+    """Of a kitchen's last class and a bedroom's, popular alike, the kitchen's is missed in it."""
+    v = torch.zeros(1, V)
+    v[0, [*KITCHEN[:3], FLOOR]] = 1.0
+    score = fitted(baseline).score(v)[0]
+    if baseline is OBJECTS[0]:
+        assert (score[KITCHEN[3]] - score[BEDROOM[3]]).abs() < 0.5
+    else:
+        assert score[KITCHEN[3]] > score[BEDROOM[3]]
+
+
+@named(OBJECTS)
+def test_object_scores_are_numbers_and_scenes_do_not_mix(baseline, validation):
+    score = fitted(baseline).score
+    values = score(validation.v[:20])
+    assert values.shape == (20, V)
+    candidates = (validation.v[:20] == 0) & ~STRUCTURE
+    assert torch.isfinite(values[candidates]).all()
+    alone = torch.cat([score(row.unsqueeze(0)) for row in validation.v[:20]])
+    torch.testing.assert_close(alone[candidates], values[candidates], rtol=1e-4, atol=1e-4)
+
+
+@named(OBJECTS)
+def test_an_empty_scene_has_a_score(baseline):
+    values = fitted(baseline).score(torch.zeros(2, V))
+    assert torch.isfinite(values[:, ~STRUCTURE]).all()
+
+
+@named([b for b in EVERY if b.name in ("masked transformer", "denoising autoencoder", "ComplEx")])
+def test_the_same_seed_gives_the_same_fit(baseline, train, validation):
+    torch.manual_seed(123)
+    state = torch.get_rng_state()
+    again = baseline.fit(train, validation, STRUCTURE, seed=0)
+    assert torch.equal(torch.get_rng_state(), state), "the global generator was disturbed"
+    figures = [trial.validation for trial in fitted(baseline).trials]
+    assert [trial.validation for trial in again.trials] == figures
+
+
+@named([b for b in OBJECTS if "RBM" in b.name])
+def test_the_rbm_repeats_itself_too(baseline, train, validation):
+    again = baseline.fit(train, validation, STRUCTURE, seed=0)
+    assert torch.equal(again.score(validation.v), fitted(baseline).score(validation.v))
+
+
+@named(RELATIONS[1:])
+def test_relations_beat_popularity(baseline):
+    assert fitted(baseline).best.validation > fitted(RELATIONS[0]).best.validation + 0.2
+
+
+@named(RELATIONS)
+def test_relations_are_judged_without_looking_at_them(baseline, validation):
+    """The truth in a batch changes nothing."""
+    batch = validation.batch(torch.arange(10))
+    blank = telling(batch, torch.zeros_like(batch.observed))
+    score = fitted(baseline).score
+    assert score(batch).shape == batch.holds.shape
+    assert torch.equal(score(batch), score(blank))
+
+
+def test_closure_completes_what_the_table_cannot():
+    """Where left is drawn at random, only what is given tells how the chain goes on."""
+    generator = torch.Generator().manual_seed(0)
+
+    def shuffled(count):
+        scenes = []
+        for k in range(count):
+            row = torch.randperm(6, generator=generator).tolist()
+            chain = [(LEFT, i, j) for place, i in enumerate(row) for j in row[place + 1 :]]
+            scenes.append(scene(range(6), chain, name=str(k)))
+        return tensors(scenes)
+
+    train, held_out = shuffled(100), shuffled(100)
+    table, closure = (b.fit(train, held_out, STRUCTURE) for b in COMPLETIONS)
+    # Half of the ordered pairs hold, so the table is right by chance alone.
+    assert table.best.validation < 0.7
+    assert closure.best.validation > table.best.validation + 0.1
+    assert closure.best.parameters["bonus"] > 0
+
+
+@named(PLACED)
+def test_a_place_tells_what_is_missing(baseline, validation):
+    """On the second class lies the first of its room, whatever else is there."""
+    result = fitted(baseline)
+    assert result.best.validation > 0.8
+    _, _, places = removed_places(validation, STRUCTURE)
+    assert result.score(places).shape == (len(places.v), V)
+
+
+def test_the_product_is_at_least_as_good_as_its_factors(train, validation):
+    objects, table = fitted(OBJECTS[3]), fitted(PLACED[0])
+    product = placed_product(objects, table.score)
+    assert objects.name in product.name
+    result = product.fit(train, validation, STRUCTURE)
+    assert result.best.validation >= table.best.validation - 0.02
+
+
+@named(EVERY)
+def test_nothing_to_learn_from_is_an_error(baseline, validation):
+    empty = tensors([scene([], annotated=False)])
+    with pytest.raises(ValueError, match="no objects in 1 training scenes"):
+        baseline.fit(empty, validation, STRUCTURE)
+
+
+@named((*RELATIONS, *COMPLETIONS, *PLACED))
+def test_no_relation_to_learn_from_is_an_error(baseline, validation):
+    bare = tensors([scene([0, 1], annotated=False)])
+    with pytest.raises(ValueError, match="no relation was observed in 1 training scenes"):
+        baseline.fit(bare, validation, STRUCTURE)
+
+
+@named(EVERY)
+def test_nothing_to_choose_by_is_an_error(baseline, train):
+    with pytest.raises(ValueError, match="no scene"):
+        baseline.fit(train, tensors([scene([0])]), STRUCTURE)
+
+
+def test_disagreeing_shapes_are_an_error(train, validation):
+    with pytest.raises(ValueError, match=r"training scenes have 11 classes.*shape \(3,\)"):
+        OBJECTS[0].fit(train, validation, torch.zeros(3, dtype=torch.bool))
+
+
+def test_a_score_that_is_no_number_is_an_error(train, validation):
+    broken = Baseline("broken", lambda *_: iter([({}, None)]), lambda *_: float("nan"))
+    with pytest.raises(FloatingPointError, match="broken"):
+        broken.fit(train, validation, STRUCTURE)
+
+
+def test_completions_get_the_given_half_only(validation):
+    """What is hidden is neither told nor observed."""
+    told = []
+
+    def spy(batch: Batch):
+        told.append(batch)
+        return torch.zeros(batch.holds.shape)
+
+    found = complete_scenes(validation, STRUCTURE, spy)
+    assert rank(found, len(validation)).annotated.sum() > 0
+    assert all(torch.equal(batch.holds > 0, batch.observed) for batch in told)

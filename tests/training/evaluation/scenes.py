@@ -1,0 +1,121 @@
+"""Tiny scenes for the evaluation's tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import count
+
+import numpy as np
+import torch
+
+from app.scene import pool_instances
+from training.batches import SceneTensors, scene_tensors
+from training.datasets import EncodedScene
+
+V = 5
+NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
+# Enough classes for many scenes that differ in them.
+WIDE = 12
+WIDE_STRUCTURE = torch.zeros(WIDE, dtype=torch.bool)
+
+_names = count()
+
+
+def scene(
+    classes: Sequence[int],
+    triples: Sequence[tuple[int, int, int]] = (),
+    *,
+    source: str = "toy",
+    unknown: int = 0,
+    room: int = -1,
+    group: str = "g",
+    name: str | None = None,
+    relations: int = 4,
+) -> EncodedScene:
+    """One instance of each entry of `classes`; triples (a, i, j) name classes, first instances."""
+    n = len(classes)
+    holds = np.zeros((4, n, n), dtype=np.bool_)
+    for a, i, j in triples:
+        holds[a, classes.index(i), classes.index(j)] = True
+    labels = np.array(classes, dtype=np.int64)
+    observed = np.broadcast_to(~np.eye(n, dtype=np.bool_), holds.shape).copy()
+    evidence = pool_instances(labels, np.ones(n), holds, observed)
+    cut = {"holds": evidence.holds[:relations], "observed": evidence.observed[:relations]}
+    return EncodedScene(
+        scene_id=name or f"scene {next(_names)}",
+        source=source,
+        group=group,
+        room_type=room,
+        evidence=type(evidence)(
+            evidence.classes, evidence.counts, evidence.confidence, **cut, room_type=None
+        ),
+        instance_classes=labels,
+        instance_holds=holds,
+        instance_observed=observed,
+        unknown=unknown,
+    )
+
+
+def toy(*args: object, **options: object) -> EncodedScene:
+    """A scene of two relations, for the toy machines."""
+    return scene(*args, relations=2, **options)
+
+
+def tensors(scenes: Sequence[EncodedScene], classes: int = V) -> SceneTensors:
+    sources = {entry.source for entry in scenes}
+    annotated = {source: np.ones(classes, dtype=np.bool_) for source in sources}
+    return scene_tensors(scenes, annotated, classes)
+
+
+def random_scenes(
+    number: int, classes: int = WIDE, relations: int = 4, seed: int = 0
+) -> list[EncodedScene]:
+    """Scenes of three to five classes with random triples; no two have the same classes."""
+    rng = np.random.default_rng(seed)
+    every: dict[tuple[int, ...], EncodedScene] = {}
+    while len(every) < number:
+        k = len(every)
+        chosen = sorted(rng.choice(classes, rng.integers(3, 6), replace=False).tolist())
+        triples = [
+            (a, *((i, j) if rng.random() < 0.5 else (j, i)))
+            for a in range(relations)
+            for i in chosen
+            for j in chosen
+            if i < j and rng.random() < 0.4
+        ]
+        every[tuple(chosen)] = scene(
+            chosen,
+            triples,
+            room=int(rng.integers(2)),
+            group=f"group {seed} {k}",
+            name=f"random {seed} {k}",
+            relations=relations,
+        )
+    return list(every.values())
+
+
+def knowing(scenes: SceneTensors):
+    """A relation score that knows which triples of the scenes hold, by their classes."""
+    truth = {}
+    for entry in scenes.scenes:
+        evidence = entry.evidence
+        triples = {
+            (int(a), int(evidence.classes[x]), int(evidence.classes[y]))
+            for a, x, y in np.argwhere(evidence.holds)
+        }
+        truth[tuple(evidence.classes.tolist())] = triples
+
+    def score(batch):
+        values = torch.zeros(batch.holds.shape)
+        for row in range(len(batch)):
+            classes = [int(c) for c in batch.classes[row] if c >= 0]
+            for a, i, j in truth[tuple(classes)]:
+                values[row, a, classes.index(i), classes.index(j)] = 1.0
+        return values
+
+    return score
+
+
+def flat(batch):
+    """A relation score that knows nothing."""
+    return torch.zeros(batch.holds.shape)

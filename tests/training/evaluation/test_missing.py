@@ -1,0 +1,89 @@
+"""T2 by hand, and that nothing of the removed object can leak."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors, toy
+from tests.training.test_objectives import toy_machine
+from training.evaluation.missing import leave_one_out, machine_score, missing_metrics
+
+
+def test_reciprocal_ranks_by_hand():
+    """Scores fixed as 5, 4, 3, 2, 1: removing 2 from {0, 2} leaves 1 above it, and so on."""
+    fixed = torch.tensor([5.0, 4, 3, 2, 1])
+    result = leave_one_out(tensors([scene([0, 2])]), NO_STRUCTURE, lambda v: fixed.expand_as(v))
+    assert dict(zip(result.target.tolist(), result.above.tolist(), strict=True)) == {0: 0, 2: 1}
+    metrics = missing_metrics(result)
+    assert metrics["MRR"].value == pytest.approx((1 + 1 / 2) / 2)
+    assert metrics["top-1"].value == pytest.approx(0.5)
+    assert metrics["MRR"].n == 2
+
+
+def test_macro_counts_every_class_alike():
+    """Class 0 is found in three scenes, class 2 comes second in all, class 4 last of two."""
+    fixed = torch.tensor([5.0, 4, 3, 2, 1])
+    data = tensors([scene([0, 2]), scene([0, 2]), scene([0, 2, 4])])
+    result = leave_one_out(data, NO_STRUCTURE, lambda v: fixed.expand_as(v))
+    metrics = missing_metrics(result)
+    assert metrics["MRR"].value == pytest.approx((3 * 1 + 3 / 2 + 1 / 3) / 7)
+    assert metrics["MRR, macro by class"].value == pytest.approx((1 + 1 / 2 + 1 / 3) / 3)
+
+
+def test_ties_score_their_expectation_under_random_order():
+    """All equal, 4 candidates: the rank is uniform on 1..4."""
+    flat = lambda v: torch.zeros_like(v)  # noqa: E731
+    result = leave_one_out(tensors([scene([0, 2])]), NO_STRUCTURE, flat)
+    expected = (1 + 1 / 2 + 1 / 3 + 1 / 4) / 4
+    assert result.reciprocal_rank() == pytest.approx([expected] * 2)
+    assert result.top(1) == pytest.approx([1 / 4] * 2)
+    assert result.top(5) == pytest.approx([1.0] * 2)
+
+
+def test_structure_is_neither_removed_nor_a_candidate():
+    structure = NO_STRUCTURE.clone()
+    structure[1] = True
+    flat = lambda v: torch.tensor([0.0, 9, 0, 0, 0]).expand_as(v)  # noqa: E731
+    result = leave_one_out(tensors([scene([0, 1, 2])]), structure, flat)
+    assert sorted(result.target.tolist()) == [0, 2]
+    assert result.above.tolist() == [0, 0]
+
+
+def test_small_scenes_are_skipped_and_counted():
+    result = leave_one_out(tensors([scene([0]), scene([0, 1])]), NO_STRUCTURE, lambda v: v)
+    assert result.skipped == 1
+    assert result.scenes == 2
+
+
+def test_the_removed_object_cannot_leak():
+    """What is scored never sees the target: the score of a scene with it equals that without."""
+    seen = []
+
+    def spy(v):
+        seen.append(v.clone())
+        return torch.zeros_like(v)
+
+    leave_one_out(tensors([scene([0, 1, 2], [(0, 0, 1)])]), NO_STRUCTURE, spy)
+    assert torch.cat(seen).tolist() == [[0, 1, 1, 0, 0], [1, 0, 1, 0, 0], [1, 1, 0, 0, 0]]
+
+
+def test_unknown_labels_score_zero():
+    result = leave_one_out(
+        tensors([scene([0, 2], unknown=2)]), NO_STRUCTURE, lambda v: torch.zeros_like(v)
+    )
+    known = missing_metrics(result)["MRR"].value
+    assert result.with_unknown(np.array([2])).value == pytest.approx(known / 2)
+
+
+def test_a_score_that_is_no_number_is_an_error():
+    with pytest.raises(ValueError, match="not a number"):
+        leave_one_out(tensors([scene([0, 2])]), NO_STRUCTURE, lambda v: v * float("nan"))
+
+
+@pytest.mark.parametrize("name", ["rbm", "gbm", "triway-seed", "triway-local"])
+def test_every_machine_can_be_evaluated(name):
+    data = tensors([toy([0, 1, 2], [(0, 1, 2)]), toy([0, 3, 4], [(1, 3, 4)])])
+    result = leave_one_out(data, NO_STRUCTURE, machine_score(toy_machine(name)))
+    assert np.isfinite(result.log_probability).all()

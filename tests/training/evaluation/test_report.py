@@ -1,0 +1,166 @@
+"""Every task for one contender, stored, resumed, pooled and compared."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.reasoning.artifacts import LARGER, artifact_of
+from tests.training.evaluation.scenes import flat, random_scenes, scene, tensors
+from tests.training.evaluation.test_completion import larger_machine
+from training.batches import seen_triples
+from training.evaluation.cases import some_scenes
+from training.evaluation.contenders import Contender, artifact_contender
+from training.evaluation.density import DensitySettings
+from training.evaluation.report import (
+    SourceReport,
+    compare,
+    digest,
+    evaluate,
+    measure,
+    pooled,
+    run,
+    settings_by_source,
+)
+from training.evaluation.tasks import TASKS, Setting, reference_contenders
+
+V = LARGER["triway-local"].V
+NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
+TRAIN = tensors(random_scenes(30, V, seed=1), V)
+DATA = tensors(random_scenes(40, V), V)
+SEEN = seen_triples(TRAIN.scenes, V)
+SETTING = Setting(DATA, NO_STRUCTURE, TRAIN, SEEN)
+EFFORT = DensitySettings(chains=8, temperatures=10, burn_in=5, draws=8)
+CONTENDER = artifact_contender(artifact_of(larger_machine("triway-local")), TRAIN, EFFORT)
+
+
+def flat_objects(v):
+    return torch.zeros_like(v)
+
+
+def values_of(report):
+    return {
+        (task, name): metric.value
+        for task, outcome in report.outcomes.items()
+        if outcome is not None
+        for name, metric in outcome.metrics.items()
+    }
+
+
+def test_every_task_has_an_outcome():
+    report = SourceReport("toy", digest(SETTING))
+    assert list(run(CONTENDER, SETTING, report)) == list(TASKS)
+    assert all(outcome is not None for outcome in report.outcomes.values())
+    assert all(np.isfinite(list(values_of(report).values())))
+    assert "R-precision, zero-shot" in report.outcomes["T1a relations"].metrics
+    assert "alarms in untouched scenes" in report.outcomes["T3 outliers, uniform"].metrics
+
+
+def test_reports_are_stored_and_resumed(tmp_path):
+    path = tmp_path / "model" / "seed-0" / "toy.json"
+    some = ("T2 missing", "T3b placement")
+    first = measure(path, CONTENDER, SETTING, "toy", tasks=some)
+    assert tuple(first.outcomes) == some
+    asked = []
+    every = (*some, "T4 generate", "T3 outliers, uniform")
+    whole = measure(path, CONTENDER, SETTING, "toy", tasks=every, progress=asked.append)
+    assert asked == ["toy: T4 generate", "toy: T3 outliers, uniform"]
+    # A finished file needs no contender.
+    again = measure(path, Contender(), SETTING, "toy", tasks=every)
+    assert values_of(again) == pytest.approx(values_of(whole))
+    assert again.outcomes["T4 generate"].notes == whole.outcomes["T4 generate"].notes
+    assert not list(path.parent.glob("*.part"))
+    written = json.loads(path.read_text())["tasks"]["T2 missing"]["outcome"]["metrics"]["MRR"]
+    (row,) = (r for r in whole.rows() if (r.task, r.metric) == ("T2 missing", "MRR"))
+    assert written["figure"] == asdict(row.figure)
+
+
+def test_a_report_goes_on_with_the_same_questions_alone(tmp_path):
+    path = tmp_path / "toy.json"
+    measure(path, CONTENDER, SETTING, "toy", tasks=("T2 missing",))
+    for other in (replace(SETTING, seed=1), replace(SETTING, limit=3)):
+        with pytest.raises(ValueError, match="other scenes or questions"):
+            measure(path, CONTENDER, other, "toy")
+    with pytest.raises(ValueError, match="unknown tasks"):
+        measure(path, CONTENDER, SETTING, "toy", tasks=("T9",))
+
+
+def test_who_takes_no_part_is_none():
+    report = SourceReport("toy", digest(SETTING))
+    for _ in run(Contender(), SETTING, report):
+        pass
+    assert set(report.outcomes.values()) == {None}
+    assert report.rows() == []
+    bare = Setting(tensors([scene([0])], V), NO_STRUCTURE, TRAIN, SEEN)
+    report = SourceReport("toy", digest(bare))
+    for _ in run(replace(CONTENDER, density=None), bare, report):
+        pass
+    assert set(report.outcomes.values()) == {None}
+
+
+def test_pooled_sources_are_their_union():
+    scenes = [replace(s, source="ab"[k % 2]) for k, s in enumerate(DATA.scenes)]
+    union = tensors(sorted(scenes, key=lambda s: s.source), V)
+    train = tensors([replace(s, source="ab"[k % 2]) for k, s in enumerate(TRAIN.scenes)], V)
+    reports = []
+    for source, setting in settings_by_source(union, NO_STRUCTURE, train, SEEN):
+        report = SourceReport(source, digest(setting))
+        for _ in run(CONTENDER, setting, report, tasks=("T1a relations", "T3 outliers, uniform")):
+            pass
+        reports.append(report)
+    together = pooled(reports)
+    setting = Setting(union, NO_STRUCTURE, train, SEEN)
+    whole = SourceReport("all", digest(setting))
+    for _ in run(CONTENDER, setting, whole, tasks=("T1a relations", "T3 outliers, uniform")):
+        pass
+    assert values_of(together) == pytest.approx(values_of(whole))
+
+
+def test_two_contenders_are_compared_scene_by_scene():
+    ignorant = Contender(objects=flat_objects, relations=flat)
+    reports = []
+    for contender in (CONTENDER, ignorant):
+        report = SourceReport("toy", digest(SETTING))
+        for _ in run(contender, SETTING, report, tasks=("T1a relations", "T2 missing")):
+            pass
+        reports.append(report)
+    rows = {(row.task, row.metric): row.figure for row in compare(*reports)}
+    values = [report.outcomes["T2 missing"].metrics["MRR"].value for report in reports]
+    assert rows["T2 missing", "MRR"].value == pytest.approx(values[0] - values[1])
+    same = compare(reports[0], reports[0])
+    assert all(row.figure.low == row.figure.high == 0 for row in same)
+    with pytest.raises(ValueError, match="different questions"):
+        compare(reports[0], replace(reports[1], scenes="others"))
+
+
+def test_references_stand_on_either_side():
+    """Independent classes gain nothing over themselves; the floor is the other half as it is."""
+    values = {}
+    for name, contender in reference_contenders(SETTING).items():
+        report = SourceReport("toy", digest(SETTING))
+        for _ in run(contender, SETTING, report, tasks=("T4 generate", "Density")):
+            pass
+        values[name] = {metric: value for (_, metric), value in values_of(report).items()}
+    gain = values["independent classes"]["gain over independent classes, upper log Z"]
+    assert gain == pytest.approx(0.0)
+    floor = values["held-out scenes (floor)"]
+    sizes = SETTING.halves()[1].v.sum(1).mean()
+    assert floor["classes per scene, free"] == pytest.approx(float(sizes))
+
+
+def test_publishing_measures_the_published_tasks_on_every_source():
+    rows = evaluate(larger_machine("triway-local"), DATA, NO_STRUCTURE)
+    assert {row.task for row in rows} == {"T1a relations", "T2 missing", "T3 outliers, uniform"}
+    assert {row.source for row in rows} == {"toy"}
+
+
+def test_some_scenes_are_the_same_for_everybody():
+    some = some_scenes(DATA, 7)
+    assert [s.scene_id for s in some.scenes] == [s.scene_id for s in some_scenes(DATA, 7).scenes]
+    assert len(some) == 7
+    assert some_scenes(DATA, None) is DATA
+    assert some_scenes(DATA, 100) is DATA

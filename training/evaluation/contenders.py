@@ -1,0 +1,133 @@
+"""What is evaluated: a machine or a baseline, as one callable for each task that it can answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.boltzmann import BoltzmannMachine
+from app.registry import Artifact, Calibration
+from training.batches import SceneTensors
+from training.evaluation import missing, placed, relations
+from training.evaluation.completion import given_score
+from training.evaluation.density import DensitySettings, ObjectDensity, machine_density
+from training.evaluation.generation import Sampler
+from training.evaluation.missing import ObjectScore
+from training.evaluation.outliers import IntruderScores
+from training.evaluation.placed import PlacedScore
+from training.evaluation.relations import RelationScore
+from training.evaluation.sampling import machine_sampler
+
+
+@dataclass(frozen=True, eq=False)
+class Alarm:
+    """When a scene is called wrong.
+
+    Attributes:
+        suspicion: scores (N,) of each judged object, higher = more an intruder.
+        threshold: from which an object raises the alarm.
+    """
+
+    suspicion: Callable[[IntruderScores], NDArray[np.float64]]
+    threshold: float
+
+
+def calibrated_alarm(calibration: Calibration) -> Alarm:
+    """The service's own: its probability of an intruder, and its default threshold."""
+    entry = calibration.outlier
+
+    def suspicion(scores: IntruderScores) -> NDArray[np.float64]:
+        size = entry.log_count * np.log(scores.size)
+        logits = entry.intercept + entry.slope * scores.log_odds + size
+        return np.asarray(1 / (1 + np.exp(-logits)))
+
+    return Alarm(suspicion, calibration.outlier_threshold)
+
+
+def fitted_alarm(validation: IntruderScores, share: float = 0.05) -> Alarm:
+    """An alarm in `share` of the untouched validation scenes, by log-odds alone."""
+    worst = np.full(validation.scenes, -np.inf)
+    clean = validation.clean
+    np.maximum.at(worst, validation.scene[clean], -validation.log_odds[clean])
+    threshold = float(np.quantile(worst[np.isfinite(worst)], 1 - share, method="higher"))
+    return Alarm(lambda scores: -scores.log_odds, threshold)
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """One row of the tables; None where it does not take part.
+
+    Attributes:
+        objects: T2 and T3.
+        relations: T1a.
+        completion: T1b; gets the given triples as the batch's relations.
+        placed: T2-at.
+        placement: T3b; gets the triples, a false one among them, as the batch's relations.
+        sampler: T4.
+        density: Density; called once, when it is needed.
+        alarm: T3, the share of untouched scenes that raise one.
+        artifact: Calibration.
+    """
+
+    objects: ObjectScore | None = None
+    relations: RelationScore | None = None
+    completion: RelationScore | None = None
+    placed: PlacedScore | None = None
+    placement: RelationScore | None = None
+    sampler: Sampler | None = None
+    density: Callable[[], ObjectDensity] | None = None
+    alarm: Alarm | None = None
+    artifact: Artifact | None = None
+
+
+def machine_contender(
+    machine: BoltzmannMachine,
+    train: SceneTensors,
+    settings: DensitySettings = DensitySettings(),  # noqa: B008
+    seed: int = 0,
+) -> Contender:
+    """A machine as it was trained, without a calibration.
+
+    Args:
+        train: training scenes, for the density's annealing.
+    """
+    given = given_score(machine)
+    density = None
+    if machine.spec.form == "local":
+        density = cache(partial(machine_density, machine, train, settings, seed))
+    return Contender(
+        objects=missing.machine_score(machine),
+        relations=relations.machine_score(machine),
+        completion=given,
+        placed=placed.machine_score(machine),
+        placement=given,
+        sampler=machine_sampler(machine),
+        density=density,
+    )
+
+
+def artifact_contender(
+    artifact: Artifact,
+    train: SceneTensors,
+    settings: DensitySettings = DensitySettings(),  # noqa: B008
+    seed: int = 0,
+) -> Contender:
+    """A published model, with its calibration."""
+    machine, calibration = artifact.machine, artifact.calibration
+    weight = calibration.placed_relation_weight * calibration.placed_temperature
+    bare = machine_contender(machine, train, settings, seed)
+    return Contender(
+        objects=bare.objects,
+        relations=bare.relations,
+        completion=bare.completion,
+        placed=placed.machine_score(machine, relation_weight=weight),
+        placement=bare.placement,
+        sampler=bare.sampler,
+        density=bare.density,
+        alarm=calibrated_alarm(calibration),
+        artifact=artifact,
+    )

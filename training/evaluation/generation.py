@@ -1,0 +1,257 @@
+"""T4: drawn scenes against held-out ones.
+
+Only the classes that may be asked for count (no structure; in one source, those it annotates).
+Intervals resample the held-out scenes, with the drawn ones as they are.
+
+    MMD²        squared maximum mean discrepancy, unbiased, kernel exp(-Hamming distance/bandwidth);
+                the bandwidth is the median distance of the held-out scenes unless it is given
+    marginals   sum_i |p_i - q_i| / sum_i q_i over classes, q held out
+    pairs       Pearson r over pairs of classes of cov(v_i, v_j), drawn and held out
+    copies      share of drawn scenes whose set of classes is that of a training scene
+    mirrored    share of related pairs where a(x, y) and a(y, x) are both on; with several instances
+                of a class that can be true, so held-out scenes have some as well
+
+Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+from zlib import crc32
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from training.batches import SceneTensors
+from training.evaluation.intervals import Metric
+from training.evaluation.metrics import Ratio, Resampled
+from training.trainer import subset
+
+Floats = NDArray[np.float64]
+
+_RESAMPLES = 200
+# The bandwidth is taken from so many held-out scenes, and covariances over so many classes.
+_BANDWIDTH_SCENES = 1000
+_COMMON_CLASSES = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """B scenes.
+
+    Attributes:
+        v: (B, V) presence.
+        related: (B,) unordered pairs of different classes × canonical relations with one direction
+            on at least; mirrored: (B,) those with both on. None where relations were not drawn.
+    """
+
+    v: Tensor
+    related: Tensor | None = None
+    mirrored: Tensor | None = None
+
+
+class Sampler(Protocol):
+    """Draws one scene for each row.
+
+    Args:
+        given: (B, V) bool, classes that must be there.
+        room: (B,) int64 room types, -1 where none is given.
+        seed: of the random numbers.
+    """
+
+    def __call__(self, given: Tensor, room: Tensor, seed: int) -> Drawn: ...
+
+
+def mirrored_pairs(holds: Tensor) -> tuple[Tensor, Tensor]:
+    """(related, mirrored) as in `Drawn`, of relations (B, A, n, n)."""
+    on = holds > 0
+    n = on.shape[-1]
+    upper = torch.ones(n, n, dtype=torch.bool).triu(1)
+    both, either = on & on.mT & upper, (on | on.mT) & upper
+    return either.flatten(1).sum(1), both.flatten(1).sum(1)
+
+
+def drawn_of(scenes: SceneTensors, block: int = 64) -> Drawn:
+    """Held-out scenes as if they had been drawn."""
+    parts = [
+        mirrored_pairs(scenes.batch(index).holds)
+        for index in torch.arange(len(scenes)).split(block)
+    ]
+    related, mirrored = (torch.cat(part) for part in zip(*parts, strict=True))
+    return Drawn(scenes.v, related, mirrored)
+
+
+def independent_sampler(train: SceneTensors) -> Sampler:
+    """Classes drawn independently with their frequency in training; no relations."""
+    frequency = train.v.mean(0)
+
+    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
+        generator = torch.Generator().manual_seed(seed)
+        v = torch.rand(given.shape, generator=generator) < frequency
+        return Drawn((v | given).to(train.v.dtype))
+
+    return sample
+
+
+def scene_sampler(scenes: SceneTensors) -> Sampler:
+    """Real scenes as if they had been drawn: the floor.
+
+    Where no class is given, each row gets the scene in its place if the room type fits; otherwise
+    any one that has what is asked for.
+
+    Raises:
+        ValueError: there is none.
+    """
+    real = drawn_of(scenes)
+
+    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
+        rng = np.random.default_rng(seed)
+        free = not bool(given.any())
+        chosen = []
+        for row in range(len(given)):
+            fits = (scenes.v >= given[row].to(scenes.v.dtype)).all(1)
+            if room[row] >= 0:
+                fits &= scenes.room == room[row]
+            places = fits.nonzero().squeeze(1).numpy()
+            if not len(places):
+                raise ValueError(f"no scene has what row {row} asks for")
+            own = free and row in places
+            chosen.append(row if own else int(rng.choice(places)))
+        index = torch.tensor(chosen)
+        if real.related is None or real.mirrored is None:
+            return Drawn(real.v[index])
+        return Drawn(real.v[index], real.related[index], real.mirrored[index])
+
+    return sample
+
+
+def halves(scenes: SceneTensors) -> tuple[SceneTensors, SceneTensors]:
+    """Held-out scenes to compare with, and a second half, the floor; a group stays together."""
+    odd = torch.tensor([crc32(scene.group.encode()) % 2 for scene in scenes.scenes]).bool()
+    first, second = (~odd).nonzero().squeeze(1), odd.nonzero().squeeze(1)
+    return subset(scenes, first), subset(scenes, second)
+
+
+def hamming(x: Tensor, y: Tensor) -> Tensor:
+    """Distances (N, M) of binary rows (N, V), (M, V)."""
+    return (x.sum(1, keepdim=True) + y.sum(1) - 2 * x @ y.T).clamp(min=0)
+
+
+def median_distance(v: Tensor) -> float:
+    """Median Hamming distance between two scenes, at least 1."""
+    v = v[:_BANDWIDTH_SCENES]
+    row, column = torch.triu_indices(len(v), len(v), 1)
+    return max(1.0, float(hamming(v, v)[row, column].median()))
+
+
+def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[Floats], float]:
+    """MMD² as a function of how often each held-out scene counts.
+
+    Pairs of a scene with itself, or with a copy of itself in a resample, are left out.
+    """
+
+    def kernel(x: Tensor, y: Tensor) -> Floats:
+        return torch.exp(-hamming(x, y) / bandwidth).double().numpy()
+
+    yy, xx = kernel(held_out, held_out), kernel(drawn, drawn)
+    xy = kernel(drawn, held_out).mean(0)
+    n = len(xx)
+    within = float((xx.sum() - np.trace(xx)) / (n * (n - 1)))
+    np.fill_diagonal(yy, 0.0)
+
+    def at(weight: Floats) -> float:
+        pairs = weight.sum() ** 2 - (weight**2).sum()
+        if not pairs > 0:
+            return float("nan")
+        across = weight @ xy / weight.sum()
+        return float(within + weight @ yy @ weight / pairs - 2 * across)
+
+    return at
+
+
+def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
+    """sum |p - q| / sum q as a function of the held-out scenes' weights."""
+    p = drawn.mean(0)
+
+    def at(weight: Floats) -> float:
+        q = weight @ held_out
+        if not q.sum() > 0:
+            return float("nan")
+        return float(np.abs(p - q / weight.sum()).sum() / q.sum() * weight.sum())
+
+    return at
+
+
+def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
+    """Pearson r of the covariances of all pairs among the commonest classes held out."""
+    common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
+    common = common[held_out[:, common].any(0)]
+    x, y = drawn[:, common], held_out[:, common]
+    pair = np.triu_indices(len(common), 1)
+
+    def covariance(v: Floats, weight: Floats) -> Floats:
+        total = weight.sum()
+        mean = weight @ v / total
+        return ((v.T * weight) @ v / total - np.outer(mean, mean))[pair]
+
+    ours = covariance(x, np.ones(len(x)))
+
+    def at(weight: Floats) -> float:
+        if not weight.sum() > 0:
+            return float("nan")
+        theirs = covariance(y, weight)
+        if len(ours) < 2 or not ours.std() or not theirs.std():
+            return float("nan")
+        return float(np.corrcoef(ours, theirs)[0, 1])
+
+    return at
+
+
+def copies(drawn: Tensor, train: Tensor) -> Floats:
+    """(B,) 1 where a drawn scene's set of classes is that of a training scene."""
+    known = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
+    rows = np.packbits(drawn.numpy() > 0, axis=1)
+    return np.array([row.tobytes() in known for row in rows], dtype=np.float64)
+
+
+def generation_metrics(
+    drawn: Drawn,
+    held_out: Tensor,
+    train: Tensor,
+    asked: Tensor,
+    bandwidth: float,
+    emphasis: Tensor | None = None,
+) -> dict[str, Metric]:
+    """Every figure of T4.
+
+    Args:
+        drawn: two scenes or more.
+        held_out: (N, V) and train: (T, V) presence.
+        asked: (V,) bool, the classes that count.
+        emphasis: (N,) how much each held-out scene counts; all alike by default.
+    """
+    x, y, known = drawn.v[:, asked], held_out[:, asked], train[:, asked]
+    ours, theirs = x.double().numpy(), y.double().numpy()
+    each = np.ones(len(y)) if emphasis is None else emphasis.double().numpy()
+
+    def resampled(statistic: Callable[[Floats], float]) -> Resampled:
+        return Resampled.of(lambda weight: statistic(weight * each), len(y), len(x), _RESAMPLES)
+
+    metrics: dict[str, Metric] = {
+        "MMD²": resampled(discrepancy(y, x, bandwidth)),
+        "marginal error": resampled(marginal_error(theirs, ours)),
+        "classes per scene": Ratio(ours.sum(1), np.ones(len(ours))),
+        "copies of training scenes": Ratio(copies(x, known), np.ones(len(ours))),
+    }
+    pairs = resampled(pair_correlation(theirs, ours))
+    if np.isfinite(pairs.value):
+        metrics["pair correlation"] = pairs
+    if drawn.related is not None and drawn.mirrored is not None and drawn.related.any():
+        metrics["mirrored relations"] = Ratio(
+            drawn.mirrored.double().numpy(), drawn.related.double().numpy()
+        )
+    return metrics

@@ -1,0 +1,150 @@
+"""Statistics of scored items that do not split into scenes.
+
+Each is prepared once from scores (N,) and truth (N,) and then asked with weights (N,): how often
+each item counts, whole numbers under resampling. Equal scores are taken in random order: a
+statistic is its expectation then. nan where a statistic is undefined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Prepared = Callable[[Floats], float]
+
+BINS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class _Levels:
+    """Items by distinct score, ascending."""
+
+    level: NDArray[np.int64]
+    scores: Floats
+    truth: NDArray[np.bool_]
+
+    def count(self, weight: Floats) -> tuple[Floats, Floats]:
+        """Weight of all items and of the true ones at each level."""
+        size = len(self.scores)
+        every = np.bincount(self.level, weights=weight, minlength=size).astype(np.float64)
+        true = np.bincount(self.level, weights=weight * self.truth, minlength=size)
+        return every, true.astype(np.float64)
+
+
+def _levels(score: Floats, truth: NDArray[np.bool_]) -> _Levels:
+    scores, level = np.unique(score, return_inverse=True)
+    return _Levels(level.astype(np.int64), scores, truth)
+
+
+def auroc(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
+    """Probability that a true item scores above a false one, ties counting half."""
+    levels = _levels(score, truth)
+
+    def at(weight: Floats) -> float:
+        every, true = levels.count(weight)
+        false = every - true
+        below = np.cumsum(false) - false
+        pairs = true.sum() * false.sum()
+        return float((true * (below + false / 2)).sum() / pairs) if pairs else float("nan")
+
+    return at
+
+
+def average_precision(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
+    """Mean precision at the true items.
+
+    Where n items of equal score, p of them true, follow N items with P true ones, the true item at
+    place k of the n sees in expectation P + 1 + (k - 1)(p - 1)/(n - 1) true ones among N + k.
+    """
+    levels = _levels(score, truth)
+
+    def at(weight: Floats) -> float:
+        every, true = (part[::-1] for part in levels.count(weight))
+        some = every > 0
+        n, p = every[some], true[some]
+        if not p.sum():
+            return float("nan")
+        N, P = np.cumsum(n) - n, np.cumsum(p) - p
+        harmonic = np.concatenate([[0.0], np.cumsum(1.0 / np.arange(1, int(n.sum()) + 1))])
+        inverse = harmonic[(N + n).astype(np.int64)] - harmonic[N.astype(np.int64)]
+        more = (p - 1) / np.maximum(n - 1, 1) * (n - (N + 1) * inverse)
+        return float((p / n * ((P + 1) * inverse + more)).sum() / p.sum())
+
+    return at
+
+
+def calibration_error(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
+    """Expected calibration error of probabilities, in `BINS` bins of equal mass.
+
+    The mean over bins of |mean probability - share of true items|.
+    """
+    levels = _levels(score, truth)
+
+    def at(weight: Floats) -> float:
+        every, true = levels.count(weight)
+        if not every.sum():
+            return float("nan")
+        mass, p, y = _bins(levels.scores, every, true)
+        return float(np.abs(p - y) @ mass)
+
+    return at
+
+
+def brier_skill(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
+    """1 - Brier score / Brier score of the base rate: above 0 it says more than the base rate."""
+    levels = _levels(score, truth)
+
+    def at(weight: Floats) -> float:
+        every, true = levels.count(weight)
+        total = every.sum()
+        rate = true.sum() / total if total else 0.0
+        base = rate * (1 - rate)
+        p = levels.scores
+        brier = (true * (1 - p) ** 2 + (every - true) * p**2).sum()
+        return float(1 - brier / total / base) if base > 0 else float("nan")
+
+    return at
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Data of a reliability plot, per bin of equal mass: mean probability, share of true items."""
+
+    probability: Floats
+    frequency: Floats
+    mass: Floats
+
+
+def reliability(score: Floats, truth: NDArray[np.bool_]) -> Reliability:
+    """The bins behind `calibration_error`."""
+    levels = _levels(score, truth)
+    mass, p, y = _bins(levels.scores, *levels.count(np.ones(len(score))))
+    return Reliability(p, y, mass)
+
+
+def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mass, mean score and share of true items of each bin.
+
+    A level that crosses the border of two bins is divided, its true items in proportion.
+    """
+    total = every.sum()
+    edges = np.linspace(0.0, total, BINS + 1)
+    last = np.cumsum(every)
+
+    def upto(values: Floats) -> Floats:
+        return np.interp(edges, np.append(0.0, last), np.append(0.0, np.cumsum(values)))
+
+    mass = np.diff(edges)
+    return mass / total, np.diff(upto(every * scores)) / mass, np.diff(upto(true)) / mass
+
+
+STATISTICS: dict[str, Callable[[Floats, NDArray[np.bool_]], Prepared]] = {
+    "AUROC": auroc,
+    "average precision": average_precision,
+    "ECE": calibration_error,
+    "Brier skill": brier_skill,
+}

@@ -1,0 +1,194 @@
+"""T2-at: one class left out, and one relation of it known with the other end ("on the desk").
+
+Each removable class that stood in a relation to another class is left out in turn with all its
+instances and relations. One of these relations, drawn at random, tells where it was: its direction
+and the class at its other end, never the removed class. All absent classes are ranked. Relations
+between equal classes or with structure are not asked; scenes under two classes are skipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine, Triway
+from app.boltzmann.draws import draw_hidden
+from app.boltzmann.edges import find_triples, pair_edges, triple_keys
+from app.boltzmann.mean_field import Evidence
+from app.reasoning.objects import presence_log_odds
+from app.reasoning.units import NO_UNIT, mean_log_p
+from training.batches import SceneTensors
+from training.evaluation.cases import scene_rng
+from training.evaluation.metrics import Ratio
+from training.evaluation.missing import LeaveOneOut, rank_blocks
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """B scenes with a class left out, and where it stood.
+
+    Attributes:
+        v: (B, V) presence of what stayed.
+        counts: (B, V) instances of what stayed, 0 elsewhere.
+        relation: (B,) int64 canonical.
+        anchor: (B,) int64 class at the other end.
+        outgoing: (B,) bool: the missing class is the subject of the relation.
+    """
+
+    v: Tensor
+    counts: Tensor
+    relation: Tensor
+    anchor: Tensor
+    outgoing: Tensor
+
+    def rows(self, index: Tensor) -> Places:
+        """Some of them."""
+        return Places(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+# Scores (B, V) of every class: the higher, the likelier missing from that place.
+PlacedScore = Callable[[Places], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedRanking:
+    """Every removed class; relation (N,) says by which canonical relation it was asked for."""
+
+    ranking: LeaveOneOut
+    relation: NDArray[np.int64]
+
+    def mrr(self, relation: int | None = None) -> Ratio:
+        """Mean reciprocal rank, of one relation if given."""
+        some = np.ones(len(self.relation), dtype=np.bool_)
+        if relation is not None:
+            some = self.relation == relation
+        value = self.ranking.reciprocal_rank()[some]
+        return Ratio.of_items(self.ranking.scene[some], value, self.ranking.scenes)
+
+
+def removed_places(
+    scenes: SceneTensors, structure: Tensor, seed: int = 0
+) -> tuple[Tensor, Tensor, Places]:
+    """Positions of the scenes (N,), removed classes (N,), and what stayed."""
+    found: list[tuple[int, int, int, int, bool]] = []
+    plain = ~structure.numpy()
+    for k, scene in enumerate(scenes.scenes):
+        evidence = scene.evidence
+        usable = plain[evidence.classes]
+        if usable.sum() < 2:
+            continue
+        pair = usable[:, None] & usable & ~np.eye(len(usable), dtype=np.bool_)
+        triples = np.argwhere(evidence.holds & pair)
+        rng = scene_rng(scene, seed)
+        for x in np.unique(triples[:, 1:]):
+            touching = triples[(triples[:, 1:] == x).any(1)]
+            a, i, j = touching[rng.integers(len(touching))].tolist()
+            anchor = j if i == x else i
+            target, other = evidence.classes[[x, anchor]].tolist()
+            found.append((k, target, a, other, bool(i == x)))
+    table = torch.tensor(found, dtype=torch.int64).reshape(-1, 5)
+    row, target, relation, anchor, outgoing = table.unbind(1)
+    v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
+    counts = torch.zeros_like(v)
+    for place, k in enumerate(row.tolist()):
+        evidence = scenes.scenes[k].evidence
+        counts[place, torch.from_numpy(evidence.classes)] = torch.from_numpy(
+            evidence.counts
+        ).float()
+    return row, target, Places(v, counts * v, relation, anchor, outgoing.bool())
+
+
+@torch.no_grad()
+def leave_one_out_at(
+    scenes: SceneTensors,
+    structure: Tensor,
+    score: PlacedScore,
+    *,
+    seed: int = 0,
+    block: int = 16,
+) -> PlacedRanking:
+    """Rank every removed class among all absent ones, given where it stood."""
+    row, target, places = removed_places(scenes, structure, seed)
+
+    def blocks() -> list[tuple[Tensor, Tensor, Tensor]]:
+        every = []
+        for index in torch.arange(len(row)).split(block):
+            some = places.rows(index)
+            values = score(some).masked_fill((some.v > 0) | structure, -torch.inf)
+            every.append((row[index], target[index], values))
+        return every
+
+    skipped = len(scenes) - len(row.unique())
+    return PlacedRanking(rank_blocks(blocks(), len(scenes), skipped), places.relation.numpy())
+
+
+def machine_score(
+    machine: BoltzmannMachine, *, relation_weight: float = 1.0, draws: int = 64
+) -> PlacedScore:
+    """Log-odds of i, plus log p(the relation | i present): the service's answer, in batches.
+
+    Args:
+        relation_weight: of the second term, in units of the first. The service's is
+            `placed_relation_weight` times `placed_temperature` of its calibration.
+    """
+
+    def score(places: Places) -> Tensor:
+        every = torch.arange(machine.spec.V).unsqueeze(0)
+        edges = None
+        if machine.spec.form == "seed":
+            edges = machine.edges(*_present(places.v, places.counts))
+        evidence = Evidence(places.v, edges)
+        context = draw_hidden(machine, evidence, draws=draws)
+        log_odds = presence_log_odds(machine, evidence, every, context)
+        # Weights of the draws as if each class were there, (M, B, V).
+        gain = context.h1 @ machine.W.T
+        if edges is not None:
+            gain = gain + machine.attraction(places.v, context.h1, edges, every)
+        weight = torch.softmax(context.log_weight.unsqueeze(-1) + gain, dim=0)
+        on, _ = mean_log_p(weight, _logits(machine, places, context.h1))
+        return log_odds + relation_weight * on.clamp(min=NO_UNIT)
+
+    return score
+
+
+def _logits(machine: BoltzmannMachine, places: Places, h1: Tensor) -> Tensor:
+    """ℓ of the named relation between every class and the anchor, each class present, (M, B, V)."""
+    V, A = machine.spec.V, machine.spec.A
+    every, anchor = torch.arange(V).expand(len(places.v), -1), places.anchor.unsqueeze(1)
+    present = torch.ones_like(places.v)
+    if not isinstance(machine, Triway):
+        subject = torch.where(places.outgoing.unsqueeze(1), every, anchor)
+        object_ = torch.where(places.outgoing.unsqueeze(1), anchor, every)
+        keys = triple_keys(places.relation.unsqueeze(1), subject, object_, V)
+        unit, exists = find_triples(machine.triple_keys, keys)
+        if not machine.spec.T:
+            return torch.full((len(h1), *keys.shape), NO_UNIT)
+        edges = machine.edges(torch.zeros(1, 0, dtype=torch.int64))
+        values = machine.relation_logits(edges, present, h1)
+        return torch.where(exists, values.gather(-1, unit.expand(len(h1), -1, -1)), NO_UNIT)
+    logits = h1.new_empty(*h1.shape[:2], V)
+    logs = places.counts.gather(1, anchor).clamp(min=1).log()
+    for outgoing in (True, False):
+        rows = (places.outgoing == outgoing).nonzero().squeeze(1)
+        if not len(rows):
+            continue
+        ours, others, log = every[rows], anchor[rows], logs[rows]
+        if outgoing:
+            pairs = pair_edges(ours, A, objects=others, log_objects=log)
+        else:
+            pairs = pair_edges(others, A, objects=ours, log_subjects=log)
+        grid = pairs.unflatten(machine.relation_logits(pairs, present[rows], h1[:, rows]))
+        grid = grid.squeeze(-1 if outgoing else -2)
+        logits[:, rows] = grid[:, torch.arange(len(rows)), places.relation[rows]]
+    return logits
+
+
+def _present(v: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Classes (B, n), -1 where padded, and their counts."""
+    value, index = v.topk(int(v.sum(1).max()), dim=1)
+    return torch.where(value > 0, index, -1), counts.gather(1, index).long().clamp(min=1)

@@ -1,0 +1,336 @@
+"""The tasks of the evaluation's table: a contender and a set of scenes to metrics.
+
+A task that the contender does not take part in, or for which the scenes hold nothing, is None.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.scene import CANONICAL
+from training.batches import SceneTensors
+from training.evaluation.answers import QUESTIONS, collect, uncalibrated
+from training.evaluation.cases import some_scenes
+from training.evaluation.completion import complete_scenes
+from training.evaluation.contenders import Contender
+from training.evaluation.density import independent_density
+from training.evaluation.generation import (
+    generation_metrics,
+    halves,
+    independent_sampler,
+    median_distance,
+    scene_sampler,
+)
+from training.evaluation.intervals import Metric
+from training.evaluation.metrics import Ratio
+from training.evaluation.missing import leave_one_out, missing_metrics
+from training.evaluation.outliers import by_popularity, by_room, intruder_scores
+from training.evaluation.placed import leave_one_out_at
+from training.evaluation.placement import placement_scores
+from training.evaluation.relations import (
+    Candidates,
+    candidates,
+    of_relation,
+    rank,
+    score_scenes,
+    unseen,
+)
+from training.trainer import subset
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What a contender is asked about.
+
+    Attributes:
+        scenes: held-out scenes.
+        structure: (V,) bool.
+        train: training scenes of the same source or sources; tasks that need them are left out
+            where there are none.
+        seen: (T, 3), the triples that the contender may have learnt from.
+        limit: at most so many scenes where a task is slow: T2-at, T3, T3b, T4, Calibration.
+        seed: of the questions.
+    """
+
+    scenes: SceneTensors
+    structure: Tensor
+    train: SceneTensors | None = None
+    seen: Tensor | None = None
+    limit: int | None = 600
+    seed: int = 0
+
+    def some(self, related: bool = False) -> SceneTensors:
+        """At most `limit` scenes, only annotated ones if `related`."""
+        scenes = self.scenes
+        if related:
+            kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
+            scenes = subset(scenes, torch.tensor(kept, dtype=torch.int64))
+        return some_scenes(scenes, self.limit, self.seed)
+
+    def halves(self) -> tuple[SceneTensors, SceneTensors]:
+        """Scenes to compare drawn ones with, and a second half, each within the limit."""
+        first, second = halves(self.scenes)
+        return (
+            some_scenes(first, self.limit, self.seed),
+            some_scenes(second, self.limit, self.seed),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Metrics of one task.
+
+    Attributes:
+        metrics: name to metric, the primary one first.
+        scenes, skipped: how many were asked about, and how many of them could not be scored.
+        notes: what has to be said beside the figures, such as a bandwidth.
+    """
+
+    metrics: dict[str, Metric]
+    scenes: int
+    skipped: int
+    notes: dict[str, float] = field(default_factory=dict)
+
+
+Task = Callable[[Contender, Setting], Outcome | None]
+
+
+def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T1a; unlisted is counted as wrong."""
+    if contender.relations is None:
+        return None
+    scenes, score = setting.scenes, contender.relations
+    with_counts = candidates(score_scenes(scenes, score), setting.structure)
+    plain = candidates(score_scenes(scenes, score, counts=False), setting.structure)
+    if not any(scene.truth.any() for scene in plain):
+        return None
+    ranking = rank(plain, len(scenes))
+    counted = rank(with_counts, len(scenes))
+    metrics: dict[str, Metric] = {
+        "R-precision, distinct classes": ranking.pooled(),
+        "R-precision, instance counts": counted.pooled(),
+        "R-precision, distinct classes, mean over scenes": ranking.per_scene(),
+        "R-precision, mean over scenes": counted.per_scene(),
+    }
+    metrics |= _by_relation(with_counts, len(scenes))
+    for k in (20, 50, 100):
+        metrics[f"R@{k}"] = rank(with_counts, len(scenes), first=k).per_scene()
+    if setting.seen is not None:
+        new = unseen(with_counts, setting.seen, scenes.v.shape[1])
+        if any(scene.truth.any() for scene in new):
+            metrics["R-precision, zero-shot"] = rank(new, len(scenes)).pooled()
+    return Outcome(metrics, len(scenes), ranking.skipped)
+
+
+def completion_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T1b; beside it the same candidates with nothing given."""
+    if contender.completion is None:
+        return None
+    scenes = setting.scenes
+    given = complete_scenes(scenes, setting.structure, contender.completion, seed=setting.seed)
+    if not any(scene.truth.any() for scene in given):
+        return None
+    ranking = rank(given, len(scenes))
+    metrics: dict[str, Metric] = {
+        "R-precision": ranking.pooled(),
+        "R-precision, mean over scenes": ranking.per_scene(),
+    }
+    metrics |= _by_relation(given, len(scenes))
+    if contender.relations is not None:
+        blind = complete_scenes(scenes, setting.structure, contender.relations, seed=setting.seed)
+        metrics["R-precision, nothing given"] = rank(blind, len(scenes)).pooled()
+    return Outcome(metrics, len(scenes), ranking.skipped)
+
+
+def _by_relation(scored: list[Candidates], scenes: int) -> dict[str, Metric]:
+    metrics: dict[str, Metric] = {}
+    for a, name in enumerate(CANONICAL):
+        some = of_relation(scored, a)
+        if any(scene.truth.any() for scene in some):
+            metrics[f"R-precision, {name}"] = rank(some, scenes).pooled()
+    return metrics
+
+
+def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T2."""
+    if contender.objects is None:
+        return None
+    scenes = setting.scenes
+    result = leave_one_out(scenes, setting.structure, contender.objects)
+    if not len(result.target):
+        return None
+    unknown = np.array([scene.unknown for scene in scenes.scenes], dtype=np.int64)
+    metrics: dict[str, Metric] = dict(missing_metrics(result))
+    metrics["MRR, unknown labels score 0"] = result.with_unknown(unknown)
+    return Outcome(metrics, len(scenes), result.skipped)
+
+
+def placed_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T2-at; beside it the same questions answered without the place."""
+    if contender.placed is None:
+        return None
+    scenes = setting.some(related=True)
+    found = leave_one_out_at(scenes, setting.structure, contender.placed, seed=setting.seed)
+    if not len(found.relation):
+        return None
+    metrics: dict[str, Metric] = {"MRR": found.mrr()}
+    for a, name in enumerate(CANONICAL):
+        if (found.relation == a).any():
+            metrics[f"MRR, {name}"] = found.mrr(a)
+    if contender.objects is not None:
+        objects = contender.objects
+        blind = leave_one_out_at(
+            scenes, setting.structure, lambda places: objects(places.v), seed=setting.seed
+        )
+        metrics["MRR, place unknown"] = blind.mrr()
+    return Outcome(metrics, len(scenes), found.ranking.skipped)
+
+
+def outliers_task(
+    contender: Contender,
+    setting: Setting,
+    *,
+    law: Callable[[SceneTensors, SceneTensors], Tensor] | None = None,
+) -> Outcome | None:
+    """T3, the intruder drawn by weights (N, V), uniformly by default."""
+    if contender.objects is None or (law is not None and setting.train is None):
+        return None
+    scenes = setting.some()
+    weights = law(scenes, setting.train) if law is not None and setting.train is not None else None
+    scores = intruder_scores(
+        scenes, setting.structure, contender.objects, weights=weights, seed=setting.seed
+    )
+    if not len(scores.scene):
+        return None
+    metrics: dict[str, Metric] = {
+        "hit@1": scores.hit_at_1(),
+        "AUROC": scores.auroc(),
+        "average precision": scores.average_precision(),
+    }
+    if contender.alarm is not None:
+        suspicion, threshold = contender.alarm.suspicion(scores), contender.alarm.threshold
+        metrics["alarms in untouched scenes"] = scores.false_alarms(suspicion, threshold)
+        metrics["intruders caught"] = scores.caught(suspicion, threshold)
+    return Outcome(metrics, len(scenes), scores.skipped)
+
+
+def placement_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T3b."""
+    if contender.placement is None:
+        return None
+    scenes = setting.some(related=True)
+    scores = placement_scores(scenes, setting.structure, contender.placement, seed=setting.seed)
+    if not len(scores.scene):
+        return None
+    metrics: dict[str, Metric] = {"hit@1": scores.hit_at_1(), "AUROC": scores.auroc()}
+    return Outcome(metrics, len(scenes), scores.skipped)
+
+
+def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T4: as many scenes as there are in a second half of the held-out ones, against the first.
+
+    Free; given the room types of the second half; and given one class each, drawn from all the
+    classes that scenes of the second half hold. A scene then comes up as often as it has classes:
+    so the first half counts by size there, and a perfect sampler would leave no discrepancy.
+    """
+    if contender.sampler is None or setting.train is None:
+        return None
+    first, second = setting.halves()
+    asked = first.annotated_classes[first.source].any(0) & ~setting.structure
+    mentions = ((second.v > 0) & asked).nonzero()
+    if min(len(first), len(second), len(mentions)) < 2 or not first.v[:, asked].any():
+        return None
+    bandwidth = median_distance(first.v[:, asked])
+    nothing = torch.zeros_like(second.v, dtype=torch.bool)
+    nowhere = torch.full_like(second.room, -1)
+    order = np.random.default_rng(setting.seed).permutation(len(mentions))[: len(second)]
+    classes = mentions[torch.from_numpy(order), 1]
+    one = nothing[: len(classes)].scatter(1, classes.unsqueeze(1), True)
+    size = first.v[:, asked].sum(1)
+    conditions = {
+        "free": (nothing, nowhere, None),
+        "given room types": (nothing, second.room, None),
+        "given one class": (one, nowhere[: len(one)], size),
+    }
+    metrics: dict[str, Metric] = {}
+    for name, (given, room, emphasis) in conditions.items():
+        drawn = contender.sampler(given, room, setting.seed)
+        found = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
+        metrics |= {f"{metric}, {name}": value for metric, value in found.items()}
+    notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
+    return Outcome(metrics, len(first), 0, notes)
+
+
+def reference_contenders(setting: Setting) -> dict[str, Contender]:
+    """What drawn scenes are compared with: independent classes above, real scenes as the floor."""
+    floor = scene_sampler(setting.halves()[1])
+    references = {"held-out scenes (floor)": Contender(sampler=floor)}
+    if setting.train is not None:
+        train = setting.train
+        references["independent classes"] = Contender(
+            sampler=independent_sampler(train), density=lambda: independent_density(train)
+        )
+    return references
+
+
+def density_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Log-likelihood of the objects in nats; claims rest on the upper estimate of log Z."""
+    if contender.density is None or setting.train is None:
+        return None
+    scenes = setting.scenes
+    density = contender.density()
+    annotated = scenes.annotated_classes[scenes.source]
+    log_sum = density.log_unnormalised(scenes.v, annotated).double().numpy()
+    independent = independent_density(setting.train)
+    base = independent.log_unnormalised(scenes.v, annotated).double().numpy()
+    one = np.ones(len(scenes))
+    metrics: dict[str, Metric] = {
+        "log-likelihood, upper log Z": Ratio(log_sum - density.upper, one),
+        "log-likelihood, lower log Z": Ratio(log_sum - density.lower, one),
+        "log-likelihood, independent classes": Ratio(base, one),
+        "gain over independent classes, upper log Z": Ratio(log_sum - density.upper - base, one),
+    }
+    notes = {"log Z, upper": density.upper, "log Z, lower": density.lower} | density.notes
+    return Outcome(metrics, len(scenes), 0, notes)
+
+
+def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Every probability of the service, as published and with log-odds as they are."""
+    if contender.artifact is None:
+        return None
+    scenes, related = setting.some(), setting.some(related=True)
+    metrics: dict[str, Metric] = {}
+    skipped = 0
+    published, plain = contender.artifact, uncalibrated(contender.artifact)
+    for name, ask in QUESTIONS.items():
+        asked = scenes if name in ("missing", "outliers") else related
+        found = collect(published, asked, ask, setting.seed)
+        skipped += found.skipped
+        if len(found.scene):
+            before = collect(plain, asked, ask, setting.seed)
+            metrics[f"ECE, {name}"] = found.ece()
+            metrics[f"ECE, {name}, uncalibrated"] = before.ece()
+            metrics[f"Brier skill, {name}"] = found.brier_skill()
+            metrics[f"Brier skill, {name}, uncalibrated"] = before.brier_skill()
+    return Outcome(metrics, len(scenes), skipped) if metrics else None
+
+
+TASKS: dict[str, Task] = {
+    "T1a relations": relations_task,
+    "T1b completion": completion_task,
+    "T2 missing": missing_task,
+    "T2-at missing at a place": placed_task,
+    "T3 outliers, uniform": outliers_task,
+    "T3 outliers, by popularity": partial(outliers_task, law=by_popularity),
+    "T3 outliers, same room type": partial(outliers_task, law=by_room),
+    "T3b placement": placement_task,
+    "T4 generate": generation_task,
+    "Density": density_task,
+    "Calibration": calibration_task,
+}
