@@ -20,6 +20,7 @@ from torch import Tensor
 from app.registry import RegistryError, Store, load_model_set
 from training.baselines.bernoulli_rbm import fit_bernoulli_rbm
 from training.batches import SceneTensors
+from training.benchmark.command import benchmark
 from training.checkpoints import CheckpointError
 from training.config import Config, ConfigError, load_config, shipped_configs
 from training.datasets import DatasetError
@@ -30,6 +31,7 @@ from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer, subset
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
+app.command()(benchmark)
 console = Console()
 
 Data = Annotated[Path, typer.Option("--data", help="folder with the scene files")]

@@ -1,0 +1,193 @@
+"""Means over training seeds with intervals over scenes, and paired differences to one row."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from training.evaluation.intervals import Figure, Floats, Metric, paired_difference
+from training.evaluation.report import SourceReport
+
+Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
+
+PRIMARY: dict[str, tuple[str, ...]] = {
+    "T1a relations": ("R-precision, distinct classes", "R-precision, instance counts"),
+    "T1b completion": ("R-precision",),
+    "T2 missing": ("MRR", "top-10"),
+    "T2-at missing at a place": ("MRR", "MRR, on-top"),
+    "T3 outliers, uniform": ("hit@1", "AUROC", "alarms in untouched scenes"),
+    "T3 outliers, by popularity": ("hit@1",),
+    "T3 outliers, same room type": ("hit@1",),
+    "T3b placement": ("hit@1",),
+    "T4 generate": ("MMD², free", "pair correlation, free"),
+    "Density": ("gain over independent classes, upper log Z",),
+    "Calibration": (),
+}
+"""What the Markdown tables show; the JSON holds every metric."""
+
+
+class MeanOverSeeds(Metric):
+    """The mean of one metric over training seeds, on the same resampled scenes for all."""
+
+    def __init__(self, members: Sequence[Metric]) -> None:
+        if not members:
+            raise ValueError("a mean over seeds needs at least one metric")
+        if len({member.scenes for member in members}) > 1:
+            raise ValueError("the seeds were measured on different numbers of scenes")
+        self.members = tuple(members)
+
+    @property
+    def scenes(self) -> int:
+        """Scenes of each member."""
+        return self.members[0].scenes
+
+    @property
+    def n(self) -> int:
+        """Scored items of each member."""
+        return self.members[0].n
+
+    @property
+    def value(self) -> float:
+        """The mean."""
+        return float(np.mean([member.value for member in self.members]))
+
+    def resampled(self, resamples: int, seed: int) -> Floats:
+        """The mean in each resample, (resamples,)."""
+        draws = [member.draws(resamples, seed) for member in self.members]
+        shortest = min(len(draw) for draw in draws)
+        mean: Floats = np.mean([draw[:shortest] for draw in draws], axis=0)
+        return mean
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure of the tables.
+
+    Attributes:
+        row, task, source, metric: where it stands.
+        figure: mean over seeds, with the interval over scenes.
+        seeds: the value of each seed.
+    """
+
+    row: str
+    task: str
+    source: str
+    metric: str
+    figure: Figure
+    seeds: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Ours minus another row, with the paired interval over scenes."""
+
+    row: str
+    task: str
+    source: str
+    metric: str
+    figure: Figure
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything a benchmark found.
+
+    Attributes:
+        ours: the row that the others are compared with.
+        cells, differences: in the order of rows, sources and tasks.
+    """
+
+    ours: str
+    cells: tuple[Cell, ...]
+    differences: tuple[Difference, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "ours": self.ours,
+            "cells": [asdict(cell) for cell in self.cells],
+            "differences": [asdict(difference) for difference in self.differences],
+        }
+
+    def markdown(self) -> str:
+        """One table for each primary metric: rows by sources.
+
+        A star marks a row that ours stands above: the whole paired interval is above zero.
+        """
+        parts = [
+            table
+            for task, metrics in PRIMARY.items()
+            for metric in metrics
+            if (table := self._table(task, metric))
+        ]
+        return "\n\n".join(parts) + "\n"
+
+    def _table(self, task: str, metric: str) -> str:
+        cells = [cell for cell in self.cells if (cell.task, cell.metric) == (task, metric)]
+        if not cells:
+            return ""
+        sources = list(dict.fromkeys(cell.source for cell in cells))
+        above = {
+            (d.row, d.source)
+            for d in self.differences
+            if (d.task, d.metric) == (task, metric) and d.figure.above_zero
+        }
+        values = {(cell.row, cell.source): cell.figure for cell in cells}
+        lines = [
+            f"### {task}: {metric}",
+            "",
+            "| | " + " | ".join(sources) + " |",
+            "|---" * (len(sources) + 1) + "|",
+        ]
+        for row in dict.fromkeys(cell.row for cell in cells):
+            shown = [
+                f"{values[row, source]}{' *' if (row, source) in above else ''}"
+                if (row, source) in values
+                else ""
+                for source in sources
+            ]
+            name = f"**{row}**" if row == self.ours else row
+            lines.append(f"| {name} | " + " | ".join(shown) + " |")
+        return "\n".join(lines)
+
+
+def summarise(reports: Reports, ours: str) -> Results:
+    """The figures of every row, and how far ours stands from each.
+
+    Raises:
+        ValueError: no report of `ours`.
+    """
+    means = {
+        (row, source, task, name): MeanOverSeeds(metrics)
+        for row in dict.fromkeys(name for name, _ in reports)
+        for source, task, name, metrics in _by_metric(reports, row)
+    }
+    if not any(key[0] == ours for key in means):
+        raise ValueError(f"there is no report of {ours}")
+    cells = tuple(
+        Cell(row, task, source, name, mean.figure(), tuple(m.value for m in mean.members))
+        for (row, source, task, name), mean in means.items()
+    )
+    differences = tuple(
+        Difference(row, task, source, name, paired_difference(mine, mean))
+        for (row, source, task, name), mean in means.items()
+        if row != ours and (mine := means.get((ours, source, task, name))) is not None
+    )
+    return Results(ours, cells, differences)
+
+
+def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
+    """(source, task, metric name, one metric a seed) of a row."""
+    found: dict[tuple[str, str, str], list[Metric]] = {}
+    for (name, _), by_source in reports.items():
+        if name != row:
+            continue
+        for source, report in by_source.items():
+            for task, outcome in report.outcomes.items():
+                for metric, value in (outcome.metrics if outcome else {}).items():
+                    found.setdefault((source, task, metric), []).append(value)
+    for (source, task, metric), values in found.items():
+        yield source, task, metric, values
