@@ -56,9 +56,6 @@ class ObjectiveConfig(_Section):
     room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of withheld room types")
     structure_dropout: float = Field(default=0.5, ge=0, le=1)
     object_dropout: float = Field(default=0.0, ge=0, lt=1)
-    unannotated: Literal["unobserved", "absent"] = Field(
-        default="unobserved", description="what a class is in scenes of a source that never has it"
-    )
 
 
 class TrainingConfig(_Section):

@@ -58,14 +58,11 @@ class Masked:
     removable: Tensor
 
 
-def mask_one_class(
-    batch: Batch, structure: Tensor, generator: torch.Generator, *, closed: bool = False
-) -> Masked | None:
+def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) -> Masked | None:
     """Take one class out of each scene of at least two; None where no scene has two.
 
     Args:
         structure: (V,) bool; such classes are neither taken out nor candidates.
-        closed: classes that the scene's source never has are candidates too, and absent.
     """
     removable = batch.v * ~structure
     enough = removable.sum(1) >= 2
@@ -74,7 +71,7 @@ def mask_one_class(
     batch, removable = batch.rows(enough), removable[enough]
     target = torch.multinomial(removable, 1, generator=generator).squeeze(1)
     v = batch.v.scatter(1, target.unsqueeze(1), 0.0)
-    absent = (v == 0) & ~structure & (batch.annotated | closed)
+    absent = (v == 0) & ~structure & batch.annotated
     return Masked(batch, v, target, absent, removable.sum(1))
 
 
@@ -113,8 +110,7 @@ class CompositeLikelihood(Objective):
         structure = self.structure
         if structure is None:
             structure = torch.zeros(machine.spec.V, dtype=torch.bool)
-        closed = self.config.unannotated == "absent"
-        masked = mask_one_class(batch, structure, generator, closed=closed)
+        masked = mask_one_class(batch, structure, generator)
         if masked is None:
             return total
         log_odds = self._log_odds(machine, masked, structure, generator)
