@@ -88,6 +88,18 @@ def test_observed_relations_enter_the_local_form_by_their_likelihood():
     torch.testing.assert_close(loss, nll)
 
 
+@pytest.mark.parametrize("name", SMALL)
+def test_one_step_of_contrastive_divergence_moves_the_context_biases(name):
+    """The model term has a context of its own: where data and model differ, so does <h1>."""
+    machine = toy_machine(name)
+    with torch.no_grad():
+        machine.W.mul_(20.0)  # what is drawn instead of the data reaches h1
+    config = ObjectiveConfig(name="contrastive_divergence", k=1)
+    objective = OBJECTIVES["contrastive_divergence"](config, machine)
+    objective.loss(machine, toy_batch(), torch.Generator().manual_seed(0)).backward()
+    assert float(machine.c1.grad.abs().max()) > 0.01
+
+
 def test_centred_gradient_is_the_gradient_in_centred_coordinates():
     """Moving along it is the plain gradient of the machine written in (v - μ)(h - λ)."""
     machine = small_machine("gbm").requires_grad_(True)

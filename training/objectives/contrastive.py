@@ -15,6 +15,8 @@ Müller, "Deep Boltzmann machines and the centering trick" (2012); Melchior, Fis
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
@@ -22,7 +24,14 @@ from torch.nn.functional import softplus
 from app.boltzmann import BoltzmannMachine
 from app.boltzmann.bernoulli import bernoulli
 from app.boltzmann.edges import Edges, PairEdges
-from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state, reconstruct
+from app.boltzmann.gibbs import (
+    Clamp,
+    State,
+    gibbs_step,
+    initial_state,
+    reconstruct,
+    sample_h1,
+)
 from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
@@ -107,6 +116,10 @@ class ContrastiveDivergence(Objective):
             model = gibbs_step(
                 machine, model, generator, clamp, collapsed=False, relations=relations
             )
+        if machine.spec.form == "local":
+            # The energies there are of h1 as drawn. The h1 that v was drawn from is the data's own
+            # after one step: with it c1 and J would see no difference.
+            model = replace(model, h1=sample_h1(machine, model, generator, clamp))
         return energy_difference(machine, data, observed, model, room, room)
 
 
