@@ -1,8 +1,8 @@
-"""Training, test and validation parts: 60 / 30 / 10, stratified by room type.
+"""Training, test and validation parts, stratified by room type.
 
-``group`` keeps near-duplicates together: whole groups go to one part, and a group that occurs in
-several sources (a frame and the 3D boxes of the same frame) goes to the same part in all of them.
-``random`` is the protocol of the seed paper: every scene on its own.
+``group``, 75 / 15 / 10, keeps near-duplicates together: whole groups go to one part, and a group
+that occurs in several sources (a frame and the 3D boxes of the same frame) goes to the same part in
+all of them. ``random``, 60 / 30 / 10, is the protocol of the seed paper: every scene on its own.
 
 The parts depend on the seed and on what is split, not on its order. Sources that share no group do
 not influence each other, so a source split alone splits as it does among others; sources that share
@@ -22,7 +22,10 @@ from training.datasets.records import AnnotatedScene
 Part = Literal["train", "test", "validation"]
 Protocol = Literal["group", "random"]
 
-FRACTIONS: Final[dict[Part, float]] = {"train": 0.6, "test": 0.3, "validation": 0.1}
+FRACTIONS: Final[dict[Protocol, dict[Part, float]]] = {
+    "group": {"train": 0.75, "test": 0.15, "validation": 0.1},
+    "random": {"train": 0.6, "test": 0.3, "validation": 0.1},
+}
 
 
 def split(
@@ -38,15 +41,15 @@ def split(
     Raises:
         ValueError: an unknown protocol, or two scenes of one source with one id.
     """
-    if protocol not in ("group", "random"):
+    if protocol not in FRACTIONS:
         raise ValueError(f"protocol must be 'group' or 'random', not {protocol!r}")
     if len({(scene.source, scene.scene_id) for scene in scenes}) < len(scenes):
         raise ValueError("two scenes of one source share one scene_id")
     units = [_unit(scene, protocol) for scene in scenes]
     part_of: dict[str, Part] = {}
     for family in _families(scenes, units):
-        part_of |= _assign(family, seed)
-    parts: dict[Part, list[AnnotatedScene]] = {part: [] for part in FRACTIONS}
+        part_of |= _assign(family, FRACTIONS[protocol], seed)
+    parts: dict[Part, list[AnnotatedScene]] = {part: [] for part in FRACTIONS[protocol]}
     for scene, unit in zip(scenes, units, strict=True):
         parts[part_of[unit]].append(scene)
     return parts
@@ -96,7 +99,9 @@ def _connected(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, 
     return family
 
 
-def _assign(rooms_of: Mapping[str, Counter[str]], seed: int) -> dict[str, Part]:
+def _assign(
+    rooms_of: Mapping[str, Counter[str]], shares: Mapping[Part, float], seed: int
+) -> dict[str, Part]:
     """Give every unit to the part that lacks most, stratum by stratum.
 
     The stratum of a unit is its most common room type. Units come in the order of a hash, large
@@ -113,8 +118,11 @@ def _assign(rooms_of: Mapping[str, Counter[str]], seed: int) -> dict[str, Part]:
         here: Counter[Part] = Counter()
         for unit in sorted(strata[room], key=lambda unit: _rank(seed, unit)):
             part = max(
-                FRACTIONS,
-                key=lambda p: _lack(p, here, weight[unit]) + _lack(p, overall, weight[unit]),
+                shares,
+                key=lambda p: (
+                    _lack(shares[p], here[p], here.total() + weight[unit])
+                    + _lack(shares[p], overall[p], overall.total() + weight[unit])
+                ),
             )
             part_of[unit] = part
             here[part] += weight[unit]
@@ -122,9 +130,9 @@ def _assign(rooms_of: Mapping[str, Counter[str]], seed: int) -> dict[str, Part]:
     return part_of
 
 
-def _lack(part: Part, given: Counter[Part], coming: int) -> float:
-    """Scenes that a part is short of its share, once ``coming`` more are given out."""
-    return FRACTIONS[part] * (given.total() + coming) - given[part]
+def _lack(share: float, given: int, total: int) -> float:
+    """Scenes that a part is short of its share of all."""
+    return share * total - given
 
 
 def _rank(seed: int, unit: str) -> bytes:

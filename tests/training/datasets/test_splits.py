@@ -72,7 +72,7 @@ def test_shares_hold_over_all_and_within_room_types(protocol: Protocol) -> None:
     parts = split(scenes, seed=1, protocol=protocol)
     assert list(parts) == ["train", "test", "validation"]
     room_size = Counter(scene.room_type for scene in scenes)
-    for part, fraction in FRACTIONS.items():
+    for part, fraction in FRACTIONS[protocol].items():
         # A part is off by at most the scenes of a group in each stratum.
         assert len(parts[part]) == pytest.approx(fraction * len(scenes), abs=8)
         here = Counter(scene.room_type for scene in parts[part])
