@@ -38,6 +38,8 @@ from training.trainer import subset
 
 # An alarm in at most 5 % of untouched scenes is promised; the margin is for scenes not seen here.
 _ALARM_SHARE = 0.035
+# Scenes of a source whose share of alarms is kept by itself.
+_ALARM_SCENES = 40
 _SCENES = 800
 # Cases a scene: with one of some 300 scenes, the weight moved by a third from draw to draw.
 _PLACED_CASES = 2
@@ -58,7 +60,9 @@ def calibrate(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> Calibr
     related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64))
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     score = machine_score(artifact.machine)
-    outlier, threshold = fit_outlier(intruder_scores(sample, structure, score, seed=seed), seed)
+    outlier, threshold = fit_outlier(
+        intruder_scores(sample, structure, score, seed=seed), sample.source.numpy(), seed
+    )
     calibration = Calibration.neutral(artifact.machine.spec.A).model_copy(
         update={
             "missing_temperature": fit_missing(sample, structure, score),
@@ -94,9 +98,17 @@ def fit_missing(scenes: SceneTensors, structure: torch.Tensor, score: ObjectScor
     return float(np.exp(found.x))
 
 
-def fit_outlier(scores: IntruderScores, seed: int = 0) -> tuple[CountSlope, float]:
-    """Logistic regression of "is the intruder", half of the scenes clean, and the alarm
-    threshold."""
+def fit_outlier(
+    scores: IntruderScores, source: NDArray[np.int64], seed: int = 0
+) -> tuple[CountSlope, float]:
+    """Logistic regression of "is the intruder", half of the scenes clean, and the alarm threshold.
+
+    The share of false alarms is kept in each source by itself: a robot's scenes are of one kind,
+    and one quantile over all kinds would alarm often in the most varied one and never in others.
+
+    Args:
+        source: (N,) of each scene.
+    """
     rng = np.random.default_rng(seed)
     clean_scene = rng.random(int(scores.scene.max()) + 1) < 0.5
     used = scores.clean == clean_scene[scores.scene]
@@ -104,11 +116,14 @@ def fit_outlier(scores: IntruderScores, seed: int = 0) -> tuple[CountSlope, floa
     slope, size, intercept = _logistic(features[used], scores.intruder[used])
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
     logits = intercept + features @ np.array([slope, size])
-    worst = [
-        logits[(scores.scene == scene) & scores.clean].max()
-        for scene in np.unique(scores.scene[scores.clean])
-    ]
-    return entry, float(_sigmoid(np.quantile(worst, 1 - _ALARM_SHARE)))
+    worst = np.full(len(source), -np.inf)
+    np.maximum.at(worst, scores.scene[scores.clean], logits[scores.clean])
+    judged = np.isfinite(worst)
+    kinds, sizes = np.unique(source[judged], return_counts=True)
+    # A quantile of a few scenes says nothing: such a source is judged with all.
+    large = [worst[judged & (source == kind)] for kind in kinds[sizes >= _ALARM_SCENES]]
+    quantiles = [np.quantile(some, 1 - _ALARM_SHARE) for some in (large or [worst[judged]])]
+    return entry, float(_sigmoid(max(quantiles)))
 
 
 def fit_relations(artifact: Artifact, scenes: SceneTensors) -> tuple[CountSlope, ...]:
@@ -139,7 +154,8 @@ def _instance_pairs(
     examples = []
     for a in range(len(values)):
         logit = values[a][place[:, None], place[None, :]]
-        kept = pair & scene.instance_observed[a] & np.isfinite(logit)
+        # What is not listed is off, also where geometry left it open: the answer promises a listing.
+        kept = pair & np.isfinite(logit)
         examples.append(np.stack([logit[kept], both[kept], scene.instance_holds[a][kept]], 1))
     return examples
 

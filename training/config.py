@@ -38,6 +38,7 @@ class MachineConfig(_Section):
     H1: int = Field(default=200, ge=1)
     H2: int = Field(default=100, ge=0)
     K: int = Field(default=32, ge=0)
+    G: int = Field(default=0, ge=0, description="rank of what given relations imply (Triway)")
     form: Form = "seed"
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
@@ -52,6 +53,9 @@ class ObjectiveConfig(_Section):
     chains: int = Field(default=128, ge=1, description="persistent chains (PCD)")
     presence_weight: float = Field(default=0.1, ge=0, description="presence against absence")
     relation_weight: float = Field(default=0.05, ge=0)
+    unlisted: Literal["unobserved", "off"] = Field(
+        default="unobserved", description="relations that geometry left open in annotated scenes"
+    )
     generative_weight: float = Field(default=0.0, ge=0, description="of PCD within composite")
     room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of withheld room types")
     structure_dropout: float = Field(default=0.5, ge=0, le=1)

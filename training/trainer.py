@@ -71,6 +71,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
         C=data.room_types,
         K=shape.K if shape.variant == "triway" else 0,
         T=len(triples),
+        G=shape.G,
         form=shape.form,
     )
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)

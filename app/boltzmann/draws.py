@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from app.boltzmann.edges import Edges
 from app.boltzmann.machine import BoltzmannMachine
 from app.boltzmann.mean_field import Evidence, MeanField, mean_field
 
@@ -46,6 +47,13 @@ class HiddenDraws:
     def effective_size(self) -> Tensor:
         """(B,) effective number of draws, 1 / sum w²."""
         return (-(2 * self.log_weight).logsumexp(0)).exp()
+
+    def implied(self, machine: BoltzmannMachine, edges: Edges, given: Tensor) -> Tensor:
+        """What the given relations (B, E), 1 where on, imply for the others, (B, E).
+
+        How strictly is for the objects to say: the context is taken at its mean without relations.
+        """
+        return machine.implied(edges, given, self.field.x.sigmoid())
 
     def mean(self, values: Tensor) -> Tensor:
         """Expectation of values (M, B, ...) over the draws, (B, ...)."""

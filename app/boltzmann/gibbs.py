@@ -8,7 +8,8 @@ One step draws, in turn,
     h2 | h1         factorial
     v  | h1         RBM, GBM: given r, factorial. Triway: with every unobserved relation summed out,
                     factorial in the local form and object after object in the seed form
-    r  | v, h1      factorial
+    r  | v, h1      factorial; where relations imply each other, group after group given those
+                    before, by the chain rule
 
 A plain block sampler freezes the gated seed form: while a relation of i is on, p(v_i = 1) = 1.
 Hence v is drawn with R_i summed out (`collapsed`, the default); the plain kernel stays for
@@ -28,10 +29,13 @@ from app.boltzmann.bernoulli import bernoulli
 from app.boltzmann.edges import Edges
 from app.boltzmann.gbm import GBM
 from app.boltzmann.machine import BoltzmannMachine
+from app.boltzmann.mean_field import Evidence, mean_field
 from app.boltzmann.presence import presence_product
 from app.boltzmann.triway import Triway
 
 _PROPOSAL_BLOCKS = 8
+# Relations that imply each other are drawn in twice so many groups, each given those before it.
+_RELATION_GROUPS = 4
 
 
 @dataclass(frozen=True)
@@ -239,15 +243,29 @@ def sample_relations(
     pairs = machine.evidence_pairs(clamp.edges, len(v))
     classes = present_classes(v, pairs.subjects if pairs is not None else None)
     edges = machine.edges(classes)
-    p = machine.relation_logits(edges, v, h1).sigmoid() * machine.gate(edges, v)
-    r = bernoulli(p, generator)
-    if pairs is None or clamp.r is None or clamp.observed is None:
-        return edges, r
-    n = pairs.subjects.shape[1]
-    grid = edges.unflatten(r)
-    given, known = pairs.unflatten(clamp.r), pairs.unflatten(clamp.observed)
-    grid[..., :n, :n] = torch.where(known, given, grid[..., :n, :n])
-    return edges, grid.flatten(-3)
+    logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
+    r, known = torch.zeros_like(logits), torch.zeros_like(logits, dtype=torch.bool)
+    if pairs is not None and clamp.r is not None and clamp.observed is not None:
+        # Both are copied into views of r and known.
+        n = pairs.subjects.shape[1]
+        edges.unflatten(known)[..., :n, :n] = pairs.unflatten(clamp.observed)
+        edges.unflatten(r)[..., :n, :n] = pairs.unflatten(clamp.r * clamp.observed)
+    if not machine.spec.G:
+        return edges, torch.where(known, r, bernoulli(logits.sigmoid() * gate, generator))
+    context = mean_field(machine, Evidence(v, room=clamp.room)).y.sigmoid()
+    group = _drawing_order(edges.unflatten(logits), generator).flatten(-3)
+    for k in range(2 * _RELATION_GROUPS):
+        p = (logits + machine.implied(edges, r, context)).sigmoid() * gate
+        r = torch.where((group == k) & ~known, bernoulli(p, generator), r)
+    return edges, r
+
+
+def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
+    """A random group for each unit (..., n, n), never the same for a(i, j) and a(j, i)."""
+    group = torch.randint(_RELATION_GROUPS, like.shape, generator=generator)
+    later = torch.randint(2, like.shape, generator=generator).triu(1)
+    later = later + (1 - later.mT).tril(-1)
+    return group + _RELATION_GROUPS * later
 
 
 def present_classes(v: Tensor, leading: Tensor | None = None) -> Tensor:

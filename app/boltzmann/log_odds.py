@@ -127,13 +127,24 @@ def relation_log_odds(
 ) -> tuple[Tensor, Tensor]:
     """Log-odds of the units of `edges`, each unobserved in the evidence, with standard errors.
 
-    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1)) ] in both forms; -inf where the gate is off.
+    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms, x_e what the observed
+    relations imply; -inf where the gate is off.
+
+    Raises:
+        ValueError: the machine knows implications, and relations are observed in another layout
+            than `edges`.
 
     Returns:
         (B, E) log-odds and (B, E) standard errors of the log-odds.
     """
     draws = draw_hidden(machine, evidence, draws=count) if draws is None else draws
-    on = machine.relation_logits(edges, evidence.v, draws.h1).sigmoid()
+    logits = machine.relation_logits(edges, evidence.v, draws.h1)
+    relations = evidence.relations(machine)
+    if machine.spec.G and relations is not None:
+        if relations[0] is not edges:
+            raise ValueError("what relations imply is known in the layout of the evidence only")
+        logits = logits + draws.implied(machine, edges, relations[1] * relations[2])
+    on = logits.sigmoid()
     p = draws.mean(on)
     error = draws.standard_error(on) / (p * (1 - p)).clamp(min=1e-12)
     gate = machine.gate(edges, evidence.v)

@@ -116,6 +116,18 @@ class BoltzmannMachine(nn.Module, ABC):
         bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 
+    def implied(self, edges: Edges, given: Tensor, h1: Tensor) -> Tensor:
+        """What given relations add to the logits of the others, (B, E); see `implications`.
+
+        Nothing but in a machine that has weights for it.
+
+        Args:
+            given: (B, E), 1 where a unit is given as on.
+            h1: (B, H1) means given the objects.
+        """
+        del edges, h1
+        return torch.zeros_like(given)
+
     @abstractmethod
     def relation_context(self, edges: Edges) -> Tensor:
         """The rows U_e, (B or 1, E, H1). Allocates them: for few units only."""

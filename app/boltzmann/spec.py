@@ -21,6 +21,8 @@ class MachineSpec:
         H2: hidden units of the second layer; 0 leaves the layer out.
         C: room types that shift the biases of h1 when one is given.
         K: rank of the shared tri-way and relation-context weights (Triway).
+        G: rank of the context's say in what given relations imply for others (Triway, local form);
+            0 leaves implications out.
         T: relation units with a weight of their own: all units of the RBM and GBM, the sparse
             residual of the Triway.
         form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations).
@@ -34,6 +36,7 @@ class MachineSpec:
     C: int = 0
     K: int = 0
     T: int = 0
+    G: int = 0
     form: Form = "seed"
 
     def __post_init__(self) -> None:
@@ -44,11 +47,13 @@ class MachineSpec:
         for name in ("V", "A", "H1"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("H2", "C", "K", "T"):
+        for name in ("H2", "C", "K", "T", "G"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
         if self.variant == "triway" and self.K < 1:
             raise ValueError(f"a triway machine needs a rank K of at least 1, not {self.K}")
+        if self.G and (self.variant != "triway" or self.form != "local"):
+            raise ValueError(f"G must be 0 but in a local triway machine, not {self.G}")
         if self.variant == "rbm" and self.H2:
             raise ValueError(f"an RBM has one hidden layer: H2 must be 0, not {self.H2}")
 

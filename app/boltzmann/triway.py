@@ -12,6 +12,9 @@ present, and the weights are shared through the factors S, O, R, M instead of on
 instances n_i, n_j of the two classes there are, since a class-level relation is the OR over
 instance pairs.
 
+With G > 0 (local form) relations that are given also shift the logits of the others, by weights
+gamma and B: see `implications`.
+
 Forms: `seed` is the energy above (with a compensating offset κ_a per active unit, 0 in the paper);
 `local` adds softplus(ℓ_e) for every active unit.
 """
@@ -25,6 +28,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding, softplus
 
 from app.boltzmann.edges import Edges, PairEdges, find_triples, pair_edges, triple_keys
+from app.boltzmann.implications import feature_count, implied
 from app.boltzmann.machine import BoltzmannMachine
 from app.boltzmann.rbm import scale
 from app.boltzmann.spec import MachineSpec
@@ -46,6 +50,9 @@ class Triway(BoltzmannMachine):
         self.P = nn.Parameter(torch.zeros(A, H1))
         self.n = nn.Parameter(torch.zeros(A, 2))
         self.residual = nn.Parameter(torch.zeros(spec.T))
+        if spec.G:
+            self.gamma = nn.Parameter(torch.zeros(1 + spec.G, A, feature_count(A)))
+            self.B = nn.Parameter(torch.zeros(spec.G, H1))
         self.kappa = nn.Parameter(torch.zeros(A), requires_grad=False)
 
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> PairEdges:
@@ -84,6 +91,13 @@ class Triway(BoltzmannMachine):
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, found = find_triples(self.triple_keys, keys)
         return pairs.unflatten(self.residual[position] * found)
+
+    def implied(self, edges: Edges, given: Tensor, h1: Tensor) -> Tensor:
+        """By gamma and B; zero without them."""
+        if not self.spec.G:
+            return super().implied(edges, given, h1)
+        grid = _pairs(edges).unflatten(given)
+        return implied(self.gamma, self.B, grid, h1).flatten(-3)
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
         """sum_e weight_e U_e through the factors, without forming U."""
@@ -210,7 +224,7 @@ class Triway(BoltzmannMachine):
         With a base, b leads to b_base and κ to -log 2: at beta = 0 the two states of a relation
         unit weigh 1/2 each, so that relations sum out to one and objects are independent.
         """
-        return scale(self, beta, base, keep=("b", "kappa"), fixed=("S", "O"))
+        return scale(self, beta, base, keep=("b", "kappa"), fixed=("S", "O", "B"))
 
 
 def _pairs(edges: Edges) -> PairEdges:

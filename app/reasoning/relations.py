@@ -110,17 +110,18 @@ def best(values: NDArray[np.floating], usable: NDArray[np.bool_], count: int) ->
 def class_log_odds(observation: Observation) -> Tensor:
     """Log-odds of every relation between the classes of a scene, each without itself, (A, n, n).
 
-        p(r_e = 1 | rest) = E[ sigmoid(ℓ_e(h1)) ],   h1 from p(h1 | rest)
+        p(r_e = 1 | rest) = E[ sigmoid(ℓ_e(h1) + x_e) ],   h1 from p(h1 | rest)
 
-    The draws are made given all that is observed. An observed unit is taken out of the evidence by
-    reweighting them: w ← w / p(r_e | v, h1). A relation without a unit has log-odds `NO_UNIT`.
+    with x_e what the observed relations imply for e. The draws are made given all that is observed.
+    An observed unit is taken out of the evidence by reweighting them: w ← w / p(r_e | v, h1). A
+    relation without a unit has log-odds `NO_UNIT`.
     """
     machine, evidence = observation.machine, observation.evidence
     draws = draw_context(machine, evidence)
     classes, counts = observation.classes, observation.counts
     units = units_between(machine, classes, classes, counts, counts)
     logits = machine.relation_logits(units.edges, evidence.v, draws.h1).squeeze(1)
-    log_weight = draws.log_weight
+    log_weight, implied = draws.log_weight, logits.new_zeros(())
     if bool(observation.observed.any()):
         observed = units.flat(observation.observed)
         r = units.flat(observation.holds).to(logits.dtype)
@@ -128,5 +129,6 @@ def class_log_odds(observation: Observation) -> Tensor:
         unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
         log_weight = log_weight + unseen - machine.relation_term(logits, gate, r, observed)
         # Where e is not observed, the difference is zero and the weights stay as they are.
-    on, off = mean_log_p(torch.softmax(log_weight, dim=0), logits)
+        implied = draws.implied(machine, units.edges, (r * observed).unsqueeze(0)).squeeze(0)
+    on, off = mean_log_p(torch.softmax(log_weight, dim=0), logits + implied)
     return units.grid((on - off).clamp(min=NO_UNIT), NO_UNIT)

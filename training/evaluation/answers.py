@@ -93,14 +93,13 @@ def ask_relations(
     encoded: EncodedScene,
     rng: np.random.Generator,  # noqa: ARG001
 ) -> Answered | None:
-    """Relations of a scene's objects; a pair that nobody looked at says nothing."""
+    """Relations of a scene's objects, if it is annotated; what is not listed does not hold."""
     if not encoded.instance_observed.any():
         return None
     found: Answered = []
     for answer in relations(artifact, _bare(encoded, range(len(encoded.instance_classes)))):
         triple = CANONICAL.index(answer.relation), answer.subject, answer.object
-        if encoded.instance_observed[triple]:
-            found.append((answer.probability, bool(encoded.instance_holds[triple])))
+        found.append((answer.probability, bool(encoded.instance_holds[triple])))
     return found
 
 

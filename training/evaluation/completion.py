@@ -46,7 +46,8 @@ def given_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScore:
         unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
         change = unseen - machine.relation_term(logits, gate, r, observed)
         weight = torch.softmax(context.log_weight.unsqueeze(-1) + change, dim=0)
-        on, off = mean_log_p(weight, logits)
+        given = r * observed
+        on, off = mean_log_p(weight, logits + context.implied(machine, edges, given))
         values = torch.where(gate > 0, (on - off).clamp(min=NO_UNIT), -torch.inf)
         if isinstance(machine, Triway):
             return values.view(batch.holds.shape)

@@ -15,7 +15,11 @@ For scenes with annotated relations:
 
 a plug-in of the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)), with the mean
 in place of draws. Relations nobody annotated are summed out; scenes without any teach the object
-part only.
+part only. A machine that knows what relations imply learns it from the same scenes with a random
+share of their relations given, by log p(r_e | r_given, v, E[h1 | v]) of the others.
+
+A class that a source never mentions counts as absent from its scenes: a request does not say what
+source it is of, and all classes have to be ranked.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Varin, Reid and Firth, "An
 overview of composite likelihood methods" (2011).
@@ -23,7 +27,7 @@ overview of composite likelihood methods" (2011).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -35,7 +39,6 @@ from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
 from training.objectives.base import Objective, withhold_rooms
-from training.objectives.contrastive import relation_nll
 from training.objectives.generative import ObjectChains
 
 
@@ -71,7 +74,7 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
     batch, removable = batch.rows(enough), removable[enough]
     target = torch.multinomial(removable, 1, generator=generator).squeeze(1)
     v = batch.v.scatter(1, target.unsqueeze(1), 0.0)
-    absent = (v == 0) & ~structure & batch.annotated
+    absent = (v == 0) & ~structure
     return Masked(batch, v, target, absent, removable.sum(1))
 
 
@@ -107,9 +110,7 @@ class CompositeLikelihood(Objective):
             room = withhold_rooms(batch, self.config.room_dropout, generator)
             chains = self.chains.loss(machine, batch.v, room, generator)
             total = total + self.config.generative_weight * chains
-        structure = self.structure
-        if structure is None:
-            structure = torch.zeros(machine.spec.V, dtype=torch.bool)
+        structure = self.classes_apart(machine)
         masked = mask_one_class(batch, structure, generator)
         if masked is None:
             return total
@@ -120,6 +121,12 @@ class CompositeLikelihood(Objective):
         off = softplus(log_odds) * masked.absent.scatter(1, masked.target.unsqueeze(1), False)
         presence = masked.removable * softplus(-chosen) + off.sum(1)
         return total + (ranking + self.config.presence_weight * presence).mean()
+
+    def classes_apart(self, machine: BoltzmannMachine) -> Tensor:
+        """(V,) bool, structure: neither taken out nor related."""
+        if self.structure is not None:
+            return self.structure
+        return torch.zeros(machine.spec.V, dtype=torch.bool)
 
     def _log_odds(
         self,
@@ -145,14 +152,38 @@ class CompositeLikelihood(Objective):
     def relation_part(
         self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
     ) -> Tensor:
-        """-log p(observed r | v, E[h1 | v]), summed over units, averaged over the batch."""
+        """-log p(observed r | v, E[h1 | v]), summed over units, averaged over the batch.
+
+        Plus the same of what is left where some are given, in a machine that knows implications.
+        """
         annotated = batch.observed.flatten(1).any(1)
         if not bool(annotated.any()):
             return machine.b.sum() * 0.0
         some = batch.rows(annotated)
+        if self.config.unlisted == "off":
+            some = unlisted_off(some, self.classes_apart(machine))
         room = withhold_rooms(some, self.config.room_dropout, generator)
         edges, r, observed = relation_units(machine, some)
         unseen = edges if machine.spec.form == "seed" and isinstance(machine, Triway) else None
-        field = mean_field(machine, Evidence(some.v, unseen, room=room))
-        nll = relation_nll(machine, edges, some.v, field.y.sigmoid(), r, observed)
-        return nll.sum() / len(batch)
+        h1 = mean_field(machine, Evidence(some.v, unseen, room=room)).y.sigmoid()
+        logits = machine.relation_logits(edges, some.v, h1)
+        counted = observed * machine.gate(edges, some.v)
+        nll = _bernoulli_nll(logits, r, counted)
+        if machine.spec.G:
+            share = torch.rand(len(some), 1, generator=generator)
+            given = r * observed * (torch.rand(r.shape, generator=generator) < share)
+            implied = machine.implied(edges, given, h1)
+            nll = nll + _bernoulli_nll(logits + implied, r, counted * (1 - given))
+        return nll / len(batch)
+
+
+def unlisted_off(batch: Batch, structure: Tensor) -> Batch:
+    """The batch with every relation between two classes of a scene observed, structure apart."""
+    n = batch.classes.shape[1]
+    thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
+    pairs = thing[:, :, None] & thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)
+    return replace(batch, observed=batch.observed | pairs[:, None])
+
+
+def _bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
+    return ((softplus(logits) - r * logits) * weight).sum()
