@@ -1,4 +1,4 @@
-"""The command line: train, evaluate, publish, list.
+"""The command line: train, tune, evaluate, publish, list.
 
 Ctrl-C during training leaves a checkpoint of the last finished epoch; the same command goes on from
 it.
@@ -29,8 +29,10 @@ from training.pipeline import SplitScenes, prepare, read_sources, split_and_enco
 from training.publish import publish_run
 from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer, subset
+from training.tuning.command import tune
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
+app.command()(tune)
 app.command()(benchmark)
 console = Console()
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -125,6 +127,44 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not TOML: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise ConfigError(f"{path.name}: {place}: {first['msg']}") from error
+        raise ConfigError(f"{path.name}: {_first_error(error)}") from error
+
+
+def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
+    """A configuration with entries changed, each named as in "training.epochs".
+
+    Raises:
+        ConfigError: there is no such entry, or the values do not fit.
+    """
+    values = config.model_dump()
+    for name, value in settings.items():
+        section, _, entry = name.partition(".")
+        known = getattr(type(getattr(config, section, None)), "model_fields", {})
+        if entry not in known:
+            choice = f"{section} has {', '.join(known)}" if known else "name it section.entry"
+            raise ConfigError(f"no setting {name!r}: {choice}")
+        values[section][entry] = value
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{dict(settings)} do not fit: {_first_error(error)}") from error
+
+
+def config_toml(config: Config) -> str:
+    """The configuration as a TOML file that `load_config` reads."""
+    values = config.model_dump(mode="json", exclude_none=True)
+    sections = {name: values.pop(name) for name in list(values) if isinstance(values[name], dict)}
+    blocks = [_entries(values)]
+    blocks += [f"[{name}]\n{_entries(entries)}" for name, entries in sections.items()]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _entries(values: Mapping[str, Any]) -> str:
+    # Of the values that a configuration holds, JSON writes all as TOML does.
+    return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items())
+
+
+def _first_error(error: ValidationError) -> str:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"]) or "the file"
+    return f"{place}: {first['msg']}"

@@ -232,9 +232,10 @@ class Trainer:
             if progress is not None:
                 progress(number, (step + 1) / self.steps_per_epoch, total / (step + 1))
         loss = total / self.steps_per_epoch
-        if not math.isfinite(loss):
+        finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
+        if not math.isfinite(loss) or not finite:
             raise FloatingPointError(
-                f"the loss of epoch {number} is {loss}: lower the learning rate"
+                f"epoch {number} diverged at a loss of {loss}: lower the learning rate"
             )
         self._close_epoch(number, loss, began)
 
