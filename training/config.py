@@ -44,6 +44,10 @@ class MachineConfig(_Section):
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
     initial_c1: float = 0.0
+    # Not written where it is empty, so that runs and reports from before it keep their digest.
+    without: tuple[str, ...] = Field(
+        default=(), exclude_if=lambda names: not names, description="weights held at zero, by name"
+    )
 
 
 class ObjectiveConfig(_Section):
@@ -89,7 +93,7 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
-        if self.machine.variant == "rbm" and self.machine.H2:
+        if self.machine.variant in ("rbm", "product_rbm") and self.machine.H2:
             raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
         if "rooms" in self.data.sources and not self.data.rooms:
             raise ValueError("data.rooms must say how many rooms to generate")

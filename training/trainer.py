@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine, MachineSpec, Triway, build
+from app.boltzmann.spec import FACTORISED
 from training.batches import SceneTensors, seen_triples
 from training.checkpoints import load_checkpoint, save_checkpoint
-from training.config import Config
+from training.config import Config, ConfigError
 from training.curves import Epoch, write_csv, write_plot
 from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.reconstruction import reconstruction_error
@@ -58,7 +59,11 @@ class TrainingResult:
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
-    """A machine at its start: small random matrices, biases at the training frequencies."""
+    """A machine at its start: small random matrices, biases at the training frequencies.
+
+    Raises:
+        ConfigError: `machine.without` names weights that the machine does not have.
+    """
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
@@ -69,7 +74,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
         H1=shape.H1,
         H2=shape.H2,
         C=data.room_types,
-        K=shape.K if shape.variant == "triway" else 0,
+        K=shape.K if shape.variant in FACTORISED else 0,
         T=len(triples),
         form=shape.form,
     )
@@ -82,7 +87,20 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
         machine.c1.fill_(shape.initial_c1)
         machine.Q.zero_()
         _start_relations(machine, data.train)
+        _hold_at_zero(machine, shape.without)
     return machine
+
+
+def _hold_at_zero(machine: BoltzmannMachine, names: tuple[str, ...]) -> None:
+    weights = dict(machine.named_parameters())
+    if unknown := sorted(set(names) - set(weights)):
+        raise ConfigError(
+            f"machine.without: a {machine.spec.variant} has no weights {', '.join(unknown)}, only "
+            f"{', '.join(weights)}"
+        )
+    for name in names:
+        weights[name].zero_()
+        weights[name].requires_grad_(False)
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
@@ -151,7 +169,7 @@ class Trainer:
         biases: list[Tensor] = []
         relations: list[Tensor] = []
         for name, parameter in self.machine.named_parameters():
-            if name == "kappa":
+            if not parameter.requires_grad:
                 continue
             group = matrices if parameter.dim() > 1 else biases
             (group if name in _OBJECT_PART else relations).append(parameter)
