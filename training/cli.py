@@ -18,6 +18,7 @@ from rich.table import Table
 from torch import Tensor
 
 from app.registry import RegistryError, Store, load_model_set
+from training.ablation.command import ablate
 from training.baselines.bernoulli_rbm import fit_bernoulli_rbm
 from training.batches import SceneTensors
 from training.benchmark.command import benchmark
@@ -34,6 +35,7 @@ from training.tuning.command import tune
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 app.command()(tune)
 app.command()(benchmark)
+app.command()(ablate)
 console = Console()
 
 Data = Annotated[Path, typer.Option("--data", help="folder with the scene files")]

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from app.boltzmann import MachineSpec, build
 from app.boltzmann.spec import Form, Variant
 
 
@@ -93,6 +94,14 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
+        if self.machine.without:
+            smallest = build(MachineSpec(self.machine.variant, V=1, A=1, H1=1, K=1))
+            names = [name for name, _ in smallest.named_parameters()]
+            if unknown := sorted(set(self.machine.without) - set(names)):
+                raise ValueError(
+                    f"machine.without: a {self.machine.variant} has no weights "
+                    f"{', '.join(unknown)}, only {', '.join(names)}"
+                )
         if self.machine.variant in ("rbm", "product_rbm") and self.machine.H2:
             raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
         if "rooms" in self.data.sources and not self.data.rooms:

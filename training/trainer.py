@@ -20,7 +20,7 @@ from app.boltzmann import BoltzmannMachine, MachineSpec, Triway, build
 from app.boltzmann.spec import FACTORISED
 from training.batches import SceneTensors, seen_triples
 from training.checkpoints import load_checkpoint, save_checkpoint
-from training.config import Config, ConfigError
+from training.config import Config
 from training.curves import Epoch, write_csv, write_plot
 from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.reconstruction import reconstruction_error
@@ -59,11 +59,7 @@ class TrainingResult:
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
-    """A machine at its start: small random matrices, biases at the training frequencies.
-
-    Raises:
-        ConfigError: `machine.without` names weights that the machine does not have.
-    """
+    """A machine at its start: small random matrices, biases at the training frequencies."""
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
@@ -87,20 +83,9 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
         machine.c1.fill_(shape.initial_c1)
         machine.Q.zero_()
         _start_relations(machine, data.train)
-        _hold_at_zero(machine, shape.without)
+        for name in shape.without:
+            machine.get_parameter(name).zero_().requires_grad_(False)
     return machine
-
-
-def _hold_at_zero(machine: BoltzmannMachine, names: tuple[str, ...]) -> None:
-    weights = dict(machine.named_parameters())
-    if unknown := sorted(set(names) - set(weights)):
-        raise ConfigError(
-            f"machine.without: a {machine.spec.variant} has no weights {', '.join(unknown)}, only "
-            f"{', '.join(weights)}"
-        )
-    for name in names:
-        weights[name].zero_()
-        weights[name].requires_grad_(False)
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
