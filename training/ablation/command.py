@@ -26,9 +26,6 @@ from training.pipeline import prepare
 from training.runs import RunError, load_run
 from training.trainer import TrainingData
 
-# Scenes a source where a task is slow.
-_ASKED = 300
-
 console = Console()
 
 
@@ -40,6 +37,7 @@ def ablate(
     row: Annotated[list[str] | None, typer.Option(help="only these, and the full model")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="training seeds of every row")] = 1,
     limit: Annotated[int | None, typer.Option(min=10, help="scenes a source")] = None,
+    asked: Annotated[int, typer.Option(min=1, help="scenes a source where a task is slow")] = 300,
     epochs: Annotated[int | None, typer.Option(min=1, help="at most, for every row")] = None,
     data: Annotated[Path, typer.Option("--data", help="folder with the scene files")] = Path(
         "../shared/data"
@@ -67,7 +65,7 @@ def ablate(
         ]
         if fresh:
             forget(place, entries)
-        reports, failures = _run(place, entries, _settings(scenes))
+        reports, failures = _run(place, entries, _settings(scenes, asked))
     except (ConfigError, DatasetError, BenchmarkError) as error:
         console.print(f"[red]error:[/red] {error}")
         raise typer.Exit(1) from None
@@ -121,15 +119,15 @@ def _configs(
     ]
 
 
-def _settings(scenes: TrainingData) -> dict[str, Setting]:
-    """The scenes of each source, of both parts."""
+def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
+    """The scenes of each source, of both parts; at most `limit` where a task is slow."""
     seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
     parts = {"validation": scenes.validation, "test": scenes.test}
     return {
         f"{part} {source}": setting
         for part, some in parts.items()
         for source, setting in settings_by_source(
-            some, scenes.structure, scenes.train, seen, limit=_ASKED
+            some, scenes.structure, scenes.train, seen, limit=limit
         )
     }
 
