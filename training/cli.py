@@ -1,4 +1,4 @@
-"""The command line: train, evaluate, publish, list.
+"""The command line: train, tune, evaluate, publish, list.
 
 Ctrl-C during training leaves a checkpoint of the last finished epoch; the same command goes on from
 it.
@@ -18,6 +18,7 @@ from rich.table import Table
 from torch import Tensor
 
 from app.registry import RegistryError, Store, load_model_set
+from training.ablation.command import ablate
 from training.baselines.bernoulli_rbm import fit_bernoulli_rbm
 from training.batches import SceneTensors
 from training.benchmark.command import benchmark
@@ -29,9 +30,12 @@ from training.pipeline import SplitScenes, prepare, read_sources, split_and_enco
 from training.publish import publish_run
 from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer, subset
+from training.tuning.command import tune
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
+app.command()(tune)
 app.command()(benchmark)
+app.command()(ablate)
 console = Console()
 
 Data = Annotated[Path, typer.Option("--data", help="folder with the scene files")]

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from app.boltzmann import MachineSpec, build
 from app.boltzmann.spec import Form, Variant
 
 
@@ -43,6 +46,10 @@ class MachineConfig(_Section):
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
     initial_c1: float = 0.0
+    # Not written where it is empty, so that runs and reports from before it keep their digest.
+    without: tuple[str, ...] = Field(
+        default=(), exclude_if=lambda names: not names, description="weights held at zero, by name"
+    )
 
 
 class ObjectiveConfig(_Section):
@@ -91,7 +98,15 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
-        if self.machine.variant == "rbm" and self.machine.H2:
+        if self.machine.without:
+            smallest = build(MachineSpec(self.machine.variant, V=1, A=1, H1=1, K=1))
+            names = [name for name, _ in smallest.named_parameters()]
+            if unknown := sorted(set(self.machine.without) - set(names)):
+                raise ValueError(
+                    f"machine.without: a {self.machine.variant} has no weights "
+                    f"{', '.join(unknown)}, only {', '.join(names)}"
+                )
+        if self.machine.variant in ("rbm", "product_rbm") and self.machine.H2:
             raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
         if "rooms" in self.data.sources and not self.data.rooms:
             raise ValueError("data.rooms must say how many rooms to generate")
@@ -129,6 +144,44 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not TOML: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise ConfigError(f"{path.name}: {place}: {first['msg']}") from error
+        raise ConfigError(f"{path.name}: {_first_error(error)}") from error
+
+
+def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
+    """A configuration with entries changed, each named as in "training.epochs".
+
+    Raises:
+        ConfigError: there is no such entry, or the values do not fit.
+    """
+    values = config.model_dump()
+    for name, value in settings.items():
+        section, _, entry = name.partition(".")
+        known = getattr(type(getattr(config, section, None)), "model_fields", {})
+        if entry not in known:
+            choice = f"{section} has {', '.join(known)}" if known else "name it section.entry"
+            raise ConfigError(f"no setting {name!r}: {choice}")
+        values[section][entry] = value
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{dict(settings)} do not fit: {_first_error(error)}") from error
+
+
+def config_toml(config: Config) -> str:
+    """The configuration as a TOML file that `load_config` reads."""
+    values = config.model_dump(mode="json", exclude_none=True)
+    sections = {name: values.pop(name) for name in list(values) if isinstance(values[name], dict)}
+    blocks = [_entries(values)]
+    blocks += [f"[{name}]\n{_entries(entries)}" for name, entries in sections.items()]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _entries(values: Mapping[str, Any]) -> str:
+    # Of the values that a configuration holds, JSON writes all as TOML does.
+    return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items())
+
+
+def _first_error(error: ValidationError) -> str:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"]) or "the file"
+    return f"{place}: {first['msg']}"

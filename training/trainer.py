@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine, MachineSpec, Triway, build
+from app.boltzmann.spec import FACTORISED
 from training.batches import SceneTensors, seen_triples
 from training.checkpoints import load_checkpoint, save_checkpoint
 from training.config import Config
@@ -69,7 +70,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
         H1=shape.H1,
         H2=shape.H2,
         C=data.room_types,
-        K=shape.K if shape.variant == "triway" else 0,
+        K=shape.K if shape.variant in FACTORISED else 0,
         T=len(triples),
         G=shape.G,
         form=shape.form,
@@ -83,6 +84,8 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
         machine.c1.fill_(shape.initial_c1)
         machine.Q.zero_()
         _start_relations(machine, data.train)
+        for name in shape.without:
+            machine.get_parameter(name).zero_().requires_grad_(False)
     return machine
 
 
@@ -152,7 +155,7 @@ class Trainer:
         biases: list[Tensor] = []
         relations: list[Tensor] = []
         for name, parameter in self.machine.named_parameters():
-            if name == "kappa":
+            if not parameter.requires_grad:
                 continue
             group = matrices if parameter.dim() > 1 else biases
             (group if name in _OBJECT_PART else relations).append(parameter)
@@ -233,9 +236,10 @@ class Trainer:
             if progress is not None:
                 progress(number, (step + 1) / self.steps_per_epoch, total / (step + 1))
         loss = total / self.steps_per_epoch
-        if not math.isfinite(loss):
+        finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
+        if not math.isfinite(loss) or not finite:
             raise FloatingPointError(
-                f"the loss of epoch {number} is {loss}: lower the learning rate"
+                f"epoch {number} diverged at a loss of {loss}: lower the learning rate"
             )
         self._close_epoch(number, loss, began)
 

@@ -8,11 +8,17 @@ from __future__ import annotations
 
 from app.boltzmann.gbm import GBM
 from app.boltzmann.machine import BoltzmannMachine
+from app.boltzmann.product_rbm import ProductRBM
 from app.boltzmann.rbm import RBM
 from app.boltzmann.spec import MachineSpec
 from app.boltzmann.triway import Triway
 
-VARIANTS: dict[str, type[BoltzmannMachine]] = {"rbm": RBM, "gbm": GBM, "triway": Triway}
+VARIANTS: dict[str, type[BoltzmannMachine]] = {
+    "rbm": RBM,
+    "gbm": GBM,
+    "triway": Triway,
+    "product_rbm": ProductRBM,
+}
 
 
 def build(spec: MachineSpec) -> BoltzmannMachine:
@@ -20,4 +26,13 @@ def build(spec: MachineSpec) -> BoltzmannMachine:
     return VARIANTS[spec.variant](spec)
 
 
-__all__ = ["GBM", "RBM", "VARIANTS", "BoltzmannMachine", "MachineSpec", "Triway", "build"]
+__all__ = [
+    "GBM",
+    "RBM",
+    "VARIANTS",
+    "BoltzmannMachine",
+    "MachineSpec",
+    "ProductRBM",
+    "Triway",
+    "build",
+]

@@ -27,6 +27,10 @@ class RBM(BoltzmannMachine):
         self.d = nn.Parameter(torch.zeros(spec.T))
         self.U = nn.Parameter(torch.zeros(spec.T, spec.H1))
 
+    def context_weights(self) -> Tensor:
+        """U, (T, H1)."""
+        return self.U
+
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
         """All T units, whatever the scene holds."""
         return triple_edges(self.triples)
@@ -37,15 +41,15 @@ class RBM(BoltzmannMachine):
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
         """d_t + U_t·h1."""
-        return self.d + h1 @ self.U.T
+        return self.d + h1 @ self.context_weights().T
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
         """weight @ U."""
-        return weight @ self.U
+        return weight @ self.context_weights()
 
     def relation_context(self, edges: Edges) -> Tensor:
         """U itself."""
-        return self.U.unsqueeze(0)
+        return self.context_weights().unsqueeze(0)
 
     def relation_input(self, edges: Edges, r: Tensor) -> Tensor:
         """What relations add to the log-odds of objects, (..., B, V): nothing."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
-Variant = Literal["rbm", "gbm", "triway"]
+Variant = Literal["rbm", "gbm", "triway", "product_rbm"]
 Form = Literal["seed", "local"]
+
+FACTORISED: frozenset[Variant] = frozenset({"triway", "product_rbm"})
+"""Variants whose relation–context weights are shared by factors of rank K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,13 +17,13 @@ class MachineSpec:
     """Sizes and form of one Boltzmann machine.
 
     Attributes:
-        variant: ``rbm``, ``gbm`` or ``triway``.
+        variant: ``rbm``, ``gbm``, ``triway``, or ``product_rbm`` (RBM with the Triway's U).
         V: object classes (visible units v).
         A: canonical relations.
         H1: hidden units of the first layer.
         H2: hidden units of the second layer; 0 leaves the layer out.
         C: room types that shift the biases of h1 when one is given.
-        K: rank of the shared tri-way and relation-context weights (Triway).
+        K: rank of the shared tri-way and relation-context weights (Triway, product RBM).
         G: rank of the context's say in what given relations imply for others (Triway, local form);
             0 leaves implications out.
         T: relation units with a weight of their own: all units of the RBM and GBM, the sparse
@@ -50,11 +53,11 @@ class MachineSpec:
         for name in ("H2", "C", "K", "T", "G"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
-        if self.variant == "triway" and self.K < 1:
-            raise ValueError(f"a triway machine needs a rank K of at least 1, not {self.K}")
+        if self.variant in FACTORISED and self.K < 1:
+            raise ValueError(f"a {self.variant} machine needs a rank K of at least 1, not {self.K}")
         if self.G and (self.variant != "triway" or self.form != "local"):
             raise ValueError(f"G must be 0 but in a local triway machine, not {self.G}")
-        if self.variant == "rbm" and self.H2:
+        if self.variant in ("rbm", "product_rbm") and self.H2:
             raise ValueError(f"an RBM has one hidden layer: H2 must be 0, not {self.H2}")
 
     def to_dict(self) -> dict[str, Any]:

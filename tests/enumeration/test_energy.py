@@ -31,15 +31,23 @@ def relation_logit(machine, e, v, h1):
         if spec.variant == "gbm":
             logit += p["g"][t, 0] * v[i] + p["g"][t, 1] * v[j]
         return float(logit)
+    if spec.variant == "product_rbm":
+        return float(
+            p["d"][table.index(e)] + sum(shared(p, spec, e, x) * h[x] for x in range(spec.H1))
+        )
     w = p["s"][a, i] + p["o"][a, j]
     w += sum(p["S"][i, k] * p["R"][a, k] * p["O"][j, k] for k in range(spec.K))
     if e in table:
         w += p["residual"][table.index(e)]
     for x in range(spec.H1):
-        u = p["P"][a, x]
-        u = u + sum(p["S"][i, k] * p["O"][j, k] * p["M"][a, k, x] for k in range(spec.K))
-        w = w + u * h[x]
+        w = w + shared(p, spec, e, x) * h[x]
     return float(p["d"][a] + w)
+
+
+def shared(p, spec, e, x):
+    """U_e at hidden unit x, through the factors."""
+    a, i, j = e
+    return p["P"][a, x] + sum(p["S"][i, k] * p["O"][j, k] * p["M"][a, k, x] for k in range(spec.K))
 
 
 def energy_by_hand(machine, edges, v, r, h1, h2, room=None):

@@ -9,7 +9,7 @@ import torch
 
 from app.boltzmann import Triway
 from training.checkpoints import CheckpointError
-from training.config import Config
+from training.config import Config, ConfigError, with_settings
 from training.pipeline import prepare
 from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer
@@ -91,6 +91,32 @@ def test_the_curve_has_objects_and_relations_separately(data, tmp_path):
         assert all(0 < error < 1 for error in errors)
         assert errors[-1] < errors[0]
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ["M", "n"])
+def test_weights_can_be_held_at_zero(data, name):
+    """The others start as they would have: what is compared differs by these weights alone."""
+    config = with_settings(small_config(), {"machine.without": [name]})
+    free, held = Trainer(small_config(), data), Trainer(config, data)
+    first, second = weights(free.machine), weights(held.machine)
+    assert first.pop(name).any()
+    assert not second.pop(name).any()
+    assert same(first, second)
+    trained = weights(held.run().machine)
+    assert not trained.pop(name).any()
+    assert not torch.equal(trained["R"], second["R"])
+
+
+def test_weights_to_hold_must_exist():
+    with pytest.raises(ConfigError, match="a triway has no weights H, g, only b, c1"):
+        with_settings(small_config(), {"machine.without": ["H", "M", "g"]})
+
+
+def test_a_digest_knows_what_is_held_at_zero():
+    config = small_config()
+    assert "without" not in config.model_dump_json()
+    assert with_settings(config, {"machine.without": ["M"]}).digest != config.digest
+    assert with_settings(config, {"machine.without": []}).digest == config.digest
 
 
 def test_patience_ends_a_run_early(data):

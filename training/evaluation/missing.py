@@ -137,13 +137,17 @@ def leave_one_out(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -
 def rank_blocks(
     blocks: Iterable[tuple[Tensor, Tensor, Tensor]], scenes: int, skipped: int
 ) -> LeaveOneOut:
-    """Rank targets by scores, blocks as `removed_objects` yields them."""
+    """Rank targets by scores, blocks as `removed_objects` yields them.
+
+    Raises:
+        FloatingPointError: a score is nan.
+    """
     empty = torch.zeros(0, dtype=torch.int64)
     rows, targets, above, ties = [empty], [empty], [empty], [empty]
     log_p = [torch.zeros(0, dtype=torch.float64)]
     for row, target, values in blocks:
         if bool(values.isnan().any()):
-            raise ValueError("a score is not a number")
+            raise FloatingPointError("a score is not a number")
         chosen = values.gather(1, target.unsqueeze(1))
         rows.append(row)
         targets.append(target)

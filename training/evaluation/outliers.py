@@ -137,6 +137,8 @@ def intruder_scores(
     nothing = torch.zeros(0, dtype=torch.int64)
     parts = [(nothing, nothing.double(), nothing.bool(), nothing, nothing.bool())]
     for index in kept.split(block):
+        if not len(index):
+            continue
         parts += _scored_blocks(scenes.v[index], index, added[index], structure, score)
     placed, log_odds, intruder, sizes, untouched = (
         torch.cat(column).numpy() for column in zip(*parts, strict=True)

@@ -118,6 +118,8 @@ def leave_one_out_at(
     def blocks() -> list[tuple[Tensor, Tensor, Tensor]]:
         every = []
         for index in torch.arange(len(row)).split(block):
+            if not len(index):
+                continue
             some = places.rows(index)
             values = score(some).masked_fill((some.v > 0) | structure, -torch.inf)
             every.append((row[index], target[index], values))

@@ -125,14 +125,14 @@ def candidates_of(batch: Batch, values: Tensor, mask: Tensor) -> Iterator[Candid
         values, mask: (B, A, n, n) scores, and which triples are candidates.
 
     Raises:
-        ValueError: the score of a candidate is nan.
+        FloatingPointError: the score of a candidate is nan.
     """
     for row in range(len(batch)):
         relation, x, y = mask[row].nonzero(as_tuple=True)
         own = batch.classes[row]
         score = values[row, relation, x, y].double().numpy()
         if np.isnan(score).any():
-            raise ValueError(f"the score of scene {row} of a batch is not a number")
+            raise FloatingPointError(f"the score of scene {row} of a batch is not a number")
         yield Candidates(
             scene=row,
             relation=relation.numpy(),

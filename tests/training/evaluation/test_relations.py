@@ -120,7 +120,7 @@ def test_expected_hits_shares_ties():
 
 def test_a_score_that_is_no_number_is_an_error():
     data = tensors([scene([0, 1], [(0, 0, 1)])])
-    with pytest.raises(ValueError, match="not a number"):
+    with pytest.raises(FloatingPointError, match="not a number"):
         rank_relations(data, NO_STRUCTURE, lambda batch: flat(batch) * float("nan"))
 
 

@@ -14,7 +14,7 @@ from tests.training.evaluation.scenes import flat, random_scenes, scene, tensors
 from tests.training.evaluation.test_completion import larger_machine
 from training.batches import seen_triples
 from training.evaluation.cases import some_scenes
-from training.evaluation.contenders import Contender, artifact_contender
+from training.evaluation.contenders import Contender, artifact_contender, machine_contender
 from training.evaluation.density import DensitySettings
 from training.evaluation.report import (
     SourceReport,
@@ -87,6 +87,17 @@ def test_a_report_goes_on_with_the_same_questions_alone(tmp_path):
             measure(path, CONTENDER, other, "toy")
     with pytest.raises(ValueError, match="unknown tasks"):
         measure(path, CONTENDER, SETTING, "toy", tasks=("T9",))
+
+
+@pytest.mark.parametrize("name", LARGER)
+def test_scenes_that_hold_no_question_have_no_outcome(name):
+    """A source without relations, and scenes of one class: nothing is asked, nothing fails."""
+    contender = machine_contender(larger_machine(name), TRAIN, EFFORT)
+    asked = [task for task in TASKS if task.startswith(("T1", "T2", "T3"))]
+    silent = Setting(tensors([scene([k]) for k in range(3)], V), NO_STRUCTURE, TRAIN, SEEN)
+    report = SourceReport("silent", digest(silent))
+    assert list(run(contender, silent, report, tasks=asked)) == asked
+    assert set(report.outcomes.values()) == {None}
 
 
 def test_who_takes_no_part_is_none():

@@ -1,0 +1,70 @@
+"""The rows of an ablation: what is read from TOML, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from training.ablation import load_rows, shipped_ablations
+from training.config import ConfigError, load_config
+
+FULL = load_config("indoor-triway")
+
+
+@pytest.mark.parametrize("name", shipped_ablations())
+def test_shipped_rows_learn_from_the_scenes_of_the_full_model(name):
+    full = load_config(name)
+    rows = load_rows(shipped_ablations()[name], full)
+    assert {row.data for row in rows} == {full.data.model_copy()}
+    assert all(row.description for row in rows)
+    # Each is another model, not another name.
+    changed = [row.model_copy(update={"name": "", "description": ""}) for row in (full, *rows)]
+    assert len({row.digest for row in changed}) == len(changed)
+
+
+def rows(tmp_path, text):
+    path = tmp_path / "rows.toml"
+    path.write_text(text)
+    return load_rows(path, FULL)
+
+
+def test_a_row_changes_what_it_names_and_nothing_else(tmp_path):
+    text = (
+        '[[row]]\nname = "shallow"\nwhat = "one layer"\nchanges = { "machine.H2" = 0 }\n'
+        '[[row]]\nname = "old"\nwhat = "the paper"\nfrom = "seed-gbm"\n'
+    )
+    shallow, old = rows(tmp_path, text)
+    assert (shallow.name, shallow.description, shallow.machine.H2) == ("shallow", "one layer", 0)
+    assert (shallow.objective, shallow.training) == (FULL.objective, FULL.training)
+    paper = load_config("seed-gbm")
+    assert (old.machine, old.training) == (paper.machine, paper.training)
+    assert old.data == FULL.data != paper.data
+
+
+ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[[row]", "is not TOML"),
+        ("", "row: Field required"),
+        ('[[row]]\nname = "x"', "row.0.what: Field required"),
+        (ONE.format(name="x", rest="change = {}"), "row.0.change: Extra inputs"),
+        (ONE.format(name="x", rest=""), "x: it changes nothing in indoor-triway"),
+        (ONE.format(name="x y", rest='from = "seed-rbm"'), "x y: String should match"),
+        (ONE.format(name="x", rest='from = "nobody"'), "x: no configuration 'nobody'"),
+        (ONE.format(name="x", rest='changes = { "a.b" = 1 }'), "x: no setting 'a.b'"),
+        (ONE.format(name="x", rest='changes = { "machine.H1" = 0 }'), "x: .*machine.H1: Input"),
+        (ONE.format(name="x", rest='changes = { "machine.without" = ["g"] }'), "no weights g"),
+        (ONE.format(name="indoor-triway", rest='from = "seed-rbm"'), "two rows are called indoor"),
+        (ONE.format(name="x", rest='from = "seed-rbm"') * 2, "two rows are called x"),
+    ],
+)
+def test_bad_rows_say_what_is_wrong(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message):
+        rows(tmp_path, text)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"no ablation .*nowhere.toml"):
+        load_rows(tmp_path / "nowhere.toml", FULL)
