@@ -29,7 +29,8 @@ from training.evaluation.relations import rank_relations
 from training.objectives import OBJECTIVES, CompositeLikelihood
 
 _VALIDATION_SCENES = 400
-_OBJECT_PART = frozenset({"b", "c1", "c2", "W", "J", "Q"})
+# At the full learning rate: the rest are relation weights, which overfit within an epoch at it.
+_FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
 # Called after every update with (epoch, share of the epoch done, mean loss so far).
 Progress = Callable[[int, float, float], None]
@@ -158,7 +159,7 @@ class Trainer:
             if not parameter.requires_grad:
                 continue
             group = matrices if parameter.dim() > 1 else biases
-            (group if name in _OBJECT_PART else relations).append(parameter)
+            (group if name in _FULL_RATE else relations).append(parameter)
         rate = t.learning_rate * t.relation_rate
         groups = [
             {"params": matrices, "weight_decay": t.weight_decay, "lr": t.learning_rate},

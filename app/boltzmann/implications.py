@@ -45,7 +45,7 @@ def implication_features(given: Tensor) -> Tensor:
     steps = both.shape[1]
     # All paths at once: (B, 2A·n, n) by (B, n, 2A·n).
     paths = both.flatten(1, 2) @ both.transpose(1, 2).flatten(2)
-    paths = paths.view(-1, steps, n, steps, n).transpose(2, 3).flatten(1, 2).clamp(max=1.0)
+    paths = paths.view(len(given), steps, n, steps, n).transpose(2, 3).flatten(1, 2).clamp(max=1.0)
     outgoing = both.sum(-1, keepdim=True) - both
     incoming = both.sum(-2, keepdim=True) - both
     degrees = torch.cat([outgoing, incoming], 1).clamp(max=_MOST)
