@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.boltzmann.gibbs import State
@@ -42,6 +43,8 @@ def generate(
 
     Chains run in blocks of fixed size, each with a random stream of its own and always whole. So
     scene k depends on the seed and on k, not on how many others a request asked for.
+
+    Structure stands in no relation but those of the evidence.
 
     Of a(x, y) and a(y, x), which exclude each other, the one that is likelier given the context
     stays where both were drawn; evidence stays in any case. A class stands in a relation to itself
@@ -92,6 +95,7 @@ def _scenes(
     artifact: Artifact, state: State, shown: Tensor, given: set[Triple], room: Tensor | None
 ) -> list[GeneratedScene]:
     machine, labels = artifact.machine, artifact.vocabulary.labels
+    structure = artifact.vocabulary.structure
     edges = state.edges
     v = state.v * shown
     logits = machine.relation_logits(edges, state.v, state.h1)
@@ -108,7 +112,7 @@ def _scenes(
             strict=True,
         )
         likelihood = dict(zip(names, logits[row, units].tolist(), strict=True))
-        kept = [triple for triple in likelihood if _stays(triple, likelihood, given)]
+        kept = [triple for triple in likelihood if _stays(triple, likelihood, given, structure)]
         r[row, units[[triple in set(kept) for triple in likelihood]]] = 1.0
         triples.append(sorted({*kept, *given}))
     scores = log_score(machine, v, r, edges, state.h1, room).tolist()
@@ -123,12 +127,18 @@ def _scenes(
     ]
 
 
-def _stays(triple: Triple, likelihood: Mapping[Triple, float], given: set[Triple]) -> bool:
+def _stays(
+    triple: Triple,
+    likelihood: Mapping[Triple, float],
+    given: set[Triple],
+    structure: NDArray[np.bool_],
+) -> bool:
     a, i, j = triple
     if triple in given:
         return True
     mirrored = (a, j, i)
-    if i == j or mirrored in given:
+    # Training drops the relations of structure, so what is drawn of them means nothing.
+    if i == j or mirrored in given or structure[i] or structure[j]:
         return False
     if mirrored not in likelihood:
         return True

@@ -17,9 +17,9 @@ _RESEARCH_WARNING = """\
 > freely licensed scenes alone carries no such warning."""
 
 _INTENDED_USE = """\
-For a robot that has recognised the objects of an indoor scene: which spatial relations hold between
-them, which object is missing and where it would stand, which one does not belong, and what such a
-scene looks like."""
+For a robot that has recognised the objects of a scene like those of the sources below: which
+spatial relations hold between them, which object is missing and where it would stand, which one
+does not belong, and what such a scene looks like."""
 
 _LIMITS = """\
 - The model speaks of classes, not of instances: it says whether a class belongs here, not how many
@@ -28,9 +28,9 @@ _LIMITS = """\
   above without being false, and `/relations` answers what an annotator would list.
 - Left and front are meant in the viewer's axes. Where a source has no viewer, one was chosen in
   training, and these two relations carry that choice.
-- Labels outside the vocabulary are not understood. Structure and vague labels (floor, wall, object)
+- Labels outside the vocabulary are not understood. Structure and vague labels (floor, sky, object)
   are accepted and never proposed.
-- Rooms unlike those of the sources above are outside what the figures speak of, and so are scenes
+- Scenes unlike those of the sources above are outside what the figures speak of, and so are scenes
   of which the robot saw a small part.
 - A probability is a statistical statement about such scenes. It is no safety check: do not let a
   robot move something, or leave it alone, on this answer only."""

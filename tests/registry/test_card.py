@@ -38,6 +38,8 @@ def test_names_data_terms_metrics_and_limits() -> None:
     assert "18 (stored as float16, float32, int32)" in page
     assert "3, of which 2 may be proposed" in page
     assert "bedroom, office" in page
+    # Models of streets have a card as well: what a scene is, the sources say.
+    assert "indoor" not in page
     for heading in ("Intended use", "Metrics", "Data and terms", "Limits"):
         assert f"\n## {heading}\n" in page
 

@@ -67,7 +67,7 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
     What is observed depends on how a scene was annotated:
 
     - relations by people: every pair of instances; what is not listed is off, in the sense that the
-      annotator would not list it;
+      annotator would not list it; what is listed both ways round is unobserved;
     - positions: what `app.scene.geometry` derives, from `room_viewpoint` where the axes are not a
       viewer's; support links count as on-top, and then nothing else holds of the pair;
     - boxes in an image: what `training.datasets.image_plane` derives;
@@ -153,7 +153,9 @@ def _relations(scene: AnnotatedScene) -> PoseRelations:
         holds = np.zeros((A, n, n), dtype=np.bool_)
         for subject, relation, anchor in scene.relations:
             holds[canonicalise(subject, relation, anchor)] = True
-        return PoseRelations(holds, np.broadcast_to(~np.eye(n, dtype=np.bool_), holds.shape))
+        # Who says that each is in front of the other has said nothing.
+        both = holds & holds.swapaxes(1, 2)
+        return PoseRelations(holds & ~both, ~both & ~np.eye(n, dtype=np.bool_))
     if any(thing.position is not None for thing in scene.objects):
         found = _from_poses(scene)
     elif any(thing.box2d is not None for thing in scene.objects):

@@ -20,20 +20,25 @@ class Names:
         base: classes of every indoor vocabulary.
         structure: classes that are accepted and never proposed.
         not_objects: labels that become no class.
+        surroundings: structure outdoors; no class of an indoor vocabulary.
         outdoor: labels that become no class of an indoor vocabulary.
         aliases: other names of each class.
+        kinds: narrower things by the class that stands for them where they have none of their own.
         rooms: other names of each room type; "" lists words that name none.
     """
 
     base: tuple[str, ...] = ()
     structure: tuple[str, ...] = ()
     not_objects: tuple[str, ...] = ()
+    surroundings: tuple[str, ...] = ()
     outdoor: tuple[str, ...] = ()
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
     rooms: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for title, table in (("aliases", self.aliases), ("rooms", self.rooms)):
+        tables = {"aliases": self.aliases, "kinds": self.kinds, "rooms": self.rooms}
+        for title, table in tables.items():
             owner: dict[str, str] = {}
             for name, others in table.items():
                 for other in (name, *others):
@@ -43,6 +48,10 @@ class Names:
         for name in self.base:
             if (other := self.canonical(name)) != name:
                 raise ValueError(f"the base class {name!r} is an alias of {other!r}")
+        for name, kinds in self.kinds.items():
+            for kind in (name, *kinds):
+                if (other := self.canonical(kind)) != kind:
+                    raise ValueError(f"kinds: {kind!r} is an alias of {other!r}")
 
     def canonical(self, label: str) -> str:
         """The curated name of a label, or the label itself, in lower case with single spaces."""
@@ -65,7 +74,7 @@ class Names:
             for name, others in self.aliases.items()
             for other in (name, *others)
         }
-        for name in (*self.base, *self.structure):
+        for name in (*self.base, *self.structure, *self.surroundings):
             keys.setdefault(label_key(name), name)
         return keys
 
@@ -91,7 +100,9 @@ def curated_names(path: Path = NAMES_FILE) -> Names:
         base=tuple(values["base"]),
         structure=tuple(values["structure"]),
         not_objects=tuple(values["not_objects"]),
+        surroundings=tuple(values["surroundings"]),
         outdoor=tuple(values["outdoor"]),
         aliases={name: tuple(others) for name, others in values["aliases"].items()},
+        kinds={name: tuple(others) for name, others in values["kinds"].items()},
         rooms={name: tuple(others) for name, others in values["rooms"].items()},
     )

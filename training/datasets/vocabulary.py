@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +33,8 @@ def build_vocabulary(
 
     Labels are pooled under their curated names before they are counted. The base classes of
     ``names`` are in the vocabulary however seldom they are mentioned; labels of ``not_objects``
-    never are, those of ``outdoor`` only on request. Room types are kept under the same minimum,
-    counted in scenes.
+    never are, those of ``outdoor`` and ``surroundings`` only on request. Room types are kept
+    under the same minimum, counted in scenes.
 
     Raises:
         ValueError: no scene mentions any class often enough.
@@ -55,9 +56,9 @@ def build_vocabulary(
     )
     refused = {label_key(name) for name in names.not_objects}
     if not outdoor:
-        refused |= {label_key(name) for name in names.outdoor}
+        refused |= {label_key(name) for name in (*names.outdoor, *names.surroundings)}
     kept = set(names.base) | {label for label, count in mentions.items() if count >= minimum}
-    structure = {label_key(name) for name in names.structure}
+    structure = {label_key(name) for name in (*names.structure, *names.surroundings)}
     return Vocabulary(
         [
             ObjectClass(
@@ -97,16 +98,27 @@ def source_vocabulary(
 ) -> Vocabulary:
     """A vocabulary of what the given scenes mention alone: no base classes, curated names.
 
-    For models trained on one source, such as ProcTHOR or the generated rooms.
+    For models trained on one source, such as ProcTHOR or VRD. It has few classes, so that a class
+    also answers to its kinds that have none of their own: "dining table" is a table.
     """
     names = curated_names()
     mentioned_only = Names(
         structure=names.structure,
         not_objects=names.not_objects,
+        surroundings=names.surroundings,
         aliases=_reachable(names),
         rooms=names.rooms,
     )
-    return build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
+    found = build_vocabulary(scenes, mentioned_only, minimum=minimum, outdoor=True)
+    objects = [_with_kinds(entry, found, names) for entry in found.objects]
+    return Vocabulary(objects, found.room_types)
+
+
+def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
+    """The class, with the names of those of its kinds that the vocabulary does not know."""
+    unknown = [kind for kind in names.kinds.get(entry.label, ()) if vocabulary.index(kind) is None]
+    more = [name for kind in unknown for name in (kind, *names.aliases.get(kind, ()))]
+    return replace(entry, aliases=(*entry.aliases, *more))
 
 
 def _reachable(names: Names) -> dict[str, tuple[str, ...]]:

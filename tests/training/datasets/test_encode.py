@@ -79,6 +79,16 @@ def test_what_people_annotate_is_complete() -> None:
     assert (found.evidence.observed == ~np.diag(single)).all()
 
 
+def test_what_is_said_both_ways_round_says_nothing() -> None:
+    found = encoded(
+        things("desk", "monitor", "pencil"),
+        relations=((0, "front", 1), (0, "behind", 1), (2, "on-top", 0), (1, "on-top", 0)),
+    )
+    assert triples(found) == {(ON_TOP, PENCIL, DESK), (ON_TOP, MONITOR, DESK)}
+    unobserved = np.argwhere(~found.instance_observed & ~np.eye(3, dtype=bool))
+    assert unobserved.tolist() == [[FRONT, 0, 1], [FRONT, 1, 0]]
+
+
 def test_relations_of_structure_are_neither_on_nor_off() -> None:
     found = encoded(
         things("desk", "floor", "monitor"), relations=((0, "on-top", 1), (2, "on-top", 0))
