@@ -154,7 +154,7 @@ def _instance_pairs(
     examples = []
     for a in range(len(values)):
         logit = values[a][place[:, None], place[None, :]]
-        # Also where geometry left it open, what is not listed is off: a listing is what is promised.
+        # What is not listed is off, left open by geometry or not: a listing is what is promised.
         kept = pair & np.isfinite(logit)
         examples.append(np.stack([logit[kept], both[kept], scene.instance_holds[a][kept]], 1))
     return examples

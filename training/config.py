@@ -42,6 +42,7 @@ class MachineConfig(_Section):
     H2: int = Field(default=100, ge=0)
     K: int = Field(default=32, ge=0)
     G: int = Field(default=0, ge=0, description="rank of what given relations imply (Triway)")
+    N: int = Field(default=0, ge=0, description="fantasies kept for chains to start from")
     form: Form = "seed"
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)

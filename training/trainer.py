@@ -22,6 +22,7 @@ from training.batches import SceneTensors, seen_triples
 from training.checkpoints import load_checkpoint, save_checkpoint
 from training.config import Config
 from training.curves import Epoch, write_csv, write_plot
+from training.dreams import dream
 from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.reconstruction import reconstruction_error
 from training.evaluation.relations import machine_score as relation_score
@@ -74,6 +75,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
         K=shape.K if shape.variant in FACTORISED else 0,
         T=len(triples),
         G=shape.G,
+        N=shape.N,
         form=shape.form,
     )
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
@@ -219,6 +221,7 @@ class Trainer:
         with torch.no_grad():
             for name, value in self.best.items():
                 parameters[name].copy_(value)
+        dream(self.machine, self.data.train, self.config.training.seed)
         return TrainingResult(self.machine, self.epochs, self.best_epoch, self.seconds, True)
 
     def _out_of_patience(self) -> bool:

@@ -48,6 +48,11 @@ class BoltzmannMachine(nn.Module, ABC):
         self.Q = nn.Parameter(torch.zeros(spec.C, spec.H1))
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         self.triples: Tensor
+        if spec.N:
+            # N scenes as bits, see `fantasies`; (N, ceil(V / 32)).
+            empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
+            self.register_buffer("fantasies", empty)
+        self.fantasies: Tensor
         self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
             lambda module, _: module.index_triples()
         )

@@ -28,6 +28,7 @@ class MachineSpec:
             0 leaves implications out.
         T: relation units with a weight of their own: all units of the RBM and GBM, the sparse
             residual of the Triway.
+        N: fantasies that chains start from; 0 keeps none.
         form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations).
     """
 
@@ -40,6 +41,7 @@ class MachineSpec:
     K: int = 0
     T: int = 0
     G: int = 0
+    N: int = 0
     form: Form = "seed"
 
     def __post_init__(self) -> None:
@@ -50,7 +52,7 @@ class MachineSpec:
         for name in ("V", "A", "H1"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("H2", "C", "K", "T", "G"):
+        for name in ("H2", "C", "K", "T", "G", "N"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
         if self.variant in FACTORISED and self.K < 1:

@@ -9,30 +9,12 @@ import torch
 from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine
-from app.boltzmann.gibbs import Clamp, State, initial_state, linear_schedule, run
+from app.boltzmann.fantasies import start_chains
+from app.boltzmann.gibbs import Clamp, State, gibbs_step
 from app.reasoning.evidence import Observation
 
 CHAINS = 8
 """Chains of a block: one random stream and one matrix product for all of them."""
-
-# The first half of the sweeps cools down from so many times the temperature, in so many stairs: a
-# machine of its own for every sweep would cost as much as the sweep.
-_HOTTEST = 2.0
-_STAIRS = 10
-
-Stairs = list[tuple[BoltzmannMachine, int]]
-
-
-def cooling(machine: BoltzmannMachine, steps: int, temperature: float) -> Stairs:
-    """(tempered machine, sweeps) of each stair, the last one at the temperature itself."""
-    annealed = steps // 2
-    stairs = min(_STAIRS, annealed)
-    heats = linear_schedule(stairs + 1, _HOTTEST * temperature, temperature)[:-1]
-    sweeps = [annealed * (k + 1) // stairs - annealed * k // stairs for k in range(stairs)]
-    return [
-        (machine if heat == 1 else machine.scaled(1 / heat), count)
-        for heat, count in zip([*heats, temperature], [*sweeps, steps - annealed], strict=True)
-    ]
 
 
 def held_units(
@@ -75,19 +57,20 @@ def clamped(observation: Observation, held: tuple[Tensor, Tensor]) -> Clamp:
     return replace(clamp, edges=edges, r=evidence.r, observed=evidence.observed)
 
 
-def run_block(observation: Observation, clamp: Clamp, stairs: Stairs, seed: int) -> State:
-    """The state of a block of chains at the foot of the stairs, from nothing but the evidence."""
+def run_block(
+    observation: Observation, clamp: Clamp, machine: BoltzmannMachine, steps: int, seed: int
+) -> State:
+    """The state of a block of chains after some sweeps, started where the evidence is at home.
+
+    Args:
+        machine: that of the observation, or the same at another temperature.
+    """
     generator = torch.Generator().manual_seed(seed)
-    machine, _ = stairs[0]
-    v = observation.present.to(machine.b.dtype).repeat(CHAINS, 1)
-    state = initial_state(machine, v, generator, clamp)
-    if clamp.h1 is not None and clamp.h2 is not None:
-        h1, h2 = torch.where(clamp.h1, 1.0, state.h1), torch.where(clamp.h2, 1.0, state.h2)
-        state = replace(state, h1=h1, h2=h2)
+    given = observation.present.to(machine.b.dtype).repeat(CHAINS, 1)
+    state = start_chains(observation.machine, given, generator, clamp)
     # In the local form relations do not act on the rest: the last sweep alone draws them.
     always = machine.spec.form == "seed"
-    for machine, sweeps in stairs[:-1]:
-        state = run(machine, state, generator, [1.0] * sweeps, clamp, relations=always)
-    machine, sweeps = stairs[-1]
-    state = run(machine, state, generator, [1.0] * (sweeps - 1), clamp, relations=always)
-    return run(machine, state, generator, [1.0], clamp)
+    for last in range(1, steps + 1):
+        relations = always or last == steps
+        state = gibbs_step(machine, state, generator, clamp, relations=relations)
+    return state

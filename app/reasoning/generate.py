@@ -11,14 +11,14 @@ from torch import Tensor
 
 from app.boltzmann.gibbs import State
 from app.reasoning.answers import GeneratedScene
-from app.reasoning.chains import clamped, cooling, held_units, run_block
+from app.reasoning.chains import clamped, held_units, run_block
 from app.reasoning.evidence import observe
 from app.reasoning.log_score import log_score
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
 
-STEPS = 200
+STEPS = 50
 """Gibbs sweeps of a chain unless a request says otherwise."""
 
 Triple = tuple[int, int, int]
@@ -35,7 +35,7 @@ def generate(
     temperature: float = 1.0,
     context: Mapping[str, Sequence[int]] | None = None,
 ) -> tuple[GeneratedScene, ...]:
-    """Draw scenes that contain the evidence, by annealed block Gibbs chains.
+    """Draw scenes that contain the evidence, by block Gibbs chains that start at fantasies.
 
     Objects of the scene are in every drawn one, whatever their confidence, and so are its
     relations; what it shows not to hold stays off; all else is drawn. Structure that is no
@@ -54,7 +54,7 @@ def generate(
         count: how many scenes.
         seed: of the random numbers; the same seed draws the same scenes.
         steps: Gibbs sweeps of a chain, `STEPS` by default.
-        temperature: at which the chains end, from twice of it; above 1 for more varied scenes.
+        temperature: of the chains; above 1 for more varied scenes.
         context: layer name ("h1", "h2") to the units that are held on.
 
     Raises:
@@ -72,14 +72,14 @@ def generate(
         raise ValueError(f"temperature must be positive, not {temperature}")
     observation = observe(machine, scene)
     clamp = clamped(observation, held_units(machine, context or {}))
-    stairs = cooling(machine, steps, temperature)
+    tempered = machine if temperature == 1 else machine.scaled(1 / temperature)
     shown = observation.present | ~torch.tensor(artifact.vocabulary.structure)
     of = observation.classes[observation.row].tolist()
     given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
     drawn: list[GeneratedScene] = []
     block = 0
     while len(drawn) < count:
-        state = run_block(observation, clamp, stairs, _stream(seed, block))
+        state = run_block(observation, clamp, tempered, steps, _stream(seed, block))
         drawn += _scenes(artifact, state, shown, given, clamp.room)
         block += 1
     return tuple(drawn[:count])

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine, Triway
 from app.boltzmann.edges import PairEdges
-from app.boltzmann.gibbs import Clamp, State, initial_state, present_classes, run
-from app.reasoning.chains import cooling
+from app.boltzmann.fantasies import start_chains
+from app.boltzmann.gibbs import Clamp, State, gibbs_step, present_classes
 from app.reasoning.generate import STEPS
 from training.evaluation.generation import Drawn, Sampler, mirrored_pairs
 from training.evaluation.relations import spread_units
@@ -17,14 +17,13 @@ _CHAINS = 256
 
 
 def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler:
-    """Annealed Gibbs chains as the service runs them, but with relations as the machine draws them.
+    """Gibbs chains as the service runs them, but with relations as the machine draws them.
 
     The service keeps one of a(x, y) and a(y, x); here both may be on.
 
     Args:
         steps: sweeps of a chain.
     """
-    stairs = cooling(machine, steps, 1.0)
     # In the local form relations do not act on the rest: the last sweep alone draws them.
     always = machine.spec.form == "seed"
 
@@ -33,10 +32,10 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
         parts = []
         for index in torch.arange(len(given)).split(_CHAINS):
             clamp = Clamp(v=given[index], room=room[index] if machine.spec.C else None)
-            state = initial_state(machine, given[index].to(machine.b.dtype), generator, clamp)
-            for tempered, sweeps in stairs:
-                state = run(tempered, state, generator, [1.0] * sweeps, clamp, relations=always)
-            state = run(machine, state, generator, [1.0], clamp)
+            state = start_chains(machine, given[index].to(machine.b.dtype), generator, clamp)
+            for last in range(1, steps + 1):
+                relations = always or last == steps
+                state = gibbs_step(machine, state, generator, clamp, relations=relations)
             parts.append((state.v, *mirrored_pairs(_grid(machine, state))))
         v, related, mirrored = (torch.cat(column) for column in zip(*parts, strict=True))
         return Drawn(v, related, mirrored)

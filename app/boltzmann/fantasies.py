@@ -1,0 +1,89 @@
+"""Where chains start: scenes that the machine has dreamt before.
+
+A chain that starts at nothing needs thousands of sweeps to find all kinds of rooms, since one kind
+leads to another through scenes of neither. So a trained machine keeps N fantasies, the states of
+long chains of its own (`BoltzmannMachine.fantasies`), and a new chain goes on from one of them.
+
+With evidence the fantasies are weighed by what they make of it before one is drawn for each chain,
+
+    log w = sum_{i given} log p(v_i = 1 | h1) + h1·Q[t] + sum_{k held} log p(h1_k = 1),
+
+h1 at its mean given the fantasy: sampling importance resampling, exact in the limit of many
+fantasies up to the mean; the sweeps that follow do the rest.
+
+Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for
+fantasy particles; Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian
+state estimation" (1993), for resampling and moving.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+
+from app.boltzmann.bernoulli import bernoulli
+from app.boltzmann.gibbs import FREE, Clamp, State, initial_state
+from app.boltzmann.machine import BoltzmannMachine
+from app.boltzmann.mean_field import Evidence, mean_field
+
+_WORD = 32
+
+
+def words(classes: int) -> int:
+    """32-bit words that a scene of so many classes takes."""
+    return -(-classes // _WORD)
+
+
+def pack_scenes(v: Tensor) -> Tensor:
+    """Presence (N, V) as bits, (N, words) int32."""
+    bits = np.zeros((len(v), words(v.shape[1]) * _WORD), dtype=np.uint8)
+    bits[:, : v.shape[1]] = v.numpy() > 0
+    packed = np.packbits(bits, axis=1, bitorder="little").view("<i4").astype(np.int32)
+    return torch.from_numpy(packed)
+
+
+def unpack_scenes(packed: Tensor, classes: int) -> Tensor:
+    """Presence (N, V) float of scenes as bits."""
+    octets = packed.numpy().astype("<i4").view(np.uint8).reshape(len(packed), -1)
+    bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
+    return torch.from_numpy(bits).float()
+
+
+@torch.no_grad()
+def start_chains(
+    machine: BoltzmannMachine, given: Tensor, generator: torch.Generator, clamp: Clamp = FREE
+) -> State:
+    """A state for each chain, from a fantasy that suits its evidence, or else from the evidence.
+
+    Args:
+        given: (B, V), 1 for classes that must be there.
+        clamp: room types and held units count as evidence too; see `Clamp`.
+    """
+    if not machine.spec.N:
+        return _held(initial_state(machine, given, generator, clamp), clamp)
+    v = unpack_scenes(machine.fantasies, machine.spec.V).to(given.dtype)
+    field = mean_field(machine, Evidence(v))
+    mean = field.y.sigmoid()
+    present = logsigmoid(machine.object_logits(mean))
+    weight = given @ present.T
+    if clamp.room is not None and machine.spec.C:
+        known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
+        weight = weight + known * (machine.Q[clamp.room.clamp(min=0)] @ mean.T)
+    if clamp.h1 is not None:
+        weight = weight + clamp.h1.to(given.dtype) @ logsigmoid(field.y).T
+    chosen = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
+    state = initial_state(machine, v[chosen].maximum(given), generator, clamp)
+    h1 = bernoulli(mean[chosen], generator)
+    h2 = bernoulli(field.h2[chosen], generator) if machine.spec.H2 else state.h2
+    return _held(replace(state, h1=h1, h2=h2), clamp)
+
+
+def _held(state: State, clamp: Clamp) -> State:
+    """The state with held units on."""
+    h1 = state.h1 if clamp.h1 is None else torch.where(clamp.h1, 1.0, state.h1)
+    h2 = state.h2 if clamp.h2 is None else torch.where(clamp.h2, 1.0, state.h2)
+    return replace(state, h1=h1, h2=h2)
