@@ -29,7 +29,11 @@ from training.evaluation.generation import (
 )
 from training.evaluation.intervals import Metric
 from training.evaluation.metrics import Ratio
-from training.evaluation.missing import leave_one_out, missing_metrics
+from training.evaluation.missing import (
+    leave_one_out,
+    leave_one_out_in_rooms,
+    missing_metrics,
+)
 from training.evaluation.outliers import by_popularity, by_room, intruder_scores
 from training.evaluation.placed import leave_one_out_at
 from training.evaluation.placement import placement_scores
@@ -54,7 +58,7 @@ class Setting:
         train: training scenes of the same source or sources; tasks that need them are left out
             where there are none.
         seen: (T, 3), the triples that the contender may have learnt from.
-        limit: at most so many scenes where a task is slow: T2-at, T3, T3b, T4, Calibration.
+        limit: at most so many scenes where a task is slow: all but T1a, T1b and T2.
         seed: of the questions.
     """
 
@@ -100,6 +104,9 @@ class Outcome:
 
 Task = Callable[[Contender, Setting], Outcome | None]
 
+FIRST = (1, 2, 5, 10, 20, 50, 100)
+"""Numbers of predictions, per scene, among which annotated relations are looked for."""
+
 
 def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
     """T1a; unlisted is counted as wrong."""
@@ -119,7 +126,7 @@ def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
         "R-precision, mean over scenes": counted.per_scene(),
     }
     metrics |= _by_relation(with_counts, len(scenes))
-    for k in (20, 50, 100):
+    for k in FIRST:
         metrics[f"R@{k}"] = rank(with_counts, len(scenes), first=k).per_scene()
     if setting.seen is not None:
         new = unseen(with_counts, setting.seen, scenes.v.shape[1])
@@ -168,6 +175,22 @@ def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
     unknown = np.array([scene.unknown for scene in scenes.scenes], dtype=np.int64)
     metrics: dict[str, Metric] = dict(missing_metrics(result))
     metrics["MRR, unknown labels score 0"] = result.with_unknown(unknown)
+    return Outcome(metrics, len(scenes), result.skipped)
+
+
+def missing_in_room_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T2 on the scenes whose room type is known and given; beside it the same with it withheld."""
+    known = (setting.scenes.room >= 0).nonzero().squeeze(1)
+    if contender.objects_in_rooms is None or not len(known):
+        return None
+    scenes = subset(setting.scenes, known)
+    result = leave_one_out_in_rooms(scenes, setting.structure, contender.objects_in_rooms)
+    if not len(result.target):
+        return None
+    metrics: dict[str, Metric] = dict(missing_metrics(result))
+    if contender.objects is not None:
+        blind = leave_one_out(scenes, setting.structure, contender.objects)
+        metrics["MRR, room type withheld"] = blind.ratio(blind.reciprocal_rank())
     return Outcome(metrics, len(scenes), result.skipped)
 
 
@@ -267,23 +290,29 @@ def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(first), 0, notes)
 
 
-def reference_contenders(setting: Setting) -> dict[str, Contender]:
-    """What drawn scenes are compared with: independent classes above, real scenes as the floor."""
-    floor = scene_sampler(setting.halves()[1])
-    references = {"held-out scenes (floor)": Contender(sampler=floor)}
-    if setting.train is not None:
-        train = setting.train
-        references["independent classes"] = Contender(
-            sampler=independent_sampler(train), density=lambda: independent_density(train)
-        )
-    return references
+def floor_contender(setting: Setting) -> Contender:
+    """A second half of the held-out scenes as if it had been drawn: the floor of T4."""
+    _, second = setting.halves()
+    return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
+
+
+def independent_contender(setting: Setting) -> Contender:
+    """Classes drawn independently, each as often as in training."""
+    train = setting.train
+    if train is None:
+        return Contender()
+    return Contender(
+        sampler=independent_sampler(train),
+        density=lambda: independent_density(train),
+        parameters=train.v.shape[1],
+    )
 
 
 def density_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Log-likelihood of the objects in nats; claims rest on the upper estimate of log Z."""
     if contender.density is None or setting.train is None:
         return None
-    scenes = setting.scenes
+    scenes = setting.some()
     density = contender.density()
     annotated = scenes.annotated_classes[scenes.source]
     log_sum = density.log_unnormalised(scenes.v, annotated).double().numpy()
@@ -325,6 +354,7 @@ TASKS: dict[str, Task] = {
     "T1a relations": relations_task,
     "T1b completion": completion_task,
     "T2 missing": missing_task,
+    "T2 missing, room type given": missing_in_room_task,
     "T2-at missing at a place": placed_task,
     "T3 outliers, uniform": outliers_task,
     "T3 outliers, by popularity": partial(outliers_task, law=by_popularity),
