@@ -4,6 +4,7 @@
                         trials.jsonl      every trial of its tuning
                         run/              the training run of a machine, and its calibration
                         <source>.json     its report on a source
+                        pooled.json       what does not follow from these: see `WHOLE_SET`
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ from functools import partial
 from pathlib import Path
 
 from training.benchmark.entries import Entry, Material, Rival
-from training.evaluation.report import SourceReport, digest, measure
-from training.evaluation.tasks import Setting
+from training.evaluation.report import SourceReport, digest, measure, pooled
+from training.evaluation.tasks import WHOLE_SET, Setting
 
 # Called with (row, source, what is being done).
 Progress = Callable[[str, str, str], None]
 # The last word on a row and a source: measured now, or known from a file.
 DONE, KNOWN = "done", "known"
+
+POOLED = "pooled"
+"""All sources together."""
 
 
 class BenchmarkError(RuntimeError):
@@ -37,7 +41,7 @@ class Plan:
     Attributes:
         folder: of the reports.
         material: what rows learn from.
-        settings: by source; "pooled" may be one of them.
+        settings: by source, and `POOLED` for all of them.
         tasks: names in `TASKS` or `SEED_TASKS`.
     """
 
@@ -50,6 +54,10 @@ class Plan:
         """The folder of one row and seed."""
         return place_of(self.folder, entry.name, entry.seed)
 
+    def asked(self, source: str) -> list[str]:
+        """The tasks that are measured on a source."""
+        return [task for task in self.tasks if source != POOLED or task in WHOLE_SET]
+
     def known(self, entry: Entry) -> dict[str, SourceReport]:
         """The finished reports of a row, by source.
 
@@ -61,24 +69,26 @@ class Plan:
         found = {}
         for source, setting in self.settings.items():
             path = self.place(entry) / f"{source}.json"
-            if path.exists():
+            if not self.asked(source):
+                found[source] = SourceReport(source, digest(setting))
+            elif path.exists():
                 report = read_report(path, setting)
-                if set(self.tasks) <= set(report.outcomes):
+                if set(self.asked(source)) <= set(report.outcomes):
                     found[source] = report
         return found
 
-    def measure(self, entry: Entry, progress: Progress) -> dict[str, SourceReport]:
-        """A row's report on every source, trained only where one lacks a task.
+    def measure(self, entry: Entry, progress: Progress) -> None:
+        """Fill in a row's report on every source, training it only where one lacks a task.
 
         KeyboardInterrupt passes through; finished tasks are on disk by then.
 
         Raises:
             BenchmarkError: see `known`.
         """
-        found = self.known(entry)
+        known = self.known(entry)
         rival: Rival | None = None
         for source, setting in self.settings.items():
-            if source in found:
+            if source in known:
                 progress(entry.name, source, KNOWN)
                 continue
             say = partial(progress, entry.name, source)
@@ -86,13 +96,21 @@ class Plan:
             if rival is None:
                 say("training")
                 rival = entry.make(self.material, place, say)
-            path = place / f"{source}.json"
             contender = rival(setting)
             _note_parameters(place, contender.parameters)
-            measure(path, contender, setting, source, tasks=self.tasks, progress=say)
-            # As the file has it, whose numbers are rounded: a resumed benchmark finds the same.
-            found[source] = read_report(path, setting)
+            path = place / f"{source}.json"
+            measure(path, contender, setting, source, tasks=self.asked(source), progress=say)
             say(DONE)
+
+    def report(self, entry: Entry) -> dict[str, SourceReport]:
+        """A measured row's reports as its files have them, that of the pool with all tasks."""
+        found = self.known(entry)
+        sources = [found[source] for source in self.settings if source != POOLED]
+        if POOLED in self.settings:
+            whole = found[POOLED]
+            every = pooled(sources, POOLED)
+            every.outcomes |= whole.outcomes
+            found[POOLED] = every
         return {source: found[source] for source in self.settings}
 
 
@@ -100,7 +118,9 @@ def measure_entries(
     plan: Plan, entries: Sequence[Entry], progress: Progress
 ) -> dict[tuple[str, int], dict[str, SourceReport]]:
     """Every row's report on every source, by (name, seed), one row after the other."""
-    return {(entry.name, entry.seed): plan.measure(entry, progress) for entry in entries}
+    for entry in entries:
+        plan.measure(entry, progress)
+    return {(entry.name, entry.seed): plan.report(entry) for entry in entries}
 
 
 def place_of(folder: Path, name: str, seed: int) -> Path:

@@ -23,7 +23,7 @@ from app.reasoning import generate
 from app.registry import Artifact
 from app.scene import CANONICAL, Scene
 from training.benchmark.entries import Entry
-from training.benchmark.measure import Plan, slug
+from training.benchmark.measure import POOLED, Plan, slug
 from training.benchmark.summary import Results
 from training.datasets import EncodedScene
 from training.evaluation.answers import QUESTIONS
@@ -58,21 +58,20 @@ def write_plots(
         machines: the rows that have a run and a calibration, the first one ours.
     """
     matplotlib.use("Agg")
-    pooled = [*plan.settings][-1]
     runs: dict[str, list[Path]] = {}
     for entry in machines:
         runs.setdefault(entry.name, []).append(plan.place(entry) / "run" / "curve.csv")
     drawn: dict[str, Figure] = {
         "learning-curves": learning_curves(runs),
-        "recall": recall_curves(results, pooled),
+        "recall": recall_curves(results, POOLED),
     }
     for entry in machines:
-        outcome = reports[entry.name, entry.seed][pooled].outcomes.get("Calibration")
+        outcome = reports[entry.name, entry.seed][POOLED].outcomes.get("Calibration")
         if outcome is not None and entry.seed == machines[0].seed:
-            title = f"{entry.name}, {pooled}"
+            title = f"{entry.name}, {POOLED}"
             drawn[f"reliability-{slug(entry.name)}"] = reliability_diagrams(outcome, title)
     ours = machines[0].make(plan.material, plan.place(machines[0]), _silent)
-    setting = plan.settings[pooled]
+    setting = plan.settings[POOLED]
     if artifact := ours(setting).artifact:
         drawn["scenes"] = scenes_page(artifact, setting.scenes.scenes, machines[0].name)
     written = []

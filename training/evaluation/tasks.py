@@ -350,6 +350,12 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), skipped) if metrics else None
 
 
+WHOLE_SET = ("T4 generate",)
+"""Tasks whose metrics are of a set of scenes as a whole: of several sources they are measured anew.
+
+The others' are pooled from what was found of each source.
+"""
+
 TASKS: dict[str, Task] = {
     "T1a relations": relations_task,
     "T1b completion": completion_task,
