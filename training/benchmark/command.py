@@ -21,6 +21,7 @@ from training.benchmark.compare import (
 )
 from training.benchmark.domains import default_configs, read_domains
 from training.benchmark.measure import DONE, KNOWN, BenchmarkError, Progress
+from training.checkpoints import CheckpointError
 from training.config import ConfigError
 from training.datasets import DatasetError
 from training.evaluation.tasks import TASKS
@@ -90,8 +91,8 @@ def benchmark(
             console.print(write_results(place, domain.name, results, protocol), markup=False)
             console.print(f"every figure: {place / 'results.json'}; plots beside it")
     except (
-        ConfigError, DatasetError, BenchmarkError, BrokenProcessPool, ValueError,
-        FloatingPointError,
+        ConfigError, DatasetError, BenchmarkError, CheckpointError, BrokenProcessPool,
+        ValueError, FloatingPointError,
     ) as error:  # fmt: skip
         console.print(f"[red]error:[/red] {error}")
         raise typer.Exit(1) from None
