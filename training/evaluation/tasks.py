@@ -47,6 +47,8 @@ from training.evaluation.relations import (
 )
 from training.trainer import subset
 
+_COSTLY = 3
+
 
 @dataclass(frozen=True, eq=False)
 class Setting:
@@ -58,7 +60,8 @@ class Setting:
         train: training scenes of the same source or sources; tasks that need them are left out
             where there are none.
         seen: (T, 3), the triples that the contender may have learnt from.
-        limit: at most so many scenes where a task is slow: all but T1a, T1b and T2.
+        limit: at most so many scenes where a task is slow: all but T1a, T1b and T2; a third of it
+            where a scene costs most: T2-at and Calibration.
         seed: of the questions.
     """
 
@@ -69,13 +72,14 @@ class Setting:
     limit: int | None = 600
     seed: int = 0
 
-    def some(self, related: bool = False) -> SceneTensors:
-        """At most `limit` scenes, only annotated ones if `related`."""
+    def some(self, related: bool = False, *, share: int = 1) -> SceneTensors:
+        """At most `limit` / `share` scenes, only annotated ones if `related`."""
         scenes = self.scenes
         if related:
             kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
             scenes = subset(scenes, torch.tensor(kept, dtype=torch.int64))
-        return some_scenes(scenes, self.limit, self.seed)
+        most = None if self.limit is None else max(1, self.limit // share)
+        return some_scenes(scenes, most, self.seed)
 
     def halves(self) -> tuple[SceneTensors, SceneTensors]:
         """Scenes to compare drawn ones with, and a second half, each within the limit."""
@@ -198,7 +202,7 @@ def placed_task(contender: Contender, setting: Setting) -> Outcome | None:
     """T2-at; beside it the same questions answered without the place."""
     if contender.placed is None:
         return None
-    scenes = setting.some(related=True)
+    scenes = setting.some(related=True, share=_COSTLY)
     found = leave_one_out_at(scenes, setting.structure, contender.placed, seed=setting.seed)
     if not len(found.relation):
         return None
@@ -333,7 +337,8 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Every probability of the service, as published and with log-odds as they are."""
     if contender.artifact is None:
         return None
-    scenes, related = setting.some(), setting.some(related=True)
+    scenes = setting.some(share=_COSTLY)
+    related = setting.some(related=True, share=_COSTLY)
     metrics: dict[str, Metric] = {}
     skipped = 0
     published, plain = contender.artifact, uncalibrated(contender.artifact)
