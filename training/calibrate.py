@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from sklearn.linear_model import LogisticRegression
 
-from app.reasoning import outliers
+from app.reasoning import misplaced
 from app.reasoning.evidence import draw_context, observe
 from app.reasoning.objects import absent_log_odds
 from app.reasoning.placements import log_p_at
@@ -233,8 +233,7 @@ def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int 
         if case is None:
             continue
         scene, false = case
-        _, misplaced = outliers(artifact, scene)
-        for answer in misplaced:
+        for answer in misplaced(artifact, scene):
             p = np.clip(answer.probability, 1e-9, 1 - 1e-9)
             triple = (CANONICAL.index(answer.relation), answer.subject, answer.object)
             rows.append((float(np.log(p / (1 - p))), triple == false))

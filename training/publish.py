@@ -6,12 +6,10 @@ import importlib.metadata
 import json
 from collections.abc import Callable
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from app.registry import (
     Artifact,
-    Calibration,
     DataSource,
     Description,
     Metric,
@@ -19,6 +17,7 @@ from app.registry import (
     VocabularyEntry,
 )
 from training.calibrate import calibrate
+from training.draft import as_stored, draft_artifact
 from training.evaluation.report import Row, evaluate
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
@@ -44,21 +43,10 @@ def publish_run(
         StoreError, ArtifactError: see `Store.publish`.
     """
     data = scenes.training_data()
-    machine = run.machine
-    for parameter in machine.parameters():
-        if parameter.dim() > 1:
-            parameter.copy_(parameter.half().float())
+    machine = as_stored(run.machine)
     progress("calibrating")
     relations = machine.spec.A
-    draft = Artifact(
-        manifest=None,  # type: ignore[arg-type]  # nothing that calibration asks looks at it
-        machine=machine,
-        vocabulary=scenes.vocabulary,
-        calibration=Calibration.neutral(relations),
-        digest="",
-        card="",
-        path=Path(),
-    )
+    draft = draft_artifact(machine, scenes.vocabulary)
     calibration = calibrate(draft, data.validation, run.config.training.seed)
     rows = evaluate(machine, data.test, data.structure, progress=progress)
     progress("publishing")

@@ -24,7 +24,7 @@ from app.reasoning.answers import (
 from app.reasoning.contexts import contexts
 from app.reasoning.generate import generate
 from app.reasoning.missing import missing
-from app.reasoning.outliers import outliers
+from app.reasoning.outliers import misplaced, outliers
 from app.reasoning.relations import relations
 
 __all__ = [
@@ -38,6 +38,7 @@ __all__ = [
     "RelationAnswer",
     "contexts",
     "generate",
+    "misplaced",
     "missing",
     "outliers",
     "relations",

@@ -76,6 +76,14 @@ def outliers(
     return found, _misplaced(artifact, observation, scene)
 
 
+@torch.inference_mode()
+def misplaced(artifact: Artifact, scene: Scene) -> tuple[MisplacedAnswer, ...]:
+    """Every stated relation, least likely first: what `outliers` says of them, and no more."""
+    if not scene.objects:
+        return ()
+    return _misplaced(artifact, observe(artifact.machine, scene), scene)
+
+
 def log_odds_given_rest(observation: Observation) -> Tensor:
     """Log-odds of each present class given the scene without it, (n,)."""
     machine, n = observation.machine, len(observation.classes)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.reasoning import missing, outliers, relations
+from app.reasoning import misplaced, missing, outliers, relations
 from app.scene import CANONICAL, OPPOSITES, Scene, contradiction
 from tests.reasoning.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
 
@@ -143,7 +143,8 @@ def test_pairs_choose_ordered_pairs(name, scene, data, opposites):
 @given(names, scenes())
 def test_outliers(name, scene):
     """Every object once, least fitting first; instances of one class alike."""
-    found, misplaced = outliers(ARTIFACTS[name], scene)
+    found, unlikely = outliers(ARTIFACTS[name], scene)
+    assert misplaced(ARTIFACTS[name], scene) == unlikely
     assert sorted(answer.object for answer in found) == list(range(len(scene.objects)))
     keys = [(answer.log_odds, answer.object) for answer in found]
     assert keys == sorted(keys)
@@ -157,10 +158,10 @@ def test_outliers(name, scene):
         assert answer.label not in others
         assert len(set(others)) == len(others)
     assert all(len(values) == 1 for values in by_class.values())
-    assert len(misplaced) == len(scene.relations or ())
+    assert len(unlikely) == len(scene.relations or ())
     stated = {(CANONICAL[a], i, j) for a, i, j in scene.relations or ()}
-    assert {(a.relation, a.subject, a.object) for a in misplaced} == stated
-    probabilities = [answer.probability for answer in misplaced]
+    assert {(a.relation, a.subject, a.object) for a in unlikely} == stated
+    probabilities = [answer.probability for answer in unlikely]
     assert probabilities == sorted(probabilities, reverse=True)
 
 

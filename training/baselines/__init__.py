@@ -47,15 +47,15 @@ OBJECTS: Final[tuple[Baseline[ObjectScore], ...]] = (
     Baseline("kNN over scenes", nearest.propose, missing_mrr),
     Baseline("EASE", ease.propose, missing_mrr),
     Baseline("pairwise logistic", pairwise.propose, missing_mrr),
-    Baseline("scikit-learn BernoulliRBM", bernoulli_rbm.propose, missing_mrr),
-    Baseline("masked transformer", transformer.propose, missing_mrr),
-    Baseline("denoising autoencoder", denoising.propose, missing_mrr),
+    Baseline("scikit-learn BernoulliRBM", bernoulli_rbm.propose, missing_mrr, stochastic=True),
+    Baseline("masked transformer", transformer.propose, missing_mrr, stochastic=True),
+    Baseline("denoising autoencoder", denoising.propose, missing_mrr, stochastic=True),
 )
 
 RELATIONS: Final[tuple[Baseline[RelationScore], ...]] = (
     Baseline("relation popularity", relation_popularity.propose, r_precision),
     Baseline("frequency table", frequency_table.propose, r_precision),
-    Baseline("ComplEx", complex_embedding.propose, r_precision),
+    Baseline("ComplEx", complex_embedding.propose, r_precision, stochastic=True),
 )
 
 # These see the given relations of a batch, and are for T1b alone.

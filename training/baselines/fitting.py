@@ -76,11 +76,13 @@ class Baseline(Generic[Score]):
         name: the row.
         propose: training scenes, structure classes (V,) bool and a seed -> what to choose from.
         judge: validation scenes, structure classes and a score -> figure, higher is better.
+        stochastic: the seed changes the fit.
     """
 
     name: str
     propose: Callable[[SceneTensors, Tensor, int], Proposals[Score]]
     judge: Callable[[SceneTensors, Tensor, Score], float]
+    stochastic: bool = False
 
     def fit(
         self,

@@ -1,4 +1,4 @@
-"""The rows of the tables: baselines tuned on validation, and our machines, by training seed."""
+"""The rows of the tables: our machines, baselines tuned on validation, and references."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from app.boltzmann import BoltzmannMachine
+from app.registry import Calibration
+from app.scene import Vocabulary
 from training.baselines import (
     COMPLETIONS,
     OBJECTS,
@@ -18,22 +21,45 @@ from training.baselines import (
     Fitted,
     placed_product,
 )
+from training.baselines.size import parameter_count
+from training.calibrate import calibrate
 from training.config import Config
-from training.evaluation.contenders import Contender, fitted_alarm, machine_contender
+from training.draft import as_stored, draft_artifact
+from training.evaluation.contenders import (
+    Contender,
+    artifact_contender,
+    fitted_alarm,
+    machine_contender,
+)
 from training.evaluation.missing import ObjectScore
 from training.evaluation.outliers import intruder_scores
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
+from training.evaluation.tasks import Setting, floor_contender, independent_contender
 from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer, TrainingData
 
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What the rows of a domain learn from: tensors of the three parts, and their vocabulary."""
+
+    data: TrainingData
+    vocabulary: Vocabulary
+
+
+CALIBRATION = "calibration.json"
+"""A machine's calibration, beside its run."""
+
 Progress = Callable[[str], None]
-Maker = Callable[[Path, Progress], Contender]
+# What stands for a row before some scenes: the same before all of them if it was trained.
+Rival = Callable[[Setting], Contender]
+Maker = Callable[[Material, Path, Progress], Rival]
 
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One row of the tables.
+    """One row of the tables, for one training seed.
 
     Attributes:
         name: of the row; rows of one name differ by their seed.
@@ -49,83 +75,134 @@ class Entry:
     make: Maker
 
 
-def baseline_entries(
-    data: TrainingData, seed: int, names: Sequence[str] | None = None
-) -> Iterator[Entry]:
+def baseline_entries(seed: int, names: Sequence[str] | None = None) -> Iterator[Entry]:
     """Every baseline of the registries, or those named.
+
+    Where the seed changes nothing, there is an entry for seed 0 alone.
 
     Raises:
         ValueError: an unknown name.
     """
-    makers: dict[str, Maker] = {}
+    makers: dict[str, tuple[Maker, bool]] = {}
     for objects in OBJECTS:
-        makers[objects.name] = partial(_objects, objects, data, seed)
+        makers[objects.name] = partial(_objects, objects, seed), objects.stochastic
     for relations in RELATIONS:
-        makers[relations.name] = partial(_relations, relations, data, seed)
+        makers[relations.name] = partial(_relations, relations, seed), relations.stochastic
     for completion in COMPLETIONS:
-        makers[f"{completion.name}, completing"] = partial(_completion, completion, data, seed)
+        name = f"{completion.name}, completing"
+        makers[name] = partial(_completion, completion, seed), completion.stochastic
     for placed in PLACED:
-        makers[placed.name] = partial(_placed, placed, data, seed)
+        makers[placed.name] = partial(_placed, placed, seed), placed.stochastic
     if unknown := sorted(set(names or ()) - set(makers)):
         raise ValueError(f"unknown baselines {unknown}, must be of {list(makers)}")
-    for name, make in makers.items():
-        if names is None or name in names:
+    for name, (make, stochastic) in makers.items():
+        if (names is None or name in names) and (stochastic or seed == 0):
             yield Entry(name, seed, f"{name}, seed {seed}", make)
 
 
-def machine_entry(config: Config, data: TrainingData) -> Entry:
-    """A machine trained by a configuration; its run lies in the entry's folder and is resumed."""
-    return Entry(config.name, config.training.seed, config.digest, partial(_machine, config, data))
+def reference_entries() -> Iterator[Entry]:
+    """What drawn scenes and densities are held against; nothing is trained."""
+    yield Entry("independent classes", 0, "independent classes", _independent)
+    yield Entry("held-out scenes (floor)", 0, "held-out scenes (floor)", _floor)
+
+
+def machine_entry(config: Config) -> Entry:
+    """A machine trained by a configuration and calibrated as publishing does.
+
+    Its run lies in the entry's folder and is resumed.
+    """
+    identity = f"{config.digest}, calibrated"
+    return Entry(config.name, config.training.seed, identity, partial(_calibrated, config))
+
+
+def bare_machine_entry(config: Config) -> Entry:
+    """A machine as it was trained: what the seed protocol samples from."""
+    return Entry(config.name, config.training.seed, config.digest, partial(_bare, config))
 
 
 def _objects(
-    baseline: Baseline[ObjectScore], data: TrainingData, seed: int, folder: Path, say: Progress
-) -> Contender:
+    baseline: Baseline[ObjectScore], seed: int, material: Material, folder: Path, say: Progress
+) -> Rival:
     """T2 and T3; T2-at by the product with the frequency table."""
+    data = material.data
     fitted = _fit(baseline, data, seed, folder, say)
     clean = intruder_scores(data.validation, data.structure, fitted.score, seed=seed)
-    alarm = fitted_alarm(clean)
+    alarm, size = fitted_alarm(clean), parameter_count(fitted.score)
     if not _related(data):
-        return Contender(objects=fitted.score, alarm=alarm)
+        return _always(Contender(objects=fitted.score, alarm=alarm, parameters=size))
     (first, *_) = PLACED
     table = _fit(first, data, seed, folder, say)
     product = _fit(placed_product(fitted, table.score), data, seed, folder, say)
-    return Contender(objects=fitted.score, alarm=alarm, placed=product.score)
+    return _always(
+        Contender(objects=fitted.score, alarm=alarm, placed=product.score, parameters=size)
+    )
 
 
 def _relations(
-    baseline: Baseline[RelationScore], data: TrainingData, seed: int, folder: Path, say: Progress
-) -> Contender:
-    score = _fit(baseline, data, seed, folder, say).score
-    return Contender(relations=score, placement=score)
+    baseline: Baseline[RelationScore], seed: int, material: Material, folder: Path, say: Progress
+) -> Rival:
+    score = _fit(baseline, material.data, seed, folder, say).score
+    return _always(Contender(relations=score, placement=score))
 
 
 def _completion(
-    baseline: Baseline[RelationScore], data: TrainingData, seed: int, folder: Path, say: Progress
-) -> Contender:
-    return Contender(completion=_fit(baseline, data, seed, folder, say).score)
+    baseline: Baseline[RelationScore], seed: int, material: Material, folder: Path, say: Progress
+) -> Rival:
+    score = _fit(baseline, material.data, seed, folder, say).score
+    return _always(Contender(completion=score))
 
 
 def _placed(
-    baseline: Baseline[PlacedScore], data: TrainingData, seed: int, folder: Path, say: Progress
-) -> Contender:
-    return Contender(placed=_fit(baseline, data, seed, folder, say).score)
+    baseline: Baseline[PlacedScore], seed: int, material: Material, folder: Path, say: Progress
+) -> Rival:
+    score = _fit(baseline, material.data, seed, folder, say).score
+    return _always(Contender(placed=score))
 
 
-def _machine(config: Config, data: TrainingData, folder: Path, say: Progress) -> Contender:
-    run = folder / "run"
+def _independent(material: Material, folder: Path, say: Progress) -> Rival:  # noqa: ARG001
+    return independent_contender
+
+
+def _floor(material: Material, folder: Path, say: Progress) -> Rival:  # noqa: ARG001
+    return floor_contender
+
+
+def _calibrated(config: Config, material: Material, folder: Path, say: Progress) -> Rival:
+    machine = as_stored(_trained(config, material.data, folder / "run", say))
+    draft = draft_artifact(machine, material.vocabulary)
+    place, seed = folder / "run" / CALIBRATION, config.training.seed
+    if place.exists():
+        calibration = Calibration.model_validate_json(place.read_text(encoding="utf-8"))
+    else:
+        say("calibrating")
+        calibration = calibrate(draft, material.data.validation, seed)
+        partial_file = place.with_suffix(".part")
+        partial_file.write_text(calibration.model_dump_json(indent=1), encoding="utf-8")
+        partial_file.replace(place)
+    artifact = draft_artifact(machine, material.vocabulary, calibration)
+    return _always(artifact_contender(artifact, material.data.train, seed=seed))
+
+
+def _bare(config: Config, material: Material, folder: Path, say: Progress) -> Rival:
+    machine = _trained(config, material.data, folder / "run", say).requires_grad_(False)
+    return _always(machine_contender(machine, material.data.train, seed=config.training.seed))
+
+
+def _trained(config: Config, data: TrainingData, run: Path, say: Progress) -> BoltzmannMachine:
     try:
-        machine = load_run(run).machine
+        return load_run(run).machine
     except RunError:
         run.mkdir(parents=True, exist_ok=True)
-        trainer = Trainer(config, data, run)
-        trainer.resume()
-        epochs = config.training.epochs
-        result = trainer.run(lambda epoch, _, loss: say(f"epoch {epoch + 1}/{epochs}, {loss:.3f}"))
-        save_run(run, config, result)
-        machine = result.machine
-    machine.requires_grad_(False)
-    return machine_contender(machine, data.train, seed=config.training.seed)
+    trainer = Trainer(config, data, run)
+    trainer.resume()
+    epochs = config.training.epochs
+    result = trainer.run(lambda epoch, _, loss: say(f"epoch {epoch + 1}/{epochs}, {loss:.3f}"))
+    save_run(run, config, result)
+    return result.machine
+
+
+def _always(contender: Contender) -> Rival:
+    return lambda _: contender
 
 
 def _fit(

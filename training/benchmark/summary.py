@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from training.evaluation.answers import QUESTIONS
 from training.evaluation.intervals import Figure, Floats, Metric, paired_difference
 from training.evaluation.report import SourceReport
 
@@ -17,16 +18,41 @@ PRIMARY: dict[str, tuple[str, ...]] = {
     "T1a relations": ("R-precision, distinct classes", "R-precision, instance counts"),
     "T1b completion": ("R-precision",),
     "T2 missing": ("MRR", "top-10"),
+    "T2 missing, room type given": ("MRR", "MRR, room type withheld"),
     "T2-at missing at a place": ("MRR", "MRR, on-top"),
-    "T3 outliers, uniform": ("hit@1", "AUROC", "alarms in untouched scenes"),
+    "T3 outliers, uniform": ("hit@1", "AUROC", "alarms in untouched scenes", "intruders caught"),
     "T3 outliers, by popularity": ("hit@1",),
     "T3 outliers, same room type": ("hit@1",),
     "T3b placement": ("hit@1",),
-    "T4 generate": ("MMD², free", "pair correlation, free"),
+    "T4 generate": (
+        "MMD², free",
+        "MMD², given room types",
+        "pair correlation, free",
+        "marginal error, free",
+        "copies of training scenes, free",
+    ),
     "Density": ("gain over independent classes, upper log Z",),
-    "Calibration": (),
+    "Calibration": tuple(
+        f"{figure}, {question}" for figure in ("ECE", "Brier skill") for question in QUESTIONS
+    ),
 }
 """What the Markdown tables show; the JSON holds every metric."""
+
+SEED_PRIMARY: dict[str, tuple[str, ...]] = {
+    "Seed T1": (
+        "labelled relations switched on",
+        "relations switched on per scene",
+        "labelled relations per scene",
+    ),
+    "Seed T2": (
+        "removed objects switched on, relations left on",
+        "removed objects switched on, relations deleted",
+    ),
+    "Seed T3": ("error measure", "error measure, doing nothing"),
+}
+"""The same of the seed protocol."""
+
+_LOWER_IS_BETTER = ("MMD²", "marginal error", "copies", "mirrored", "alarms", "ECE", "error")
 
 
 class MeanOverSeeds(Metric):
@@ -98,28 +124,31 @@ class Results:
     Attributes:
         ours: the row that the others are compared with.
         cells, differences: in the order of rows, sources and tasks.
+        parameters: trained weights by row, where a number says something.
     """
 
     ours: str
     cells: tuple[Cell, ...]
     differences: tuple[Difference, ...]
+    parameters: Mapping[str, int] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
         return {
             "ours": self.ours,
+            "parameters": dict(self.parameters),
             "cells": [asdict(cell) for cell in self.cells],
             "differences": [asdict(difference) for difference in self.differences],
         }
 
-    def markdown(self) -> str:
+    def markdown(self, primary: Mapping[str, tuple[str, ...]] = PRIMARY) -> str:
         """One table for each primary metric: rows by sources.
 
-        A star marks a row that ours stands above: the whole paired interval is above zero.
+        A star marks a row that ours is better than: the whole paired interval is on its side.
         """
         parts = [
             table
-            for task, metrics in PRIMARY.items()
+            for task, metrics in primary.items()
             for metric in metrics
             if (table := self._table(task, metric))
         ]
@@ -130,31 +159,39 @@ class Results:
         if not cells:
             return ""
         sources = list(dict.fromkeys(cell.source for cell in cells))
-        above = {
+        better = {
             (d.row, d.source)
             for d in self.differences
-            if (d.task, d.metric) == (task, metric) and d.figure.above_zero
+            if (d.task, d.metric) == (task, metric) and is_better(metric, d.figure)
         }
         values = {(cell.row, cell.source): cell.figure for cell in cells}
         lines = [
             f"### {task}: {metric}",
             "",
-            "| | " + " | ".join(sources) + " |",
-            "|---" * (len(sources) + 1) + "|",
+            "| | weights | " + " | ".join(sources) + " |",
+            "|---" * (len(sources) + 2) + "|",
         ]
         for row in dict.fromkeys(cell.row for cell in cells):
             shown = [
-                f"{values[row, source]}{' *' if (row, source) in above else ''}"
+                f"{values[row, source]}{' *' if (row, source) in better else ''}"
                 if (row, source) in values
                 else ""
                 for source in sources
             ]
             name = f"**{row}**" if row == self.ours else row
-            lines.append(f"| {name} | " + " | ".join(shown) + " |")
+            weights = f"{self.parameters[row]:,}" if row in self.parameters else ""
+            lines.append(f"| {name} | {weights} | " + " | ".join(shown) + " |")
         return "\n".join(lines)
 
 
-def summarise(reports: Reports, ours: str) -> Results:
+def is_better(metric: str, difference: Figure) -> bool:
+    """The whole interval of a paired difference is on the good side of zero."""
+    if metric.startswith(_LOWER_IS_BETTER):
+        return difference.high < 0
+    return difference.above_zero
+
+
+def summarise(reports: Reports, ours: str, parameters: Mapping[str, int] | None = None) -> Results:
     """The figures of every row, and how far ours stands from each.
 
     Raises:
@@ -176,7 +213,7 @@ def summarise(reports: Reports, ours: str) -> Results:
         for (row, source, task, name), mean in means.items()
         if row != ours and (mine := means.get((ours, source, task, name))) is not None
     )
-    return Results(ours, cells, differences)
+    return Results(ours, cells, differences, parameters or {})
 
 
 def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning import missing, outliers, relations
+from app.reasoning import misplaced, missing, outliers, relations
 from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject
 from training.batches import SceneTensors
@@ -160,7 +160,7 @@ def ask_misplaced(
     if case is None:
         return None
     scene, false = case
-    _, found = outliers(artifact, replace(scene, room_type=None))
+    found = misplaced(artifact, replace(scene, room_type=None))
     return [
         (a.probability, (CANONICAL.index(a.relation), a.subject, a.object) == false) for a in found
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -16,7 +16,7 @@ from training.evaluation import missing, placed, relations
 from training.evaluation.completion import given_score
 from training.evaluation.density import DensitySettings, ObjectDensity, machine_density
 from training.evaluation.generation import Sampler
-from training.evaluation.missing import ObjectScore
+from training.evaluation.missing import ObjectScore, RoomScore
 from training.evaluation.outliers import IntruderScores
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
@@ -71,6 +71,9 @@ class Contender:
         density: Density; called once, when it is needed.
         alarm: T3, the share of untouched scenes that raise one.
         artifact: Calibration.
+        objects_in_rooms: T2 where the room type is given.
+        machine: the seed protocol, which samples.
+        parameters: number of trained weights, None where that says nothing.
     """
 
     objects: ObjectScore | None = None
@@ -82,6 +85,9 @@ class Contender:
     density: Callable[[], ObjectDensity] | None = None
     alarm: Alarm | None = None
     artifact: Artifact | None = None
+    objects_in_rooms: RoomScore | None = None
+    machine: BoltzmannMachine | None = None
+    parameters: int | None = None
 
 
 def machine_contender(
@@ -95,18 +101,21 @@ def machine_contender(
     Args:
         train: training scenes, for the density's annealing.
     """
-    given = given_score(machine)
+    objects, given = missing.machine_score(machine), given_score(machine)
     density = None
     if machine.spec.form == "local":
         density = cache(partial(machine_density, machine, train, settings, seed))
     return Contender(
-        objects=missing.machine_score(machine),
+        objects=objects,
         relations=relations.machine_score(machine),
         completion=given,
         placed=placed.machine_score(machine),
         placement=given,
         sampler=machine_sampler(machine),
         density=density,
+        objects_in_rooms=objects if machine.spec.C else None,
+        machine=machine,
+        parameters=machine.parameter_count,
     )
 
 
@@ -120,14 +129,9 @@ def artifact_contender(
     machine, calibration = artifact.machine, artifact.calibration
     weight = calibration.placed_relation_weight * calibration.placed_temperature
     bare = machine_contender(machine, train, settings, seed)
-    return Contender(
-        objects=bare.objects,
-        relations=bare.relations,
-        completion=bare.completion,
+    return replace(
+        bare,
         placed=placed.machine_score(machine, relation_weight=weight),
-        placement=bare.placement,
-        sampler=bare.sampler,
-        density=bare.density,
         alarm=calibrated_alarm(calibration),
         artifact=artifact,
     )

@@ -10,9 +10,9 @@ Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,11 +107,18 @@ def interval(draws: Floats) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def scene_weights(scenes: int, resamples: int, seed: int) -> Iterator[Floats]:
-    """How often each scene is drawn, (scenes,), resample after resample."""
+@lru_cache(maxsize=4)
+def scene_weights(scenes: int, resamples: int, seed: int) -> Floats:
+    """How often each scene is drawn, (resamples, scenes); not to be written to.
+
+    Kept, since many metrics are resampled over the same scenes one after the other.
+    """
     rng = np.random.default_rng(seed)
-    for _ in range(resamples):
-        yield np.bincount(rng.integers(scenes, size=scenes), minlength=scenes).astype(np.float64)
+    weights = np.empty((resamples, scenes))
+    for row in weights:
+        row[:] = np.bincount(rng.integers(scenes, size=scenes), minlength=scenes)
+    weights.flags.writeable = False
+    return weights
 
 
 def resample(

@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from training.evaluation.intervals import Floats, Metric, resample
+from training.evaluation.intervals import Floats, Metric, resample, scene_weights
 from training.evaluation.item_statistics import STATISTICS
 
 Ints = NDArray[np.int64]
@@ -74,6 +74,14 @@ class Ratio(SceneMetric):
     def at(self, weight: Floats) -> float:
         below = float(weight @ self.denominators)
         return float(weight @ self.numerators) / below if below > 0 else float("nan")
+
+    def resampled(self, resamples: int, seed: int) -> Floats:
+        # All resamples in two products.
+        weights = scene_weights(self.scenes, resamples, seed)
+        top, below = weights @ self.numerators, weights @ self.denominators
+        nothing = np.full(resamples, np.nan)
+        share: Floats = np.divide(top, below, where=below > 0, out=nothing)
+        return share
 
     def mean_over_scenes(self) -> Ratio:
         """The same with every scored scene counting alike."""

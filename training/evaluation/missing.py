@@ -26,6 +26,11 @@ from training.evaluation.metrics import Macro, Ratio
 
 # Log-odds (B, V) of every class given presence (B, V) and the counts of present classes (B, V).
 ObjectScore = Callable[[Tensor], Tensor]
+# The same given room types (B,) as well, -1 where none is known.
+RoomScore = Callable[[Tensor, Tensor], Tensor]
+
+TOP = (1, 2, 3, 5, 10, 20, 50)
+"""Lengths of the lists in which a removed object is looked for."""
 
 
 @dataclass(frozen=True)
@@ -84,27 +89,36 @@ class LeaveOneOut:
         return Ratio(known.numerators, known.denominators + unknown)
 
 
-def machine_score(machine: BoltzmannMachine) -> ObjectScore:
+@dataclass(frozen=True, eq=False)
+class MachineScore:
     """Log-odds under a machine with every relation unobserved.
 
     Seed-form machines sum relations out at the mean-field fixed point.
     """
 
-    def score(v: Tensor) -> Tensor:
-        edges: Edges | None = None
-        if machine.spec.form == "seed":
-            if isinstance(machine, Triway):
-                n = int(v.sum(1).max())
-                value, index = v.topk(n, dim=1)
-                edges = machine.edges(torch.where(value > 0, index, -1))
-            else:
-                edges = machine.edges(torch.zeros(1, 0, dtype=torch.int64))
-        return object_log_odds(machine, Evidence(v, edges))
+    machine: BoltzmannMachine
 
-    return score
+    def __call__(self, v: Tensor, room: Tensor | None = None) -> Tensor:
+        """Scores (B, V) of presence (B, V), room types (B,) withheld unless they are given."""
+        evidence = Evidence(v, _open_units(self.machine, v), room=room)
+        return object_log_odds(self.machine, evidence)
 
 
-@torch.no_grad()
+def machine_score(machine: BoltzmannMachine) -> MachineScore:
+    """A machine's score; it takes room types too."""
+    return MachineScore(machine)
+
+
+def _open_units(machine: BoltzmannMachine, v: Tensor) -> Edges | None:
+    """The relation units that an unobserved relation acts by: none in the local form."""
+    if machine.spec.form == "local":
+        return None
+    if not isinstance(machine, Triway):
+        return machine.edges(torch.zeros(1, 0, dtype=torch.int64))
+    value, index = v.topk(int(v.sum(1).max()), dim=1)
+    return machine.edges(torch.where(value > 0, index, -1))
+
+
 def removed_objects(
     scenes: SceneTensors, structure: Tensor, score: ObjectScore, *, block: int = 256
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
@@ -118,19 +132,34 @@ def removed_objects(
         Positions of the scenes (n,), the removed classes (n,), and the scores (n, V), -inf but for
         candidates.
     """
+    return _removed(scenes, structure, lambda v, _: score(v), block)
+
+
+@torch.no_grad()
+def _removed(
+    scenes: SceneTensors, structure: Tensor, score: RoomScore, block: int = 256
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     removable = (scenes.v > 0) & ~structure
     enough = removable.sum(1) >= 2
     row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
     for start in range(0, len(row), block):
         r, t = row[start : start + block], target[start : start + block]
         v = scenes.v[r].scatter(1, t.unsqueeze(1), 0.0)
-        yield r, t, score(v).masked_fill((v > 0) | structure, -torch.inf)
+        values = score(v, scenes.room[r])
+        yield r, t, values.masked_fill((v > 0) | structure, -torch.inf)
 
 
 def leave_one_out(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> LeaveOneOut:
     """Rank every removed object; see `removed_objects`."""
+    return leave_one_out_in_rooms(scenes, structure, lambda v, _: score(v))
+
+
+def leave_one_out_in_rooms(
+    scenes: SceneTensors, structure: Tensor, score: RoomScore
+) -> LeaveOneOut:
+    """The same where the score is told the room type of each scene."""
     enough = ((scenes.v > 0) & ~structure).sum(1) >= 2
-    blocks = removed_objects(scenes, structure, score)
+    blocks = _removed(scenes, structure, score)
     return rank_blocks(blocks, len(scenes), skipped=int((~enough).sum()))
 
 
@@ -166,9 +195,9 @@ def rank_blocks(
 
 
 def missing_metrics(result: LeaveOneOut) -> dict[str, Ratio | Macro]:
-    """MRR and top-1/5/10, micro-averaged over removed objects, and MRR by class."""
+    """MRR and top-k, micro-averaged over removed objects, and MRR by class."""
     reciprocal = result.reciprocal_rank()
     metrics: dict[str, Ratio | Macro] = {"MRR": result.ratio(reciprocal)}
-    for k in (1, 5, 10):
+    for k in TOP:
         metrics[f"top-{k}"] = result.ratio(result.top(k))
     return metrics | {"MRR, macro by class": result.macro(reciprocal)}

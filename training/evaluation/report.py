@@ -26,9 +26,11 @@ from training.evaluation.intervals import Figure, paired_difference
 from training.evaluation.metrics import metric_from_dict, metric_to_dict, pool
 from training.evaluation.missing import machine_score
 from training.evaluation.relations import machine_score as relation_score
+from training.evaluation.seed_protocol import SEED_TASKS
 from training.evaluation.tasks import TASKS, Outcome, Setting
 from training.trainer import subset
 
+_EVERY_TASK = TASKS | SEED_TASKS
 _PUBLISHED = ("T2 missing", "T1a relations", "T3 outliers, uniform")
 
 Progress = Callable[[str], None]
@@ -141,14 +143,14 @@ def run(
     if report.scenes != digest(setting):
         raise ValueError(f"the report on {report.source} is of other scenes or questions")
     wanted = list(tasks)
-    if unknown := sorted(set(wanted) - set(TASKS)):
-        raise ValueError(f"unknown tasks {unknown}, must be of {list(TASKS)}")
+    if unknown := sorted(set(wanted) - set(_EVERY_TASK)):
+        raise ValueError(f"unknown tasks {unknown}, must be of {list(_EVERY_TASK)}")
     for task in wanted:
         if task in report.outcomes:
             continue
         progress(f"{report.source}: {task}")
         began = time.perf_counter()
-        report.outcomes[task] = TASKS[task](contender, setting)
+        report.outcomes[task] = _EVERY_TASK[task](contender, setting)
         report.seconds[task] = time.perf_counter() - began
         yield task
 

@@ -29,7 +29,11 @@ from training.evaluation.generation import (
 )
 from training.evaluation.intervals import Metric
 from training.evaluation.metrics import Ratio
-from training.evaluation.missing import leave_one_out, missing_metrics
+from training.evaluation.missing import (
+    leave_one_out,
+    leave_one_out_in_rooms,
+    missing_metrics,
+)
 from training.evaluation.outliers import by_popularity, by_room, intruder_scores
 from training.evaluation.placed import leave_one_out_at
 from training.evaluation.placement import placement_scores
@@ -43,6 +47,8 @@ from training.evaluation.relations import (
 )
 from training.trainer import subset
 
+_COSTLY = 3
+
 
 @dataclass(frozen=True, eq=False)
 class Setting:
@@ -54,7 +60,8 @@ class Setting:
         train: training scenes of the same source or sources; tasks that need them are left out
             where there are none.
         seen: (T, 3), the triples that the contender may have learnt from.
-        limit: at most so many scenes where a task is slow: T2-at, T3, T3b, T4, Calibration.
+        limit: at most so many scenes where a task is slow: all but T1a, T1b and T2; a third of it
+            where a scene costs most: T2-at and Calibration.
         seed: of the questions.
     """
 
@@ -65,13 +72,14 @@ class Setting:
     limit: int | None = 600
     seed: int = 0
 
-    def some(self, related: bool = False) -> SceneTensors:
-        """At most `limit` scenes, only annotated ones if `related`."""
+    def some(self, related: bool = False, *, share: int = 1) -> SceneTensors:
+        """At most `limit` / `share` scenes, only annotated ones if `related`."""
         scenes = self.scenes
         if related:
             kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
             scenes = subset(scenes, torch.tensor(kept, dtype=torch.int64))
-        return some_scenes(scenes, self.limit, self.seed)
+        most = None if self.limit is None else max(1, self.limit // share)
+        return some_scenes(scenes, most, self.seed)
 
     def halves(self) -> tuple[SceneTensors, SceneTensors]:
         """Scenes to compare drawn ones with, and a second half, each within the limit."""
@@ -100,6 +108,9 @@ class Outcome:
 
 Task = Callable[[Contender, Setting], Outcome | None]
 
+FIRST = (1, 2, 5, 10, 20, 50, 100)
+"""Numbers of predictions, per scene, among which annotated relations are looked for."""
+
 
 def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
     """T1a; unlisted is counted as wrong."""
@@ -119,7 +130,7 @@ def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
         "R-precision, mean over scenes": counted.per_scene(),
     }
     metrics |= _by_relation(with_counts, len(scenes))
-    for k in (20, 50, 100):
+    for k in FIRST:
         metrics[f"R@{k}"] = rank(with_counts, len(scenes), first=k).per_scene()
     if setting.seen is not None:
         new = unseen(with_counts, setting.seen, scenes.v.shape[1])
@@ -171,11 +182,27 @@ def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), result.skipped)
 
 
+def missing_in_room_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T2 on the scenes whose room type is known and given; beside it the same with it withheld."""
+    known = (setting.scenes.room >= 0).nonzero().squeeze(1)
+    if contender.objects_in_rooms is None or not len(known):
+        return None
+    scenes = subset(setting.scenes, known)
+    result = leave_one_out_in_rooms(scenes, setting.structure, contender.objects_in_rooms)
+    if not len(result.target):
+        return None
+    metrics: dict[str, Metric] = dict(missing_metrics(result))
+    if contender.objects is not None:
+        blind = leave_one_out(scenes, setting.structure, contender.objects)
+        metrics["MRR, room type withheld"] = blind.ratio(blind.reciprocal_rank())
+    return Outcome(metrics, len(scenes), result.skipped)
+
+
 def placed_task(contender: Contender, setting: Setting) -> Outcome | None:
     """T2-at; beside it the same questions answered without the place."""
     if contender.placed is None:
         return None
-    scenes = setting.some(related=True)
+    scenes = setting.some(related=True, share=_COSTLY)
     found = leave_one_out_at(scenes, setting.structure, contender.placed, seed=setting.seed)
     if not len(found.relation):
         return None
@@ -267,23 +294,29 @@ def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(first), 0, notes)
 
 
-def reference_contenders(setting: Setting) -> dict[str, Contender]:
-    """What drawn scenes are compared with: independent classes above, real scenes as the floor."""
-    floor = scene_sampler(setting.halves()[1])
-    references = {"held-out scenes (floor)": Contender(sampler=floor)}
-    if setting.train is not None:
-        train = setting.train
-        references["independent classes"] = Contender(
-            sampler=independent_sampler(train), density=lambda: independent_density(train)
-        )
-    return references
+def floor_contender(setting: Setting) -> Contender:
+    """A second half of the held-out scenes as if it had been drawn: the floor of T4."""
+    _, second = setting.halves()
+    return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
+
+
+def independent_contender(setting: Setting) -> Contender:
+    """Classes drawn independently, each as often as in training."""
+    train = setting.train
+    if train is None:
+        return Contender()
+    return Contender(
+        sampler=independent_sampler(train),
+        density=lambda: independent_density(train),
+        parameters=train.v.shape[1],
+    )
 
 
 def density_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Log-likelihood of the objects in nats; claims rest on the upper estimate of log Z."""
     if contender.density is None or setting.train is None:
         return None
-    scenes = setting.scenes
+    scenes = setting.some()
     density = contender.density()
     annotated = scenes.annotated_classes[scenes.source]
     log_sum = density.log_unnormalised(scenes.v, annotated).double().numpy()
@@ -304,7 +337,8 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Every probability of the service, as published and with log-odds as they are."""
     if contender.artifact is None:
         return None
-    scenes, related = setting.some(), setting.some(related=True)
+    scenes = setting.some(share=_COSTLY)
+    related = setting.some(related=True, share=_COSTLY)
     metrics: dict[str, Metric] = {}
     skipped = 0
     published, plain = contender.artifact, uncalibrated(contender.artifact)
@@ -321,10 +355,17 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), skipped) if metrics else None
 
 
+WHOLE_SET = ("T4 generate",)
+"""Tasks whose metrics are of a set of scenes as a whole: of several sources they are measured anew.
+
+The others' are pooled from what was found of each source.
+"""
+
 TASKS: dict[str, Task] = {
     "T1a relations": relations_task,
     "T1b completion": completion_task,
     "T2 missing": missing_task,
+    "T2 missing, room type given": missing_in_room_task,
     "T2-at missing at a place": placed_task,
     "T3 outliers, uniform": outliers_task,
     "T3 outliers, by popularity": partial(outliers_task, law=by_popularity),

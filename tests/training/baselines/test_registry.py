@@ -99,6 +99,20 @@ def test_the_same_seed_gives_the_same_fit(baseline, train, validation):
     assert [trial.validation for trial in again.trials] == figures
 
 
+@named(EVERY)
+def test_the_seed_changes_what_it_is_said_to_change(baseline, train, validation):
+    other = baseline.fit(train, validation, STRUCTURE, seed=1)
+    if baseline in OBJECTS:
+        ours, theirs = (f.score(validation.v) for f in (fitted(baseline), other))
+    elif baseline in PLACED:
+        _, _, places = removed_places(validation, STRUCTURE)
+        ours, theirs = (f.score(places) for f in (fitted(baseline), other))
+    else:
+        batch = validation.batch(torch.arange(20))
+        ours, theirs = (f.score(batch) for f in (fitted(baseline), other))
+    assert torch.equal(ours, theirs) is not baseline.stochastic
+
+
 @named([b for b in OBJECTS if "RBM" in b.name])
 def test_the_rbm_repeats_itself_too(baseline, train, validation):
     again = baseline.fit(train, validation, STRUCTURE, seed=0)

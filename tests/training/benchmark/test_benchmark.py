@@ -8,14 +8,27 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from training.benchmark import MeanOverSeeds, measure_entries, summarise
-from training.benchmark.entries import Entry
-from training.benchmark.measure import BenchmarkError, slug
+from training.benchmark import (
+    BenchmarkError,
+    Entry,
+    MeanOverSeeds,
+    Plan,
+    measure_entries,
+    summarise,
+)
+from training.benchmark.command import chosen_tasks
+from training.benchmark.domains import default_configs, read_domains
+from training.benchmark.entries import baseline_entries
+from training.benchmark.measure import slug
+from training.benchmark.plots import read_curve, recall_points
+from training.benchmark.summary import Cell, Results, is_better
 from training.cli import app
+from training.config import ConfigError, load_config
 from training.evaluation.contenders import Contender
-from training.evaluation.intervals import paired_difference
+from training.evaluation.intervals import Figure, paired_difference
 from training.evaluation.metrics import Ratio
-from training.evaluation.tasks import Setting
+from training.evaluation.tasks import TASKS, Setting
+from training.runs import load_run
 from training.trainer import Trainer
 
 CONFIG = """
@@ -36,6 +49,9 @@ name = "composite"
 epochs = {epochs}
 """
 BASELINES = ("--baseline", "popularity", "--baseline", "EASE")
+# In this process, where tests can look on; workers have a test of their own.
+HERE = ("--workers", "1")
+REFERENCES = {"independent classes", "held-out scenes (floor)"}
 
 
 def write(folder, *, variant="triway", rooms=60, epochs=2):
@@ -51,23 +67,27 @@ def run(*arguments):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A finished small benchmark: (its arguments, its folder)."""
+    """A finished small benchmark: (its arguments, the folder of its domain)."""
     folder = tmp_path_factory.mktemp("benchmark")
     where = folder / "reports"
     arguments = (
         write(folder), write(folder, variant="rbm"), "--folder", str(where), "--quick", *BASELINES,
+        "--seed-protocol", *HERE,
     )  # fmt: skip
     code, output = run(*arguments)
     assert code == 0, output
-    return arguments, where
+    return arguments, where / "rooms"
 
 
-def test_every_row_is_measured_and_compared(finished):
-    _, folder = finished
-    results = json.loads((folder / "results.json").read_text())
+@pytest.fixture(scope="module")
+def results(finished):
+    return json.loads((finished[1] / "results.json").read_text())
+
+
+def test_every_row_is_measured_and_compared(finished, results):
     assert results["ours"] == "rooms-triway"
     rows = {cell["row"] for cell in results["cells"]}
-    assert rows == {"rooms-triway", "rooms-rbm", "popularity", "EASE"}
+    assert rows == {"rooms-triway", "rooms-rbm", "popularity", "EASE"} | REFERENCES
     cells = {(c["row"], c["source"], c["task"], c["metric"]): c["figure"] for c in results["cells"]}
     for difference in results["differences"]:
         key = (difference["source"], difference["task"], difference["metric"])
@@ -75,12 +95,58 @@ def test_every_row_is_measured_and_compared(finished):
         assert difference["figure"]["value"] == pytest.approx(gap)
     compared = {(d["row"], d["task"]) for d in results["differences"]}
     assert {("EASE", "T2 missing"), ("rooms-rbm", "T1b completion")} <= compared
-    assert "### T2 missing: MRR" in (folder / "results.md").read_text()
+    assert "### T2 missing: MRR" in (finished[1] / "results.md").read_text()
 
 
-def test_one_source_is_also_the_pool(finished):
-    _, folder = finished
-    cells = json.loads((folder / "results.json").read_text())["cells"]
+def test_machines_are_measured_as_they_are_published(results):
+    """Calibrated, with the default alarm, told the room type where the table says so."""
+    found = {(c["row"], c["task"], c["metric"]) for c in results["cells"]}
+    for row in ("rooms-triway", "rooms-rbm"):
+        assert (row, "T3 outliers, uniform", "alarms in untouched scenes") in found
+        assert (row, "T2 missing, room type given", "MRR, room type withheld") in found
+        for question in ("relations", "missing", "outliers", "misplaced"):
+            assert (row, "Calibration", f"Brier skill, {question}") in found
+
+
+def test_references_stand_in_the_tables_of_generation(results):
+    rows = {c["row"] for c in results["cells"] if c["task"] == "T4 generate"}
+    assert rows == {"rooms-triway", "rooms-rbm"} | REFERENCES
+
+
+def test_weights_are_counted(finished, results):
+    machine = load_run(finished[1] / "rooms-rbm/seed-0/run").machine
+    assert results["parameters"]["rooms-rbm"] == machine.parameter_count
+    assert results["parameters"]["popularity"] == machine.spec.V
+    assert f"{machine.parameter_count:,}" in (finished[1] / "results.md").read_text()
+
+
+def test_the_seed_protocol_has_a_section_of_its_own(finished, results):
+    protocol = results["seed_protocol"]
+    assert {cell["task"] for cell in protocol["cells"]} == {"Seed T1", "Seed T2", "Seed T3"}
+    assert {cell["row"] for cell in protocol["cells"]} == {"rooms-triway", "rooms-rbm"}
+    assert protocol["paper"]["T3 error measure"]["Triway"] == 0.0789
+    assert "## Seed protocol" in (finished[1] / "results.md").read_text()
+    config = json.loads(
+        (finished[1] / "seed-protocol/rooms-rbm/seed-0/run/config.json").read_text()
+    )
+    assert config["data"]["split"] == "random"
+
+
+def test_plots_lie_beside_the_results(finished):
+    names = {path.stem for path in finished[1].glob("*.png") if path.stat().st_size > 5000}
+    assert names == {
+        "learning-curves", "recall", "scenes", "reliability-rooms-rbm", "reliability-rooms-triway",
+    }  # fmt: skip
+
+
+def test_a_curve_is_read_back(finished):
+    epochs, values = read_curve(finished[1] / "rooms-triway/seed-0/run/curve.csv", "mrr_validation")
+    assert epochs == [1, 2]
+    assert all(0 < value <= 1 for value in values)
+
+
+def test_one_source_is_also_the_pool(results):
+    cells = results["cells"]
     mrr = {
         (c["row"], c["source"]): c["figure"]["value"]
         for c in cells
@@ -125,7 +191,7 @@ def test_every_trial_is_kept(finished):
 def test_reports_of_another_configuration_are_not_gone_on_with(finished, tmp_path):
     _, folder = finished
     other = write(tmp_path, epochs=1)
-    arguments = (other, "--folder", str(folder), "--quick", "--baseline", "none")
+    arguments = (other, "--folder", str(folder.parent), "--quick", "--baseline", "none", *HERE)
     code, output = run(*arguments)
     assert code == 1
     assert "another configuration of rooms-triway" in output
@@ -135,19 +201,127 @@ def test_reports_of_another_configuration_are_not_gone_on_with(finished, tmp_pat
     ("others", "message"),
     [
         (("--baseline", "nobody"), "unknown baselines ['nobody']"),
-        (("--data", "nowhere"), ""),
+        (("--task", "T9"), "unknown task 'T9'"),
     ],
 )
 def test_bad_requests_are_named(tmp_path, others, message):
-    code, output = run(write(tmp_path), "--folder", str(tmp_path / "x"), "--quick", *others)
-    assert message in output
-    assert code == (1 if message else 0)
+    code, output = run(write(tmp_path), "--folder", str(tmp_path / "x"), "--quick", *HERE, *others)
+    assert (code, message in output) == (1, True)
 
 
-def test_machines_must_share_their_scenes(tmp_path):
+def test_some_tasks_are_measured_and_the_rest_later(tmp_path, monkeypatch):
+    arguments = (
+        write(tmp_path, epochs=1), "--folder", str(tmp_path), "--quick", "--baseline", "none",
+        *HERE,
+    )  # fmt: skip
+    code, output = run(*arguments, "--task", "T2 missing")
+    assert code == 0, output
+    tasks = json.loads((tmp_path / "rooms/rooms-triway/seed-0/rooms.json").read_text())["tasks"]
+    assert set(tasks) == {"T2 missing"}
+    monkeypatch.setattr(Trainer, "run", None)
+    code, output = run(*arguments, "--task", "T1")
+    assert code == 0, output
+    more = json.loads((tmp_path / "rooms/rooms-triway/seed-0/rooms.json").read_text())["tasks"]
+    assert set(more) == {"T2 missing", "T1a relations", "T1b completion"}
+    kept, first = (t["T2 missing"]["outcome"]["metrics"]["MRR"]["made_of"] for t in (more, tasks))
+    assert kept == first
+
+
+def test_workers_find_what_one_process_finds(finished, tmp_path):
+    (first, *_), folder = finished
+    arguments = (first, "--folder", str(tmp_path), "--quick", *BASELINES, "--task", "T2 missing")
+    code, output = run(*arguments, "--workers", "2")
+    assert code == 0, output
+    for row in ("rooms-triway", "ease"):
+        ours, theirs = (
+            json.loads((place / row / "seed-0/rooms.json").read_text())["tasks"]["T2 missing"]
+            for place in (tmp_path / "rooms", folder)
+        )
+        assert ours["outcome"] == theirs["outcome"]
+
+
+def test_a_failing_worker_is_told(tmp_path):
+    broken = tmp_path / "rooms/rooms-triway/seed-0/run/checkpoint.pt"
+    broken.parent.mkdir(parents=True)
+    broken.write_bytes(b"nothing")
+    code, output = run(
+        write(tmp_path), "--folder", str(tmp_path), "--quick", "--baseline", "none", "--workers",
+        "2", "--task", "T2 missing",
+    )  # fmt: skip
+    assert (code, "checkpoint.pt cannot be read" in output) == (1, True)
+
+
+def test_machines_of_one_domain_share_their_scenes(tmp_path):
     code, output = run(write(tmp_path), write(tmp_path, variant="rbm", rooms=50), "--quick")
     assert code == 1
     assert "different data sections" in output
+
+
+def test_configurations_of_one_data_section_are_a_domain():
+    found = read_domains(["indoor-rbm", "procthor-triway", "indoor-triway"])
+    assert [domain.name for domain in found] == ["indoor", "procthor"]
+    assert [config.name for config in found[0].configs] == ["indoor-rbm", "indoor-triway"]
+    with pytest.raises(ConfigError, match="two configurations are called indoor-rbm"):
+        read_domains(["indoor-rbm", "indoor-rbm"])
+
+
+def test_the_default_domains_begin_with_their_triway_machine():
+    domains = read_domains(default_configs())
+    assert domains[0].name == "indoor"
+    assert [config.machine.variant for config in domains[0].configs] == ["triway", "gbm", "rbm"]
+    assert all(domain.configs[0].machine.variant == "triway" for domain in domains)
+    assert "everyday-triway" not in default_configs() or domains[1].name == "everyday"
+
+
+def test_the_random_split_changes_nothing_else():
+    (domain,) = read_domains(["indoor-triway"])
+    (config,) = domain.split_at_random().configs
+    assert config.data.split == "random"
+    data = config.data.model_copy(update={"split": "group"})
+    assert config.model_copy(update={"data": data}) == load_config("indoor-triway")
+
+
+def test_baselines_that_no_seed_changes_are_trained_once():
+    every = {entry.name for entry in baseline_entries(0)}
+    again = {entry.name for entry in baseline_entries(1)}
+    assert again == {
+        "scikit-learn BernoulliRBM", "masked transformer", "denoising autoencoder", "ComplEx",
+    }  # fmt: skip
+    assert again < every
+
+
+def test_tasks_go_by_name_or_by_how_they_begin():
+    assert chosen_tasks(None, quick=False) == tuple(TASKS)
+    assert "Density" not in chosen_tasks(None, quick=True)
+    assert chosen_tasks(["T2 missing"], quick=True) == ("T2 missing",)
+    assert chosen_tasks(["Density", "T1"], quick=True) == (
+        "T1a relations", "T1b completion", "Density",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("metric", "low", "high", "better"),
+    [
+        ("MRR", 0.1, 0.2, True),
+        ("MRR", -0.1, 0.2, False),
+        ("MMD², free", -0.2, -0.1, True),
+        ("ECE, missing", 0.1, 0.2, False),
+    ],
+)
+def test_better_is_less_where_less_is_better(metric, low, high, better):
+    assert is_better(metric, Figure((low + high) / 2, low, high, 1)) is better
+
+
+def test_recall_curves_follow_the_figures():
+    cells = tuple(
+        Cell(row, "T2 missing", source, metric, Figure(value, 0, 1, 1), (value,))
+        for row, source, metric, value in [
+            ("a", "pooled", "top-10", 0.5), ("a", "pooled", "top-1", 0.2), ("a", "x", "top-1", 0.3),
+            ("a", "pooled", "MRR", 1.0), ("b", "pooled", "top-1", 0.4),
+        ]
+    )  # fmt: skip
+    found = recall_points(Results("a", cells, ()), "T2 missing", "top-", "pooled")
+    assert found == {"a": [(1, 0.2), (10, 0.5)], "b": [(1, 0.4)]}
 
 
 def ratio(values):
@@ -176,47 +350,40 @@ def test_a_summary_needs_our_row():
         summarise({}, "ours")
 
 
-def test_interrupting_keeps_what_is_finished(tmp_path, finished):
+def test_interrupting_keeps_what_is_finished(tmp_path):
     """Ctrl-C in the second row: the first row's report is there and is not made again."""
     made = []
 
     def make(name):
-        def maker(_, __):
+        def maker(*_):
             made.append(name)
             if name == "second" and made.count(name) == 1:
                 raise KeyboardInterrupt
-            return Contender()
+            return lambda _: Contender()
 
         return maker
 
-    setting = Setting(scenes=_no_scenes(), structure=None)
+    plan = _plan(tmp_path)
     entries = [Entry(name, 0, name, make(name)) for name in ("first", "second")]
-
-    def go():
-        return measure_entries(tmp_path, entries, {"none": setting}, ["T2 missing"], print)
-
     with pytest.raises(KeyboardInterrupt):
-        go()
-    assert set(go()) == {("first", 0), ("second", 0)}
+        measure_entries(plan, entries, print)
+    assert set(measure_entries(plan, entries, print)) == {("first", 0), ("second", 0)}
     assert made == ["first", "second", "second"]
 
 
-def _no_scenes():
+def _plan(folder):
     class Nothing:
         scenes = ()
 
-    return Nothing()
+    settings = {"none": Setting(scenes=Nothing(), structure=None)}
+    return Plan(folder, None, settings, ["T2 missing"])
 
 
 def test_a_changed_row_is_refused(tmp_path):
-    setting = Setting(scenes=_no_scenes(), structure=None)
-    for identity in ("one", "two"):
-        entry = Entry("row", 0, identity, lambda *_: Contender())
-        if identity == "two":
-            with pytest.raises(BenchmarkError, match="another configuration of row"):
-                measure_entries(tmp_path, [entry], {"none": setting}, ["T2 missing"], print)
-        else:
-            measure_entries(tmp_path, [entry], {"none": setting}, ["T2 missing"], print)
+    first, second = (Entry("row", 0, name, lambda *_: lambda _: Contender()) for name in "12")
+    measure_entries(_plan(tmp_path), [first], print)
+    with pytest.raises(BenchmarkError, match="another configuration of row"):
+        measure_entries(_plan(tmp_path), [second], print)
 
 
 def test_names_of_folders():

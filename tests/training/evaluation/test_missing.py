@@ -8,7 +8,12 @@ import torch
 
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors, toy
 from tests.training.test_objectives import toy_machine
-from training.evaluation.missing import leave_one_out, machine_score, missing_metrics
+from training.evaluation.missing import (
+    leave_one_out,
+    leave_one_out_in_rooms,
+    machine_score,
+    missing_metrics,
+)
 
 
 def test_reciprocal_ranks_by_hand():
@@ -87,3 +92,22 @@ def test_every_machine_can_be_evaluated(name):
     data = tensors([toy([0, 1, 2], [(0, 1, 2)]), toy([0, 3, 4], [(1, 3, 4)])])
     result = leave_one_out(data, NO_STRUCTURE, machine_score(toy_machine(name)))
     assert np.isfinite(result.log_probability).all()
+
+
+def test_the_room_type_of_the_scene_is_told():
+    """A score that knows what belongs to each room finds it there alone."""
+    told = []
+
+    def score(v, room):
+        told.extend(room.tolist())
+        return torch.eye(5)[room + 1]
+
+    data = tensors([scene([0, 1, 2], room=0), scene([0, 1, 2], room=1)])
+    result = leave_one_out_in_rooms(data, NO_STRUCTURE, score)
+    assert told == [0, 0, 0, 1, 1, 1]
+    found = {
+        (int(data.room[row]), int(target)): int(above)
+        for row, target, above in zip(result.scene, result.target, result.above, strict=True)
+    }
+    assert (found[0, 1], found[1, 2]) == (0, 0)
+    assert result.ties[0] > 0

@@ -1,0 +1,100 @@
+"""Rows measured by several processes at once, each with one thread.
+
+Workers do nothing but fill the folder's files, each of which is written as a whole. So they can be
+stopped at any time, and whoever comes after reads and goes on.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from multiprocessing.queues import Queue
+from queue import Empty
+
+import torch
+
+from training.benchmark.entries import Entry
+from training.benchmark.measure import Plan, Progress
+
+_Message = tuple[str, str, str]
+# How often messages are looked for, in seconds.
+_TICK = 0.2
+# Read by the linear algebra libraries when they are loaded, that is at the start of a process.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+_plan: Plan
+_messages: Queue[_Message]
+
+
+def fill(plan: Plan, entries: Sequence[Entry], progress: Progress, workers: int) -> None:
+    """Measure entries; the reports are on disk afterwards.
+
+    KeyboardInterrupt stops the workers at once and passes through.
+
+    Raises:
+        BrokenProcessPool: a worker died.
+    """
+    # Plain bytes: torch would hand tensors over through shared memory, which containers keep small.
+    material = pickle.dumps(plan)
+    context = multiprocessing.get_context("spawn")
+    messages: Queue[_Message] = context.Queue()
+    with (
+        _one_thread(),
+        ProcessPoolExecutor(
+            workers, context, initializer=_begin, initargs=(material, messages)
+        ) as pool,
+    ):
+        futures = [pool.submit(_measure, entry) for entry in entries]
+        try:
+            while True:
+                done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
+                for message in _pending(messages):
+                    progress(*message)
+                for future in done:
+                    future.result()
+                if not waiting:
+                    return
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _begin(material: bytes, messages: Queue[_Message]) -> None:
+    global _plan, _messages  # what a worker is given once, for all its rows
+    # Ctrl-C reaches every process of the terminal; the first one decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    _plan, _messages = pickle.loads(material), messages
+
+
+def _measure(entry: Entry) -> None:
+    _plan.measure(entry, lambda *message: _messages.put(message))
+
+
+def _pending(messages: Queue[_Message]) -> Iterator[_Message]:
+    while True:
+        try:
+            yield messages.get_nowait()
+        except Empty:
+            return
