@@ -70,6 +70,16 @@ class ObjectiveConfig(_Section):
     object_dropout: float = Field(default=0.0, ge=0, lt=1)
 
 
+class PolishConfig(_Section):
+    """The last phase: persistent chains on the object part (local form)."""
+
+    updates: int = Field(default=0, ge=0)
+    chains: int = Field(default=512, ge=1)
+    k: int = Field(default=2, ge=1, description="Gibbs steps an update")
+    learning_rate: float = Field(default=0.002, gt=0)
+    anchor: float = Field(default=0.1, ge=0, description="pull to the weights before")
+
+
 class TrainingConfig(_Section):
     """Optimiser and stopping."""
 
@@ -96,6 +106,7 @@ class Config(_Section):
     machine: MachineConfig
     objective: ObjectiveConfig
     training: TrainingConfig = TrainingConfig()
+    polish: PolishConfig = PolishConfig()
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
@@ -113,6 +124,8 @@ class Config(_Section):
             raise ValueError("data.rooms must say how many rooms to generate")
         if self.objective.generative_weight and self.machine.form != "local":
             raise ValueError("objective.generative_weight is defined for the local form only")
+        if (self.polish.updates or self.machine.N) and self.machine.form != "local":
+            raise ValueError("polish.updates and machine.N are defined for the local form only")
         return self
 
     @property

@@ -22,12 +22,12 @@ from training.batches import SceneTensors, seen_triples
 from training.checkpoints import load_checkpoint, save_checkpoint
 from training.config import Config
 from training.curves import Epoch, write_csv, write_plot
-from training.dreams import dream
 from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.reconstruction import reconstruction_error
 from training.evaluation.relations import machine_score as relation_score
 from training.evaluation.relations import rank_relations
 from training.objectives import OBJECTIVES, CompositeLikelihood
+from training.polish import polish
 
 _VALIDATION_SCENES = 400
 # At the full learning rate: the rest are relation weights, which overfit within an epoch at it.
@@ -221,7 +221,13 @@ class Trainer:
         with torch.no_grad():
             for name, value in self.best.items():
                 parameters[name].copy_(value)
-        dream(self.machine, self.data.train, self.config.training.seed)
+        polish(
+            self.machine,
+            self.data.train,
+            self.config.polish,
+            self.config.objective.room_dropout,
+            self.config.training.seed,
+        )
         return TrainingResult(self.machine, self.epochs, self.best_epoch, self.seconds, True)
 
     def _out_of_patience(self) -> bool:

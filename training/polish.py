@@ -1,0 +1,113 @@
+"""The last phase of training: the machine's own chains are brought to the data.
+
+Conditional likelihoods make a machine that answers well and dreams badly: scenes half as full
+again as real ones. Some hundred updates of persistent contrastive divergence with many chains, on
+the object part alone, mend that and leave the answers as they were; a term
+
+    anchor · sum (θ - θ_before)²
+
+holds the weights where the answers left them. The chains go on with the averaged weights
+afterwards, and are kept as the machine's fantasies (see `app.boltzmann.fantasies`).
+
+Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine
+from app.boltzmann.bernoulli import bernoulli
+from app.boltzmann.fantasies import pack_scenes
+from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state
+from app.boltzmann.mean_field import Evidence, mean_field
+from training.batches import SceneTensors
+from training.config import PolishConfig
+
+_NAMES = ("b", "c1", "c2", "W")
+_AVERAGING = 0.98
+# Sweeps between the last update and the fantasies, with the averaged weights.
+_SWEEPS = 50
+
+
+def polish(
+    machine: BoltzmannMachine,
+    train: SceneTensors,
+    config: PolishConfig,
+    room_dropout: float,
+    seed: int,
+) -> None:
+    """Change b, c1, c2 and W in place, and fill the fantasies.
+
+    Args:
+        config: how many updates and chains; none of either does nothing.
+        room_dropout: share of chains and scenes whose room type is withheld.
+
+    Raises:
+        ValueError: in the seed form, where chains cannot leave relations out.
+    """
+    if not config.updates and not machine.spec.N:
+        return
+    if machine.spec.form != "local":
+        raise ValueError("chains over objects alone are for machines of the local form")
+    generator = torch.Generator().manual_seed(seed)
+
+    def scenes(count: int) -> tuple[Tensor, Tensor]:
+        index = torch.randint(len(train), (count,), generator=generator)
+        hidden = torch.rand(count, generator=generator) < room_dropout
+        return train.v[index], torch.where(hidden, -1, train.room[index])
+
+    v, room = scenes(max(config.chains, machine.spec.N))
+    state = _settled(machine, v, room, generator)
+    before = {name: machine.get_parameter(name).detach().clone() for name in _NAMES}
+    average = {name: value.clone() for name, value in before.items()}
+    weights = [machine.get_parameter(name) for name in _NAMES]
+    optimiser = torch.optim.Adam(weights, lr=config.learning_rate)
+    cycle = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(config.updates, 1))
+    for _ in range(config.updates):
+        state = _sweep(machine, state, room, generator, config.k)
+        data_v, data_room = scenes(len(v))
+        with torch.no_grad():
+            field = mean_field(machine, Evidence(data_v, room=data_room))
+            h2 = bernoulli(field.h2, generator)
+        loss = machine.free_energy(data_v, h2=h2, room=data_room).mean()
+        loss = loss - machine.free_energy(state.v, h2=state.h2, room=room).mean()
+        for name, weight in zip(_NAMES, weights, strict=True):
+            loss = loss + config.anchor * ((weight - before[name]) ** 2).sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        cycle.step()
+        for name, weight in zip(_NAMES, weights, strict=True):
+            average[name].lerp_(weight.detach(), 1 - _AVERAGING)
+    with torch.no_grad():
+        for name, weight in zip(_NAMES, weights, strict=True):
+            weight.copy_(average[name])
+    if machine.spec.N:
+        free = torch.full_like(room, -1)
+        state = _sweep(machine, state, free, generator, _SWEEPS)
+        machine.fantasies.copy_(pack_scenes(state.v[: machine.spec.N]))
+
+
+@torch.no_grad()
+def _settled(
+    machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
+) -> State:
+    """Chains at scenes, with the context drawn given them."""
+    field = mean_field(machine, Evidence(v, room=room))
+    return replace(
+        initial_state(machine, v, generator, Clamp(room=room)),
+        h1=bernoulli(field.y.sigmoid(), generator),
+        h2=bernoulli(field.h2, generator),
+    )
+
+
+def _sweep(
+    machine: BoltzmannMachine, state: State, room: Tensor, generator: torch.Generator, count: int
+) -> State:
+    for _ in range(count):
+        state = gibbs_step(machine, state, generator, Clamp(room=room), relations=False)
+    return state
