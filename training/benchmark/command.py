@@ -56,7 +56,7 @@ def benchmark(
     task: Annotated[
         list[str] | None, typer.Option(help="only these tasks, by name or its beginning: T2, T3")
     ] = None,
-    limit: Annotated[int, typer.Option(min=1, help="scenes a source where a task is slow")] = 600,
+    limit: Annotated[int, typer.Option(min=1, help="scenes a source where a task is slow")] = 300,
     workers: Annotated[int, typer.Option(min=1, help="processes, of one thread each")] = WORKERS,
     seed_protocol: Annotated[
         bool, typer.Option("--seed-protocol", help="the seed paper's protocol as well")
