@@ -53,33 +53,52 @@ def unpack_scenes(packed: Tensor, classes: int) -> Tensor:
     return torch.from_numpy(bits).float()
 
 
-@torch.no_grad()
-def start_chains(
-    machine: BoltzmannMachine, given: Tensor, generator: torch.Generator, clamp: Clamp = FREE
-) -> State:
-    """A state for each chain, from a fantasy that suits its evidence, or else from the evidence.
+class Fantasies:
+    """The fantasies of a machine whose weights do not change, and what each makes of evidence.
 
     Args:
-        given: (B, V), 1 for classes that must be there.
-        clamp: room types and held units count as evidence too; see `Clamp`.
+        machine: read here; later changes to it are not seen.
     """
-    if not machine.spec.N:
-        return _held(initial_state(machine, given, generator, clamp), clamp)
-    v = unpack_scenes(machine.fantasies, machine.spec.V).to(given.dtype)
-    field = mean_field(machine, Evidence(v))
-    mean = field.y.sigmoid()
-    present = logsigmoid(machine.object_logits(mean))
-    weight = given @ present.T
-    if clamp.room is not None and machine.spec.C:
-        known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
-        weight = weight + known * (machine.Q[clamp.room.clamp(min=0)] @ mean.T)
-    if clamp.h1 is not None:
-        weight = weight + clamp.h1.to(given.dtype) @ logsigmoid(field.y).T
-    chosen = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
-    state = initial_state(machine, v[chosen].maximum(given), generator, clamp)
-    h1 = bernoulli(mean[chosen], generator)
-    h2 = bernoulli(field.h2[chosen], generator) if machine.spec.H2 else state.h2
-    return _held(replace(state, h1=h1, h2=h2), clamp)
+
+    def __init__(self, machine: BoltzmannMachine) -> None:
+        self.machine = machine
+        if not machine.spec.N:
+            return
+        with torch.no_grad():
+            self.v = unpack_scenes(machine.fantasies, machine.spec.V).to(machine.b.dtype)
+            field = mean_field(machine, Evidence(self.v))
+            self.h1, self.h2 = field.y.sigmoid(), field.h2
+            # log w of each given class, room type and held unit, a row for each fantasy.
+            self._present = logsigmoid(machine.object_logits(self.h1))
+            self._room = self.h1 @ machine.Q.T
+            self._unit = logsigmoid(field.y)
+
+    @torch.no_grad()
+    def start(self, given: Tensor, generator: torch.Generator, clamp: Clamp = FREE) -> State:
+        """A state for each chain: a fantasy that suits its evidence; without any, the evidence.
+
+        Args:
+            given: (B, V), 1 for classes that must be there.
+            clamp: room types and held units count as evidence too; see `Clamp`.
+        """
+        machine = self.machine
+        if not machine.spec.N:
+            return _held(initial_state(machine, given, generator, clamp), clamp)
+        weight = self.log_weight(given, clamp)
+        chosen = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
+        state = initial_state(machine, self.v[chosen].maximum(given), generator, clamp)
+        h2 = bernoulli(self.h2[chosen], generator)
+        return _held(replace(state, h1=bernoulli(self.h1[chosen], generator), h2=h2), clamp)
+
+    def log_weight(self, given: Tensor, clamp: Clamp = FREE) -> Tensor:
+        """log w of every fantasy, (B, N); see the module."""
+        weight = given @ self._present.T
+        if clamp.room is not None and self.machine.spec.C:
+            known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
+            weight = weight + known * self._room.T[clamp.room.clamp(min=0)]
+        if clamp.h1 is not None:
+            weight = weight + clamp.h1.to(given.dtype) @ self._unit.T
+        return weight
 
 
 def _held(state: State, clamp: Clamp) -> State:

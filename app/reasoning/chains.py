@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine
-from app.boltzmann.fantasies import start_chains
+from app.boltzmann.fantasies import Fantasies
 from app.boltzmann.gibbs import Clamp, State, gibbs_step
 from app.reasoning.evidence import Observation
 
@@ -58,17 +58,28 @@ def clamped(observation: Observation, held: tuple[Tensor, Tensor]) -> Clamp:
 
 
 def run_block(
-    observation: Observation, clamp: Clamp, machine: BoltzmannMachine, steps: int, seed: int
+    fantasies: Fantasies,
+    observation: Observation,
+    clamp: Clamp,
+    machine: BoltzmannMachine,
+    steps: int,
+    seed: int,
 ) -> State:
     """The state of a block of chains after some sweeps, started where the evidence is at home.
 
     Args:
-        machine: that of the observation, or the same at another temperature.
+        fantasies: of the observation's machine.
+        machine: the same, or the same at another temperature.
     """
     generator = torch.Generator().manual_seed(seed)
     given = observation.present.to(machine.b.dtype).repeat(CHAINS, 1)
-    state = start_chains(observation.machine, given, generator, clamp)
-    # In the local form relations do not act on the rest: the last sweep alone draws them.
+    return sweep(machine, fantasies.start(given, generator, clamp), generator, clamp, steps)
+
+
+def sweep(
+    machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp, steps: int
+) -> State:
+    """Gibbs sweeps. In the local form relations do not act on the rest: the last one draws them."""
     always = machine.spec.form == "seed"
     for last in range(1, steps + 1):
         relations = always or last == steps

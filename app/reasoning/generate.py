@@ -79,7 +79,9 @@ def generate(
     drawn: list[GeneratedScene] = []
     block = 0
     while len(drawn) < count:
-        state = run_block(observation, clamp, tempered, steps, _stream(seed, block))
+        state = run_block(
+            artifact.fantasies, observation, clamp, tempered, steps, _stream(seed, block)
+        )
         drawn += _scenes(artifact, state, shown, given, clamp.room)
         block += 1
     return tuple(drawn[:count])

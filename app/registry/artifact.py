@@ -22,6 +22,7 @@ from app.scene.vocabulary import Vocabulary
 
 if TYPE_CHECKING:  # importing torch takes seconds; writing and listing artifacts does without
     from app.boltzmann import BoltzmannMachine
+    from app.boltzmann.fantasies import Fantasies
     from app.boltzmann.scoring import ContextScorer
 
 
@@ -53,6 +54,13 @@ class Artifact:
         from app.boltzmann.scoring import ContextScorer
 
         return ContextScorer(self.machine)
+
+    @cached_property
+    def fantasies(self) -> Fantasies:
+        """Where chains start; made when first asked for."""
+        from app.boltzmann.fantasies import Fantasies
+
+        return Fantasies(self.machine)
 
 
 def write_artifact(

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from training.baselines.fitting import Proposals
 from training.baselines.frequency_table import smoothed_log_odds
 from training.baselines.triple_counts import TripleTable, count_triples
 from training.batches import Batch, SceneTensors
+from training.evaluation.closure import transitive_closure
 from training.evaluation.relations import RelationScore
 
 _PAIR = (3.0, 10.0, 30.0)
@@ -48,16 +48,6 @@ class ClosureScore:
         closed = transitive_closure(given)
         follows, mirror = closed & ~given, closed.mT & ~closed
         return self.table(batch) + self.bonus * follows - self.penalty * mirror
-
-
-def transitive_closure(given: Tensor) -> Tensor:
-    """All pairs joined by a chain of given ones, (..., n, n) bool, by repeated squaring."""
-    reach = given.float()
-    while True:
-        further = ((reach + reach @ reach) > 0).float()
-        if torch.equal(further, reach):
-            return reach > 0
-        reach = further
 
 
 def propose(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:

@@ -10,14 +10,16 @@ Intervals resample the held-out scenes, with the drawn ones as they are.
     copies      share of drawn scenes whose set of classes is that of a training scene
     mirrored    share of related pairs where a(x, y) and a(y, x) are both on; with several instances
                 of a class that can be true, so held-out scenes have some as well
+    cycles      share of the scenes with anything on top of another class in which following on-top
+                leads back to where it began; the same holds
 
 Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from typing import Protocol
 from zlib import crc32
 
@@ -26,7 +28,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from app.scene import CANONICAL
 from training.batches import SceneTensors
+from training.evaluation.closure import transitive_closure
 from training.evaluation.intervals import Metric
 from training.evaluation.metrics import Ratio, Resampled
 from training.trainer import subset
@@ -37,6 +41,63 @@ _RESAMPLES = 200
 # The bandwidth is taken from so many held-out scenes, and covariances over so many classes.
 _BANDWIDTH_SCENES = 1000
 _COMMON_CLASSES = 200
+_ON_TOP = CANONICAL.index("on-top")
+
+
+@dataclass(frozen=True, eq=False)
+class Contradictions:
+    """What the relations of B scenes say twice, between different classes.
+
+    Attributes:
+        related: (B,) unordered pairs × canonical relations with one direction on at least.
+        mirrored: (B,) those with both on.
+        stacked: (B,) bool, something is on top of something.
+        cyclic: (B,) bool, following on-top leads back.
+    """
+
+    related: Tensor
+    mirrored: Tensor
+    stacked: Tensor
+    cyclic: Tensor
+
+    @classmethod
+    def of(cls, holds: Tensor) -> Contradictions:
+        """Of relations (B, A, n, n)."""
+        n = holds.shape[-1]
+        on = (holds > 0) & ~torch.eye(n, dtype=torch.bool)
+        upper = torch.ones(n, n, dtype=torch.bool).triu(1)
+        both, either = on & on.mT & upper, (on | on.mT) & upper
+        if holds.shape[1] > _ON_TOP and n:
+            stacks = on[:, _ON_TOP]
+        else:
+            stacks = torch.zeros(len(holds), 1, 1, dtype=torch.bool)
+        return cls(
+            either.flatten(1).sum(1),
+            both.flatten(1).sum(1),
+            stacks.flatten(1).any(1),
+            transitive_closure(stacks).diagonal(dim1=-2, dim2=-1).any(1),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Contradictions]) -> Contradictions:
+        """Of all scenes of the parts."""
+        return cls(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+    def at(self, index: Tensor) -> Contradictions:
+        """Of the scenes at the given positions."""
+        return Contradictions(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def metrics(self) -> dict[str, Metric]:
+        """Shares, where there is anything to contradict."""
+        shares = {
+            "mirrored relations": (self.mirrored, self.related),
+            "on-top cycles": (self.cyclic, self.stacked),
+        }
+        return {
+            name: Ratio(some.double().numpy(), whole.double().numpy())
+            for name, (some, whole) in shares.items()
+            if whole.any()
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +106,11 @@ class Drawn:
 
     Attributes:
         v: (B, V) presence.
-        related: (B,) unordered pairs of different classes × canonical relations with one direction
-            on at least; mirrored: (B,) those with both on. None where relations were not drawn.
+        contradictions: of their relations; None where these were not drawn.
     """
 
     v: Tensor
-    related: Tensor | None = None
-    mirrored: Tensor | None = None
+    contradictions: Contradictions | None = None
 
 
 class Sampler(Protocol):
@@ -66,23 +125,13 @@ class Sampler(Protocol):
     def __call__(self, given: Tensor, room: Tensor, seed: int) -> Drawn: ...
 
 
-def mirrored_pairs(holds: Tensor) -> tuple[Tensor, Tensor]:
-    """(related, mirrored) as in `Drawn`, of relations (B, A, n, n)."""
-    on = holds > 0
-    n = on.shape[-1]
-    upper = torch.ones(n, n, dtype=torch.bool).triu(1)
-    both, either = on & on.mT & upper, (on | on.mT) & upper
-    return either.flatten(1).sum(1), both.flatten(1).sum(1)
-
-
 def drawn_of(scenes: SceneTensors, block: int = 64) -> Drawn:
     """Held-out scenes as if they had been drawn."""
     parts = [
-        mirrored_pairs(scenes.batch(index).holds)
+        Contradictions.of(scenes.batch(index).holds)
         for index in torch.arange(len(scenes)).split(block)
     ]
-    related, mirrored = (torch.cat(part) for part in zip(*parts, strict=True))
-    return Drawn(scenes.v, related, mirrored)
+    return Drawn(scenes.v, Contradictions.joined(parts))
 
 
 def independent_sampler(train: SceneTensors) -> Sampler:
@@ -122,9 +171,8 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
             own = free and row in places
             chosen.append(row if own else int(rng.choice(places)))
         index = torch.tensor(chosen)
-        if real.related is None or real.mirrored is None:
-            return Drawn(real.v[index])
-        return Drawn(real.v[index], real.related[index], real.mirrored[index])
+        found = real.contradictions
+        return Drawn(real.v[index], None if found is None else found.at(index))
 
     return sample
 
@@ -250,8 +298,6 @@ def generation_metrics(
     pairs = resampled(pair_correlation(theirs, ours))
     if np.isfinite(pairs.value):
         metrics["pair correlation"] = pairs
-    if drawn.related is not None and drawn.mirrored is not None and drawn.related.any():
-        metrics["mirrored relations"] = Ratio(
-            drawn.mirrored.double().numpy(), drawn.related.double().numpy()
-        )
+    if drawn.contradictions is not None:
+        metrics |= drawn.contradictions.metrics()
     return metrics

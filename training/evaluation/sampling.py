@@ -7,10 +7,11 @@ from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine, Triway
 from app.boltzmann.edges import PairEdges
-from app.boltzmann.fantasies import start_chains
-from app.boltzmann.gibbs import Clamp, State, gibbs_step, present_classes
+from app.boltzmann.fantasies import Fantasies
+from app.boltzmann.gibbs import Clamp, State, present_classes
+from app.reasoning.chains import sweep
 from app.reasoning.generate import STEPS
-from training.evaluation.generation import Drawn, Sampler, mirrored_pairs
+from training.evaluation.generation import Contradictions, Drawn, Sampler
 from training.evaluation.relations import spread_units
 
 _CHAINS = 256
@@ -24,21 +25,18 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
     Args:
         steps: sweeps of a chain.
     """
-    # In the local form relations do not act on the rest: the last sweep alone draws them.
-    always = machine.spec.form == "seed"
+    fantasies = Fantasies(machine)
 
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
         generator = torch.Generator().manual_seed(seed)
         parts = []
         for index in torch.arange(len(given)).split(_CHAINS):
             clamp = Clamp(v=given[index], room=room[index] if machine.spec.C else None)
-            state = start_chains(machine, given[index].to(machine.b.dtype), generator, clamp)
-            for last in range(1, steps + 1):
-                relations = always or last == steps
-                state = gibbs_step(machine, state, generator, clamp, relations=relations)
-            parts.append((state.v, *mirrored_pairs(_grid(machine, state))))
-        v, related, mirrored = (torch.cat(column) for column in zip(*parts, strict=True))
-        return Drawn(v, related, mirrored)
+            state = fantasies.start(given[index].to(machine.b.dtype), generator, clamp)
+            state = sweep(machine, state, generator, clamp, steps)
+            parts.append((state.v, Contradictions.of(_grid(machine, state))))
+        objects, found = zip(*parts, strict=True)
+        return Drawn(torch.cat(objects), Contradictions.joined(found))
 
     return sample
 

@@ -10,7 +10,7 @@ from sklearn.neural_network import BernoulliRBM
 
 from tests.training.baselines.furnished import LEFT, ON_TOP, STRUCTURE, A, V, scene, tensors
 from training.baselines.bernoulli_rbm import propose as propose_rbm
-from training.baselines.closure import ClosureScore, transitive_closure
+from training.baselines.closure import ClosureScore
 from training.baselines.complex_embedding import complex_logits, fit_complex
 from training.baselines.ease import fit_ease
 from training.baselines.frequency_table import smoothed_log_odds

@@ -9,6 +9,7 @@ import torch
 from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from training.evaluation.generation import (
+    Contradictions,
     Drawn,
     copies,
     discrepancy,
@@ -19,7 +20,6 @@ from training.evaluation.generation import (
     independent_sampler,
     marginal_error,
     median_distance,
-    mirrored_pairs,
     pair_correlation,
     scene_sampler,
 )
@@ -86,7 +86,21 @@ def test_mirrored_relations_are_counted_by_pair():
     holds = torch.zeros(1, 2, 3, 3)
     for a, i, j in [(0, 0, 1), (0, 1, 0), (0, 0, 2), (1, 2, 2)]:
         holds[0, a, i, j] = 1
-    assert [part.tolist() for part in mirrored_pairs(holds)] == [[2], [1]]
+    found = Contradictions.of(holds)
+    assert (found.related.tolist(), found.mirrored.tolist()) == ([2], [1])
+
+
+def test_cycles_of_on_top_are_found_whatever_their_length():
+    """A tower of three; the same with its foot on its top; nothing but left, in a circle."""
+    holds = torch.zeros(3, 4, 3, 3)
+    for k, a, i, j in [(0, 2, 0, 1), (0, 2, 1, 2), (1, 2, 0, 1), (1, 2, 1, 2), (1, 2, 2, 0)]:
+        holds[k, a, i, j] = 1
+    holds[2, 0] = torch.eye(3).roll(1, 1)
+    holds[:, 2, 1, 1] = 1  # of itself: two books, one on the other
+    found = Contradictions.of(holds)
+    assert found.stacked.tolist() == [True, True, False]
+    assert found.cyclic.tolist() == [False, True, False]
+    assert set(found.metrics()) == {"mirrored relations", "on-top cycles"}
 
 
 def test_halves_keep_groups_together():
@@ -183,8 +197,11 @@ def test_machines_are_sampled_from_their_distribution(name):
     row, unit = present.nonzero(as_tuple=True)
     ends = (getattr(edges, end)[0][unit] for end in ("relation", "subject", "object"))
     grid[row, *ends] = 1.0
-    related, mirrored = mirrored_pairs(grid)
-    for exact, ours in ((related, drawn.related), (mirrored, drawn.mirrored)):
+    exact_pairs, ours_pairs = Contradictions.of(grid), drawn.contradictions
+    for exact, ours in (
+        (exact_pairs.related, ours_pairs.related),
+        (exact_pairs.mirrored, ours_pairs.mirrored),
+    ):
         mean = joint.p @ exact.double()
         spread = (joint.p @ (exact.double() - mean) ** 2 / 2000).sqrt()
         assert abs(ours.double().mean() - mean) <= 5 * spread + 1e-9
