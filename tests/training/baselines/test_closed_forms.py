@@ -22,6 +22,7 @@ from training.baselines.pairwise import fit_pairwise
 from training.baselines.placed_table import PlacedTable, smoothed_log_p
 from training.baselines.popularity import frequency
 from training.baselines.triple_counts import TripleTable, count_triples
+from training.evaluation.closure import transitive_closure
 from training.evaluation.missing import machine_score
 from training.evaluation.placed import Places
 from training.evaluation.relations import telling
