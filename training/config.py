@@ -120,9 +120,14 @@ class Config(_Section):
                 )
         if self.machine.variant in ("rbm", "product_rbm") and self.machine.H2:
             raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
+        local = self.machine.form == "local"
+        if self.machine.G and not (local and self.machine.variant == "triway"):
+            raise ValueError("machine.G is defined for the local form of the Triway only")
+        if self.machine.N and not local:
+            raise ValueError("machine.N is defined for the local form only")
         if "rooms" in self.data.sources and not self.data.rooms:
             raise ValueError("data.rooms must say how many rooms to generate")
-        if self.objective.generative_weight and self.machine.form != "local":
+        if self.objective.generative_weight and not local:
             raise ValueError("objective.generative_weight is defined for the local form only")
         if (self.polish.updates or self.machine.N) and self.machine.form != "local":
             raise ValueError("polish.updates and machine.N are defined for the local form only")

@@ -31,7 +31,8 @@ def placements(
     """The likeliest relations of each candidate to the anchors, best first.
 
     p(r_e = 1 | v with i, evidence), over draws weighed as if the candidate were there, for all
-    relations in both directions; instances of an anchor's class are spoken of by the first.
+    relations in both directions; instances of an anchor's class are spoken of by the first. What
+    the observed relations imply for those of a candidate is left out.
 
     Args:
         candidates: (N,) absent classes.

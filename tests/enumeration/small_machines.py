@@ -23,6 +23,7 @@ SMALL: dict[str, MachineSpec] = {
     "triway-seed": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, form="seed"),
     "triway-seed-two-layers": MachineSpec("triway", V=2, A=2, H1=2, H2=2, K=2, form="seed"),
     "triway-local": MachineSpec("triway", V=2, A=2, H1=2, K=2, T=2, C=3, form="local"),
+    "triway-implications": MachineSpec("triway", V=3, A=1, H1=2, K=2, T=2, C=3, G=2, form="local"),
     "triway-local-two-layers": MachineSpec("triway", V=2, A=2, H1=2, H2=2, K=2, T=4, form="local"),
 }
 ONE_LAYER = [name for name, spec in SMALL.items() if not spec.H2]

@@ -19,6 +19,7 @@ EXACT: dict[str, MachineSpec] = {
     "product-rbm": SMALL["product-rbm-local"],
     "triway-seed": MachineSpec("triway", V=3, A=1, H1=2, K=2, T=2, form="seed"),
     "triway-local": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, form="local"),
+    "triway-implications": MachineSpec("triway", V=3, A=1, H1=3, K=2, T=2, C=2, G=2, form="local"),
 }
 # Too large to enumerate; with structure, four relations and two layers.
 LARGER: dict[str, MachineSpec] = {
@@ -27,6 +28,9 @@ LARGER: dict[str, MachineSpec] = {
     "product-rbm": MachineSpec("product_rbm", V=9, A=4, H1=6, K=3, T=40, form="local"),
     "triway-seed": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, form="seed"),
     "triway-local": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, form="local"),
+    "triway-implications": MachineSpec(
+        "triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, G=2, form="local"
+    ),
 }
 LABELS = ("bed", "lamp", "desk", "chair", "sofa", "vase", "shelf", "rug", "wall")
 STRUCTURE = {"wall"}

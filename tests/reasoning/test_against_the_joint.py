@@ -10,6 +10,7 @@ import torch
 
 from app.reasoning import missing, outliers, relations
 from app.scene import CANONICAL, OPPOSITES
+from tests.enumeration.implied import relation_by_definition
 from tests.enumeration.small_machines import Joint, enumerate_joint
 from tests.reasoning.artifacts import EXACT, LABELS, exact_artifact, scene_of
 
@@ -31,12 +32,17 @@ class Exact:
 
     joint: Joint
 
-    def unit(self, triple) -> torch.Tensor | None:
-        """(N,) values of a relation unit; None where the machine has none."""
+    def place(self, triple) -> int | None:
+        """Where a relation unit is; None where the machine has none."""
         e = self.joint.edges
         a, i, j = triple
         match = (e.relation[0] == a) & (e.subject[0] == i) & (e.object[0] == j)
-        return self.joint.r[:, match.nonzero().item()] > 0 if bool(match.any()) else None
+        return int(match.nonzero()) if bool(match.any()) else None
+
+    def unit(self, triple) -> torch.Tensor | None:
+        """(N,) values of a relation unit; None where the machine has none."""
+        place = self.place(triple)
+        return None if place is None else self.joint.r[:, place] > 0
 
     def given(self, present, absent, observed=()):
         """(N,) bool: states with these classes on and off, and these triples on."""
@@ -59,13 +65,23 @@ class Exact:
         kept = [t for t in observed if t not in touching]
         return self.joint.log_odds(self.joint.v[:, i] > 0, self.given(rest, others, kept))
 
-    def relation(self, triple, present, observed=()) -> float:
-        """p(r_e = 1) given the classes and the other observed relations."""
+    def relation(self, triple, present, observed=(), *, implied=True) -> float:
+        """p(r_e = 1) given the classes and the other observed relations.
+
+        Where relations imply each other that is defined by their logits, not by the joint.
+        """
         unit = self.unit(triple)
         if unit is None:
             return 0.0
-        absent = set(range(self.joint.machine.spec.V)) - set(present)
+        spec = self.joint.machine.spec
+        absent = set(range(spec.V)) - set(present)
         kept = [t for t in observed if t != triple]
+        if spec.G and implied:
+            on = torch.zeros(spec.A, spec.V, spec.V)
+            for t in kept:
+                on[t] = 1.0
+            where = self.given(present, absent, kept)
+            return relation_by_definition(self.joint, self.place(triple), where, on)
         return 1 / (1 + math.exp(-self.joint.log_odds(unit, self.given(present, absent, kept))))
 
 
@@ -113,7 +129,10 @@ def test_missing(case, classes, stated):
 
 @pytest.mark.parametrize(("classes", "stated"), SCENES[:5])
 def test_placements(case, classes, stated):
-    """p(r_e = 1 | the candidate is there too), then made exclusive; the best three."""
+    """p(r_e = 1 | the candidate is there too), then made exclusive; the best three.
+
+    What the observed relations imply for those of a candidate is left out.
+    """
     artifact, exact = case
     A = artifact.machine.spec.A
     observed = triples(classes, stated)
@@ -122,8 +141,8 @@ def test_placements(case, classes, stated):
         truth = {}
         for anchor, x in enumerate(classes):
             for a in range(A):
-                p = exact.relation((a, i, x), [*classes, i], observed)
-                q = exact.relation((a, x, i), [*classes, i], observed)
+                p = exact.relation((a, i, x), [*classes, i], observed, implied=False)
+                q = exact.relation((a, x, i), [*classes, i], observed, implied=False)
                 truth[CANONICAL[a], anchor] = p / max(1, p + q)
                 truth[OPPOSITES[CANONICAL[a]], anchor] = q / max(1, p + q)
         best = sorted(truth.values(), reverse=True)[:3]
@@ -153,8 +172,7 @@ def test_missing_at_a_place(case, relation, anchor):
 
 def test_the_place_counts_by_the_calibration(case):
     """Without weight the place says nothing; the log-odds never change."""
-    name = case[0].machine.spec.variant
-    name = name if name in EXACT else f"triway-{case[0].machine.spec.form}"
+    name = next(name for name, spec in EXACT.items() if spec == case[0].machine.spec)
     unweighted = exact_artifact(name, placed_relation_weight=0.0, placed_temperature=2.0)
     cooled = exact_artifact(name, missing_temperature=2.0)
     there = missing(unweighted, scene_of([0]), at=("left", 0))

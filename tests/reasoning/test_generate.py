@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from app.boltzmann.gibbs import gibbs_step
 from app.reasoning import generate
-from app.reasoning.chains import cooling
 from app.reasoning.log_score import log_score
 from app.scene import CANONICAL, contradiction, derive_relations
 from app.scene.scene import Scene
@@ -131,10 +131,13 @@ def test_objects_are_drawn_from_the_model(name, given_classes):
 
 
 @pytest.mark.usefixtures("wide_blocks")
-@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("name", [name for name, spec in EXACT.items() if not spec.G])
 def test_relations_are_drawn_from_the_model(name):
     """Shares of scenes with left(bed, lamp), with the opposite, and with neither, within five
-    standard errors of the joint; of both the likelier given the context is left."""
+    standard errors of the joint; of both the likelier given the context is left.
+
+    Relations that imply each other have no joint: the order in which they are drawn counts.
+    """
     artifact = exact_artifact(name)
     joint = enumerate_joint(artifact.machine)
     e = joint.edges
@@ -226,19 +229,23 @@ def test_two_layers_score_below_their_sum():
         assert bool((gap < 0.5).all())
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3, 7, 25, 200])
-def test_chains_cool_to_the_temperature_in_the_steps_asked_for(steps):
-    machine = ARTIFACTS["triway-local"].machine
-    stairs = cooling(machine, steps, 0.5)
-    assert sum(sweeps for _, sweeps in stairs) == steps
-    assert all(sweeps > 0 for _, sweeps in stairs)
-    heats = [float(machine.b[0] / tempered.b[0]) for tempered, _ in stairs]
-    assert heats == sorted(heats, reverse=True)
-    assert heats[-1] == pytest.approx(0.5)
-    assert heats[0] <= 1.0 + 1e-6
-    if steps > 1:
-        assert heats[0] == pytest.approx(1.0)
-        assert stairs[-1][1] == steps - steps // 2
+@pytest.mark.parametrize("steps", [1, 2, 7])
+@pytest.mark.parametrize("name", ["triway-local", "triway-implications", "triway-seed", "rbm"])
+def test_a_chain_makes_the_sweeps_asked_for_at_its_temperature(name, steps, monkeypatch):
+    """Nine scenes take two blocks. Relations are drawn in every sweep only where they act back."""
+    machine, made = ARTIFACTS[name].machine, []
+
+    def recorded(tempered, state, generator, clamp, *, relations):
+        made.append((tempered, relations))
+        return gibbs_step(tempered, state, generator, clamp, relations=relations)
+
+    monkeypatch.setattr("app.reasoning.chains.gibbs_step", recorded)
+    generate(ARTIFACTS[name], scene_of([0]), count=9, seed=0, steps=steps, temperature=2.0)
+    block = [machine.spec.form == "seed"] * (steps - 1) + [True]
+    assert [relations for _, relations in made] == block * 2
+    for tempered, _ in made:
+        torch.testing.assert_close(tempered.b, machine.b / 2)
+        torch.testing.assert_close(tempered.W, machine.W / 2)
 
 
 @pytest.mark.parametrize(

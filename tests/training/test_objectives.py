@@ -5,6 +5,9 @@ All objectives in the registry run on the same tiny scenes.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -18,7 +21,7 @@ from training.config import ObjectiveConfig
 from training.evaluation.missing import machine_score
 from training.evaluation.relations import machine_score as relation_score
 from training.objectives import OBJECTIVES
-from training.objectives.composite import mask_one_class
+from training.objectives.composite import mask_one_class, unlisted_off
 from training.objectives.contrastive import centre_gradients, energy_difference
 
 SAMPLES = 200_000
@@ -228,6 +231,43 @@ def test_masking_takes_one_class_out_and_never_structure():
     assert bool((masked.removable == 2).all())
     assert not bool(masked.absent[:, 0].any())
     assert bool(masked.absent.gather(1, masked.target.unsqueeze(1)).all())
+
+
+def test_a_class_that_a_source_never_mentions_counts_as_absent():
+    """All classes are candidates, whatever the source of the scene."""
+    batch = toy_batch()
+    silent = replace(batch, annotated=torch.zeros_like(batch.annotated))
+    structure = torch.zeros(5, dtype=torch.bool)
+    masks = [
+        mask_one_class(some, structure, torch.Generator().manual_seed(0))
+        for some in (batch, silent)
+    ]
+    assert torch.equal(masks[0].absent, masks[1].absent)
+    assert bool((masks[1].absent == (masks[1].v == 0)).all())
+
+
+def test_relations_that_nobody_listed_can_count_as_off():
+    """Between things, not structure; scenes that nobody annotated teach nothing either way."""
+    batch = toy_batch()
+    batch = replace(batch, observed=batch.holds > 0)
+    structure = torch.tensor([True, False, False, False, False])
+    off = unlisted_off(batch, structure)
+    pairs = torch.zeros(3, 3, dtype=torch.bool)
+    pairs[1, 2] = pairs[2, 1] = True
+    assert torch.equal(off.observed, pairs.expand_as(off.observed))
+    assert torch.equal(off.holds, batch.holds)
+    machine = toy_machine("triway-local")
+    losses = []
+    for unlisted in ("unobserved", "off"):
+        config = ObjectiveConfig(name="composite", unlisted=unlisted, room_dropout=0.0)
+        target = OBJECTIVES["composite"](config, machine)
+        target.structure = structure
+        loss = target.relation_part(machine, batch, torch.Generator().manual_seed(0))
+        losses.append(float(loss.detach()))
+    # 16 of 24 scenes are annotated; each of their units is near even odds here.
+    even = 16 / 24 * math.log(2)
+    assert losses[0] == pytest.approx(even, rel=0.1)
+    assert losses[1] == pytest.approx(4 * even, rel=0.1)
 
 
 @pytest.mark.parametrize("name", SEED_FORM)

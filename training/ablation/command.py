@@ -15,9 +15,18 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from training.ablation.rows import load_rows, shipped_ablations
 from training.ablation.table import COLUMNS, TASKS, Cost, markdown
 from training.batches import seen_triples
-from training.benchmark.entries import Entry, machine_entry
-from training.benchmark.measure import BenchmarkError, forget, measure_entries, slug
+from training.benchmark.entries import Entry, Material, machine_entry
+from training.benchmark.measure import (
+    DONE,
+    KNOWN,
+    BenchmarkError,
+    Plan,
+    forget,
+    measure_entries,
+    place_of,
+)
 from training.benchmark.summary import summarise
+from training.checkpoints import CheckpointError
 from training.config import Config, ConfigError, load_config, with_settings
 from training.datasets import DatasetError
 from training.evaluation.report import SourceReport, pooled, settings_by_source
@@ -57,16 +66,20 @@ def ablate(
         configs = _configs(configuration, rows, row, limit, epochs)
         place = folder / configs[0].name
         with console.status("reading and encoding scenes"):
-            scenes = prepare(configs[0], data).training_data()
+            split = prepare(configs[0], data)
+            scenes = split.training_data()
+        plan = Plan(
+            place, Material(scenes, split.vocabulary), _settings(scenes, asked), tasks=TASKS
+        )
         entries = [
-            machine_entry(with_settings(config, {"training.seed": seed}), scenes)
+            machine_entry(with_settings(config, {"training.seed": seed}))
             for config in configs
             for seed in range(seeds)
         ]
         if fresh:
             forget(place, entries)
-        reports, failures = _run(place, entries, _settings(scenes, asked))
-    except (ConfigError, DatasetError, BenchmarkError) as error:
+        reports, failures = _run(plan, entries)
+    except (ConfigError, DatasetError, BenchmarkError, CheckpointError) as error:
         console.print(f"[red]error:[/red] {error}")
         raise typer.Exit(1) from None
     except KeyboardInterrupt:
@@ -133,7 +146,7 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
 
 
 def _run(
-    folder: Path, entries: Sequence[Entry], settings: Mapping[str, Setting]
+    plan: Plan, entries: Sequence[Entry]
 ) -> tuple[dict[tuple[str, int], dict[str, SourceReport]], dict[str, str]]:
     """Reports by row and seed, pools among them; and why rows are missing there."""
     reports: dict[tuple[str, int], dict[str, SourceReport]] = {}
@@ -146,22 +159,22 @@ def _run(
         TextColumn("{task.fields[note]}"),
     )
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("ablation", total=len(entries) * len(settings), note="")
+        task = bar.add_task("ablation", total=len(entries) * len(plan.settings), note="")
 
         def show(row: str, source: str, note: str) -> None:
             bar.update(task, note=f"{row}, {source}: {note}")
-            if note in ("done", "known"):
+            if note in (DONE, KNOWN):
                 bar.advance(task)
 
         for number, entry in enumerate(entries, 1):
             try:
-                found = measure_entries(folder, [entry], settings, TASKS, show)
+                found = measure_entries(plan, [entry], show)
             except FloatingPointError as error:
                 failures[entry.name] = f"seed {entry.seed}: {error}"
             else:
                 for key, by_source in found.items():
                     reports[key] = _with_pools(by_source)
-            bar.update(task, completed=number * len(settings))
+            bar.update(task, completed=number * len(plan.settings))
     kept = {key: value for key, value in reports.items() if key[0] not in failures}
     return kept, failures
 
@@ -195,7 +208,7 @@ def _shown(report: SourceReport) -> SourceReport:
 
 def _cost(folder: Path, config: Config, seeds: int) -> Cost | None:
     """What the row's runs took; None where one of them is missing."""
-    places = [folder / slug(config.name) / f"seed-{seed}/run" for seed in range(seeds)]
+    places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]
     try:
         runs = [load_run(place) for place in places]
     except RunError:

@@ -40,6 +40,10 @@ def test_a_row_changes_what_it_names_and_nothing_else(tmp_path):
     assert old.data == FULL.data != paper.data
 
 
+SEED = (
+    '[[row]]\nname = "x"\nwhat = ""\n'
+    'changes = {{ "machine.form" = "seed", "objective.generative_weight" = 0.0, {settings} }}\n'
+)
 ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
 
 
@@ -56,6 +60,8 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         (ONE.format(name="x", rest='changes = { "a.b" = 1 }'), "x: no setting 'a.b'"),
         (ONE.format(name="x", rest='changes = { "machine.H1" = 0 }'), "x: .*machine.H1: Input"),
         (ONE.format(name="x", rest='changes = { "machine.without" = ["g"] }'), "no weights g"),
+        (SEED.format(settings='"machine.N" = 0'), "machine.G is defined for the local form"),
+        (SEED.format(settings='"machine.G" = 0, "machine.N" = 9'), "machine.N is defined for the"),
         (ONE.format(name="indoor-triway", rest='from = "seed-rbm"'), "two rows are called indoor"),
         (ONE.format(name="x", rest='from = "seed-rbm"') * 2, "two rows are called x"),
     ],

@@ -1,0 +1,153 @@
+"""Fantasies as bits, and chains that start at those which suit their evidence."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.boltzmann import MachineSpec, build
+from app.boltzmann.fantasies import pack_scenes, start_chains, unpack_scenes, words
+from app.boltzmann.gibbs import Clamp, initial_state
+
+V = 35
+CHAINS = 20_000
+
+
+@given(st.integers(1, 9), st.integers(1, 100), st.integers(0, 2**32))
+def test_scenes_are_read_back_from_their_bits(scenes, classes, seed):
+    generator = torch.Generator().manual_seed(seed)
+    v = (torch.rand(scenes, classes, generator=generator) < 0.5).float()
+    packed = pack_scenes(v)
+    assert packed.dtype == torch.int32
+    assert packed.shape == (scenes, words(classes))
+    assert torch.equal(unpack_scenes(packed, classes), v)
+
+
+def machine_of(N=6, H2=0, form="local", seed=0):
+    """Every weight from N(0, 1); distinct random fantasies."""
+    spec = MachineSpec("triway", V=V, A=1, H1=4, H2=H2, K=2, C=2, N=N, form=form)
+    machine = build(spec).double()
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, parameter in machine.named_parameters():
+            if name != "kappa":
+                parameter.copy_(torch.randn(parameter.shape, generator=generator))
+        if N:
+            dreamt = (torch.rand(N, V, generator=generator) < 0.4).float()
+            assert len(dreamt.unique(dim=0)) == N
+            machine.fantasies.copy_(pack_scenes(dreamt))
+    return machine.requires_grad_(False)
+
+
+def evidence(*classes, chains=CHAINS):
+    v = torch.zeros(chains, V).double()
+    v[:, list(classes)] = 1
+    return v
+
+
+def log_sigmoid(x):
+    return -math.log1p(math.exp(-x))
+
+
+def by_formula(machine, classes, room=None, held=()):
+    """Share of chains that start at each fantasy, by the module's docstring, one layer."""
+    weights = []
+    for v in unpack_scenes(machine.fantasies, V).double():
+        x = [float(machine.c1[k] + v @ machine.W[:, k]) for k in range(4)]
+        h1 = [1 / (1 + math.exp(-value)) for value in x]
+        log_w = 0.0
+        for i in classes:
+            log_w += log_sigmoid(
+                float(machine.b[i]) + sum(float(machine.W[i, k]) * h1[k] for k in range(4))
+            )
+        if room is not None:
+            log_w += sum(float(machine.Q[room, k]) * h1[k] for k in range(4))
+        log_w += sum(log_sigmoid(x[k]) for k in held)
+        weights.append(math.exp(log_w))
+    return [weight / sum(weights) for weight in weights]
+
+
+@pytest.mark.parametrize(
+    ("classes", "room", "held"),
+    [([], None, ()), ([0], None, ()), ([3, 33], None, ()), ([5], 1, ()), ([], None, (2,)),
+     ([1], 0, (0, 3))],
+)  # fmt: skip
+def test_fantasies_are_weighed_by_the_formula(classes, room, held):
+    """Shares of 20,000 chains within five standard errors: six fantasies fail by chance with
+    probability < 4e-6."""
+    machine = machine_of()
+    clamp = Clamp(
+        h1=torch.tensor([k in held for k in range(4)]),
+        room=None if room is None else torch.full((CHAINS,), room),
+    )
+    state = start_chains(machine, evidence(*classes), torch.Generator().manual_seed(1), clamp)
+    expected = by_formula(machine, classes, room, held)
+    assert max(expected) > 1.05 * min(expected) or not (classes or held or room is not None)
+    dreamt = unpack_scenes(machine.fantasies, V).double().maximum(evidence(*classes, chains=1))
+    assert len(dreamt.unique(dim=0)) == len(dreamt)
+    total = 0.0
+    for v, p in zip(dreamt, expected, strict=True):
+        share = float((state.v == v).all(1).double().mean())
+        assert abs(share - p) <= 5 * math.sqrt(p * (1 - p) / CHAINS)
+        total += share
+    assert total == pytest.approx(1)
+    assert bool((state.h1[:, list(held)] == 1).all())
+
+
+def test_a_fantasy_that_holds_what_is_given_is_preferred():
+    """Two kinds of scenes, told by one unit: nearly all chains start at the kind of the class."""
+    machine = machine_of(N=2)
+    for parameter in machine.parameters():
+        parameter.zero_()
+    machine.W[:10, 0], machine.W[10:20, 0] = 6.0, -6.0
+    machine.b[:10] = -3.0
+    machine.b[10:20] = 3.0
+    dreamt = torch.zeros(2, V)
+    dreamt[0, :5] = dreamt[1, 10:15] = 1
+    machine.fantasies.copy_(pack_scenes(dreamt))
+    for given_class, kind in ((7, 0), (17, 1)):
+        chains = evidence(given_class, chains=500)
+        state = start_chains(machine, chains, torch.Generator().manual_seed(0))
+        at_home = (state.v[:, :5].all(1), state.v[:, 10:15].all(1))[kind]
+        # exp(-3) against 1: some 24 chains of 500 start elsewhere.
+        assert float(at_home.double().mean()) > 0.9
+        assert bool((state.v[:, given_class] == 1).all())
+    # One unit that is on in the first kind of scenes alone.
+    clamp = Clamp(h1=torch.tensor([True, False, False, False]))
+    state = start_chains(machine, evidence(chains=500), torch.Generator().manual_seed(0), clamp)
+    assert bool((state.v[:, :5] == 1).all())
+
+
+@pytest.mark.parametrize("N", [0, 6])
+@pytest.mark.parametrize("H2", [0, 3])
+def test_chains_hold_what_is_given(N, H2):
+    machine = machine_of(N=N, H2=H2)
+    chains = torch.zeros(40, V).double()
+    generator = torch.Generator().manual_seed(2)
+    chains[torch.rand(40, V, generator=generator) < 0.2] = 1
+    held = Clamp(h1=torch.tensor([False, True, False, False]), h2=torch.arange(H2) == 2)
+    state = start_chains(machine, chains, generator, held)
+    assert bool((state.v >= chains).all())
+    assert bool((state.h1[:, 1] == 1).all())
+    assert state.h2.shape == (40, H2)
+    assert not H2 or bool((state.h2[:, 2] == 1).all())
+    assert set(state.h1.unique().tolist()) == {0.0, 1.0}
+    again = start_chains(machine, chains, generator.manual_seed(2), held)
+    other = start_chains(machine, chains, generator.manual_seed(2), held)
+    assert torch.equal(again.v, other.v)
+    assert torch.equal(again.h1, other.h1)
+
+
+@pytest.mark.parametrize("form", ["seed", "local"])
+def test_without_fantasies_chains_start_at_their_evidence(form):
+    machine = machine_of(N=0, form=form)
+    chains = evidence(2, 9, chains=7)
+    state = start_chains(machine, chains, torch.Generator().manual_seed(5))
+    plain = initial_state(machine, chains, torch.Generator().manual_seed(5))
+    assert torch.equal(state.v, chains)
+    assert torch.equal(state.h1, plain.h1)
+    assert torch.equal(state.r, plain.r)
