@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.boltzmann import MachineSpec, build
-from app.boltzmann.fantasies import pack_scenes, start_chains, unpack_scenes, words
-from app.boltzmann.gibbs import Clamp, initial_state
+from app.boltzmann.fantasies import Fantasies, pack_scenes, unpack_scenes, words
+from app.boltzmann.gibbs import FREE, Clamp, initial_state
 
 V = 35
 CHAINS = 20_000
@@ -41,6 +41,10 @@ def machine_of(N=6, H2=0, form="local", seed=0):
             assert len(dreamt.unique(dim=0)) == N
             machine.fantasies.copy_(pack_scenes(dreamt))
     return machine.requires_grad_(False)
+
+
+def start_chains(machine, given, generator, clamp=FREE):
+    return Fantasies(machine).start(given, generator, clamp)
 
 
 def evidence(*classes, chains=CHAINS):
