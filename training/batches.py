@@ -23,7 +23,7 @@ class Batch:
 
     Attributes:
         v: (B, V) presence.
-        classes, counts: (B, n) int64, classes -1 where padded.
+        classes, counts: (B, n) int64, classes -1 where padded, counts 0 where nobody counted.
         holds, observed: (B, A, n, n) relations between those classes.
         room: (B,) int64, -1 where nobody said.
         annotated: (B, V) bool: the source mentions the class at all; elsewhere v says nothing.

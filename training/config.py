@@ -68,6 +68,9 @@ class ObjectiveConfig(_Section):
     room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of withheld room types")
     structure_dropout: float = Field(default=0.5, ge=0, le=1)
     object_dropout: float = Field(default=0.0, ge=0, lt=1)
+    count_dropout: float = Field(
+        default=0.0, ge=0, le=1, description="share of scenes whose relations see no counts"
+    )
 
 
 class PolishConfig(_Section):

@@ -119,10 +119,22 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
                 per_unit[place[machine.triple_keys[place] == torch.from_numpy(keys)]] += 1
     if isinstance(machine, Triway):
         machine.d.copy_(log_odds_of(held, seen))
+        machine.usual.copy_(usual_log_counts(scenes))
     else:
         machine.get_parameter("d").copy_(
             log_odds_of(per_unit, torch.full_like(per_unit, annotated))
         )
+
+
+def usual_log_counts(scenes: SceneTensors) -> Tensor:
+    """Mean log of the instances of each class, (V,), over scenes with annotated relations."""
+    total, times = torch.zeros(scenes.v.shape[1]), torch.zeros(scenes.v.shape[1])
+    for scene in scenes.scenes:
+        e = scene.evidence
+        if e.observed.any():
+            total[torch.from_numpy(e.classes)] += torch.from_numpy(e.counts).log()
+            times[torch.from_numpy(e.classes)] += 1
+    return total / times.clamp(min=1)
 
 
 class Trainer:

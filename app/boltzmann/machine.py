@@ -101,7 +101,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
         Args:
             classes: (B, n) int64, -1 where padded.
-            counts: (B, n) instances per class.
+            counts: (B, n) instances per class, 0 where unknown; one each where omitted.
         """
 
     @abstractmethod

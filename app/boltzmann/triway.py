@@ -10,7 +10,7 @@ here the state space is {r_e ≤ v_i v_j}, so a relation can be on only between 
 present, and the weights are shared through the factors S, O, R, M instead of one free weight per
 (a,i,j). The residual w' exists for triples seen in training; n lets relations see how many
 instances n_i, n_j of the two classes there are, since a class-level relation is the OR over
-instance pairs.
+instance pairs; where nobody counted, the class's usual log n_i stands in.
 
 With G > 0 (local form) relations that are given also shift the logits of the others, by weights
 gamma and B: see `implications`.
@@ -49,6 +49,7 @@ class Triway(BoltzmannMachine):
         self.M = nn.Parameter(torch.zeros(A, K, H1))
         self.P = nn.Parameter(torch.zeros(A, H1))
         self.n = nn.Parameter(torch.zeros(A, 2))
+        self.usual = nn.Parameter(torch.zeros(V))
         self.residual = nn.Parameter(torch.zeros(spec.T))
         if spec.G:
             self.gamma = nn.Parameter(torch.zeros(1 + spec.G, A, feature_count(A)))
@@ -56,8 +57,15 @@ class Triway(BoltzmannMachine):
         self.kappa = nn.Parameter(torch.zeros(A), requires_grad=False)
 
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> PairEdges:
-        """The A·n² units between the given classes; all others are off."""
-        logs = None if counts is None else counts.clamp(min=1).to(self.b.dtype).log()
+        """The A·n² units between the given classes; all others are off.
+
+        Args:
+            counts: 0 where nobody said how many there are: the usual number counts then.
+        """
+        if counts is None:
+            return pair_edges(classes, self.spec.A)
+        usual = self.usual[classes.clamp(min=0)]
+        logs = torch.where(counts > 0, counts.clamp(min=1).to(self.b.dtype).log(), usual)
         return pair_edges(classes, self.spec.A, log_subjects=logs)
 
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
@@ -224,7 +232,7 @@ class Triway(BoltzmannMachine):
         With a base, b leads to b_base and κ to -log 2: at beta = 0 the two states of a relation
         unit weigh 1/2 each, so that relations sum out to one and objects are independent.
         """
-        return scale(self, beta, base, keep=("b", "kappa"), fixed=("S", "O", "B"))
+        return scale(self, beta, base, keep=("b", "kappa"), fixed=("S", "O", "B", "usual"))
 
 
 def _pairs(edges: Edges) -> PairEdges:

@@ -72,6 +72,6 @@ class TripleTable:
         index = batch.classes.clamp(min=0)
         values = self.log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
         if self.multiplicity:
-            logs = batch.counts.to(values.dtype).log()
+            logs = batch.counts.clamp(min=1).to(values.dtype).log()
             values = values + self.multiplicity * (logs[:, None, :, None] + logs[:, None, None, :])
         return values

@@ -95,7 +95,7 @@ def score_scenes(
     """Batches of the scenes that have annotated triples, with their scores (B, A, n, n).
 
     Args:
-        counts: say how many instances of each class there are; otherwise one each.
+        counts: say how many instances of each class there are; otherwise 0, nobody counted.
     """
     scored = []
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
@@ -104,7 +104,7 @@ def score_scenes(
             batch = scenes.batch(index)
             asked = telling(batch, torch.zeros_like(batch.observed))
             if not counts:
-                asked = replace(asked, counts=torch.ones_like(asked.counts))
+                asked = replace(asked, counts=torch.zeros_like(asked.counts))
             scored.append((batch, score(asked)))
     return scored
 

@@ -163,6 +163,9 @@ class CompositeLikelihood(Objective):
         if self.config.unlisted == "off":
             some = unlisted_off(some, self.classes_apart(machine))
         room = withhold_rooms(some, self.config.room_dropout, generator)
+        if self.config.count_dropout:
+            withheld = torch.rand(len(some), 1, generator=generator) < self.config.count_dropout
+            some = replace(some, counts=some.counts.masked_fill(withheld, 0))
         edges, r, observed = relation_units(machine, some)
         unseen = edges if machine.spec.form == "seed" and isinstance(machine, Triway) else None
         h1 = mean_field(machine, Evidence(some.v, unseen, room=room)).y.sigmoid()
