@@ -40,7 +40,7 @@ from training.trainer import subset
 _ALARM_SHARE = 0.05
 _RESAMPLES = 200
 # Scenes of a source whose share of alarms is kept by itself.
-_ALARM_SCENES = 40
+_ALARM_SCENES = 200
 _SCENES = 1500
 # Cases a scene: with one of some 300 scenes, the weight moved by a third from draw to draw.
 _PLACED_CASES = 2
