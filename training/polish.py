@@ -7,7 +7,8 @@ the object part alone, mend that and leave the answers as they were; a term
     anchor · sum (θ - θ_before)²
 
 holds the weights where the answers left them. The chains go on with the averaged weights
-afterwards, and are kept as the machine's fantasies (see `app.boltzmann.fantasies`).
+afterwards, each under the room type of the scene it began at, and are kept as the machine's
+fantasies (see `app.boltzmann.fantasies`).
 
 Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
 """
@@ -55,12 +56,13 @@ def polish(
         raise ValueError("chains over objects alone are for machines of the local form")
     generator = torch.Generator().manual_seed(seed)
 
-    def scenes(count: int) -> tuple[Tensor, Tensor]:
+    def scenes(count: int) -> tuple[Tensor, Tensor, Tensor]:
         index = torch.randint(len(train), (count,), generator=generator)
         hidden = torch.rand(count, generator=generator) < room_dropout
-        return train.v[index], torch.where(hidden, -1, train.room[index])
+        rooms = train.room[index]
+        return train.v[index], torch.where(hidden, -1, rooms), rooms
 
-    v, room = scenes(max(config.chains, machine.spec.N))
+    v, room, every_room = scenes(max(config.chains, machine.spec.N))
     state = _settled(machine, v, room, generator)
     before = {name: machine.get_parameter(name).detach().clone() for name in _NAMES}
     average = {name: value.clone() for name, value in before.items()}
@@ -69,7 +71,7 @@ def polish(
     cycle = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(config.updates, 1))
     for _ in range(config.updates):
         state = _sweep(machine, state, room, generator, config.k)
-        data_v, data_room = scenes(len(v))
+        data_v, data_room, _ = scenes(len(v))
         with torch.no_grad():
             field = mean_field(machine, Evidence(data_v, room=data_room))
             h2 = bernoulli(field.h2, generator)
@@ -87,9 +89,9 @@ def polish(
         for name, weight in zip(_NAMES, weights, strict=True):
             weight.copy_(average[name])
     if machine.spec.N:
-        free = torch.full_like(room, -1)
-        state = _sweep(machine, state, free, generator, _SWEEPS)
+        state = _sweep(machine, state, every_room, generator, _SWEEPS)
         machine.fantasies.copy_(pack_scenes(state.v[: machine.spec.N]))
+        machine.fantasy_rooms.copy_(every_room[: machine.spec.N])
 
 
 @torch.no_grad()

@@ -2,14 +2,17 @@
 
 A chain that starts at nothing needs thousands of sweeps to find all kinds of rooms, since one kind
 leads to another through scenes of neither. So a trained machine keeps N fantasies, the states of
-long chains of its own (`BoltzmannMachine.fantasies`), and a new chain goes on from one of them.
+long chains of its own, with the room type that each was dreamt under (`BoltzmannMachine.fantasies`
+and `.fantasy_rooms`), and a new chain goes on from one of them.
 
 With evidence the fantasies are weighed by what they make of it before one is drawn for each chain,
 
-    log w = sum_{i given} log p(v_i = 1 | h1) + h1·Q[t] + sum_{k held} log p(h1_k = 1),
+    log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
+            + h1·Q[t] - 6 [dreamt under another room type than t],
 
-h1 at its mean given the fantasy: sampling importance resampling, exact in the limit of many
-fantasies up to the mean; the sweeps that follow do the rest.
+h1 at its mean given the fantasy: sampling importance resampling, the sweeps that follow do the
+rest. A chain does not find from one kind of room to another in a few sweeps whatever Q says, so
+fantasies of other room types are for those that nobody dreamt of.
 
 Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for
 fantasy particles; Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian
@@ -31,6 +34,7 @@ from app.boltzmann.machine import BoltzmannMachine
 from app.boltzmann.mean_field import Evidence, mean_field
 
 _WORD = 32
+_OTHER_ROOM = 6.0
 
 
 def words(classes: int) -> int:
@@ -86,16 +90,20 @@ class Fantasies:
             return _held(initial_state(machine, given, generator, clamp), clamp)
         weight = self.log_weight(given, clamp)
         chosen = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
-        state = initial_state(machine, self.v[chosen].maximum(given), generator, clamp)
-        h2 = bernoulli(self.h2[chosen], generator)
-        return _held(replace(state, h1=bernoulli(self.h1[chosen], generator), h2=h2), clamp)
+        h1, h2 = bernoulli(self.h1[chosen], generator), bernoulli(self.h2[chosen], generator)
+        # No relations: in the local form, which alone has fantasies, they do not act on the rest.
+        edges = machine.edges(torch.zeros(len(given), 0, dtype=torch.int64))
+        r = given.new_zeros(len(given), edges.shape[-1])
+        return _held(State(self.v[chosen].maximum(given), h1, h2, r, edges), clamp)
 
     def log_weight(self, given: Tensor, clamp: Clamp = FREE) -> Tensor:
         """log w of every fantasy, (B, N); see the module."""
         weight = given @ self._present.T
         if clamp.room is not None and self.machine.spec.C:
             known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
-            weight = weight + known * self._room.T[clamp.room.clamp(min=0)]
+            other = self.machine.fantasy_rooms != clamp.room.unsqueeze(1)
+            hint = self._room.T[clamp.room.clamp(min=0)] - _OTHER_ROOM * other
+            weight = weight + known * hint
         if clamp.h1 is not None:
             weight = weight + clamp.h1.to(given.dtype) @ self._unit.T
         return weight

@@ -49,10 +49,12 @@ class BoltzmannMachine(nn.Module, ABC):
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         self.triples: Tensor
         if spec.N:
-            # N scenes as bits, see `fantasies`; (N, ceil(V / 32)).
+            # N scenes as bits, (N, ceil(V / 32)), and their room types, -1 for none: `fantasies`.
             empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
             self.register_buffer("fantasies", empty)
+            self.register_buffer("fantasy_rooms", torch.full((spec.N,), -1, dtype=torch.int32))
         self.fantasies: Tensor
+        self.fantasy_rooms: Tensor
         self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
             lambda module, _: module.index_triples()
         )
