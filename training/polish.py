@@ -28,7 +28,7 @@ from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import SceneTensors
 from training.config import PolishConfig
 
-_NAMES = ("b", "c1", "c2", "W")
+_NAMES = ("b", "c1", "c2", "W", "Q")
 _AVERAGING = 0.98
 # Sweeps between the last update and the fantasies, with the averaged weights.
 _SWEEPS = 50
@@ -41,7 +41,7 @@ def polish(
     room_dropout: float,
     seed: int,
 ) -> None:
-    """Change b, c1, c2 and W in place, and fill the fantasies.
+    """Change b, c1, c2, W and Q in place, and fill the fantasies.
 
     Args:
         config: how many updates and chains; none of either does nothing.

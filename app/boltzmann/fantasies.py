@@ -8,11 +8,11 @@ and `.fantasy_rooms`), and a new chain goes on from one of them.
 With evidence the fantasies are weighed by what they make of it before one is drawn for each chain,
 
     log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
-            + h1·Q[t] - 6 [dreamt under another room type than t],
+            - 6 [dreamt under another room type than t],
 
 h1 at its mean given the fantasy: sampling importance resampling, the sweeps that follow do the
-rest. A chain does not find from one kind of room to another in a few sweeps whatever Q says, so
-fantasies of other room types are for those that nobody dreamt of.
+rest. Where no fantasy was dreamt under t, the last term is h1·Q[t]. A chain does not find from one
+kind of room to another in a few sweeps, whatever Q says.
 
 Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for
 fantasy particles; Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian
@@ -101,8 +101,9 @@ class Fantasies:
         weight = given @ self._present.T
         if clamp.room is not None and self.machine.spec.C:
             known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
-            other = self.machine.fantasy_rooms != clamp.room.unsqueeze(1)
-            hint = self._room.T[clamp.room.clamp(min=0)] - _OTHER_ROOM * other
+            own = self.machine.fantasy_rooms == clamp.room.unsqueeze(1)
+            hint = self._room.T[clamp.room.clamp(min=0)]
+            hint = torch.where(own.any(1, keepdim=True), -_OTHER_ROOM * ~own, hint)
             weight = weight + known * hint
         if clamp.h1 is not None:
             weight = weight + clamp.h1.to(given.dtype) @ self._unit.T

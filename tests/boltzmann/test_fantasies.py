@@ -40,6 +40,7 @@ def machine_of(N=6, H2=0, form="local", seed=0):
             dreamt = (torch.rand(N, V, generator=generator) < 0.4).float()
             assert len(dreamt.unique(dim=0)) == N
             machine.fantasies.copy_(pack_scenes(dreamt))
+            machine.fantasy_rooms.copy_(torch.arange(N) % 3 - 1)
     return machine.requires_grad_(False)
 
 
@@ -60,7 +61,10 @@ def log_sigmoid(x):
 def by_formula(machine, classes, room=None, held=()):
     """Share of chains that start at each fantasy, by the module's docstring, one layer."""
     weights = []
-    for v in unpack_scenes(machine.fantasies, V).double():
+    dreamt = zip(
+        unpack_scenes(machine.fantasies, V).double(), machine.fantasy_rooms.tolist(), strict=True
+    )
+    for v, own in dreamt:
         x = [float(machine.c1[k] + v @ machine.W[:, k]) for k in range(4)]
         h1 = [1 / (1 + math.exp(-value)) for value in x]
         log_w = 0.0
@@ -69,7 +73,7 @@ def by_formula(machine, classes, room=None, held=()):
                 float(machine.b[i]) + sum(float(machine.W[i, k]) * h1[k] for k in range(4))
             )
         if room is not None:
-            log_w += sum(float(machine.Q[room, k]) * h1[k] for k in range(4))
+            log_w -= 6.0 if own != room else 0.0
         log_w += sum(log_sigmoid(x[k]) for k in held)
         weights.append(math.exp(log_w))
     return [weight / sum(weights) for weight in weights]
@@ -124,6 +128,16 @@ def test_a_fantasy_that_holds_what_is_given_is_preferred():
     clamp = Clamp(h1=torch.tensor([True, False, False, False]))
     state = start_chains(machine, evidence(chains=500), torch.Generator().manual_seed(0), clamp)
     assert bool((state.v[:, :5] == 1).all())
+
+
+def test_a_room_type_that_nobody_dreamt_of_takes_any_fantasy():
+    machine = machine_of()
+    machine.fantasy_rooms.fill_(0)
+    clamp = Clamp(room=torch.full((200,), 1))
+    fantasies = Fantasies(machine)
+    plain = fantasies.log_weight(evidence(3, chains=200))
+    weight = fantasies.log_weight(evidence(3, chains=200), clamp)
+    assert torch.allclose(weight - plain, (fantasies.h1 @ machine.Q[1]).expand(200, -1))
 
 
 @pytest.mark.parametrize("N", [0, 6])

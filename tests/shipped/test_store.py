@@ -11,7 +11,7 @@ from app.registry import Artifact, Store, load_model_set
 from app.scene import CANONICAL
 
 STORE = Store(Path(__file__).resolve().parents[2] / "model_store")
-SHIPPED = ["indoor-gbm", "indoor-rbm", "indoor-triway", "procthor-triway"]
+SHIPPED = ["everyday-triway", "indoor-gbm", "indoor-rbm", "indoor-triway", "procthor-triway"]
 
 
 @pytest.fixture(scope="module")

@@ -58,6 +58,24 @@ def test_fantasies_follow_the_machine_and_not_the_scenes_they_began_at():
         assert abs(share - p) <= 5 * math.sqrt(p * (1 - p) / 3000)
 
 
+def test_each_fantasy_knows_the_room_type_it_was_dreamt_under():
+    rooms = [k % 3 - 1 for k in range(30)]
+    data = tensors([scene([0, 1], room=room) for room in rooms], WIDE)
+    spec = MachineSpec("rbm", V=WIDE, A=4, H1=2, C=2, N=300, form="local")
+    machine = build(spec).requires_grad_(False)
+    machine.b.fill_(-4.0)
+    machine.W[2:4, 0], machine.W[4:6, 1] = 8.0, 8.0
+    machine.c1.fill_(-12.0)
+    machine.Q[:] = torch.eye(2) * 20
+    dream(machine, data, 0)
+    found, own = dreamt(machine), machine.fantasy_rooms
+    assert set(own.tolist()) == {-1, 0, 1}
+    for room, things in ((0, slice(2, 4)), (1, slice(4, 6))):
+        # h1 is on with probability 0.9997 there, and each thing then with 0.98.
+        assert float(found[own == room][:, things].mean()) > 0.85
+        assert float(found[own != room][:, things].mean()) < 0.15
+
+
 def test_without_fantasies_nothing_is_dreamt():
     machine = machine_of(0)
     dream(machine, DATA, 0)
@@ -72,7 +90,7 @@ def test_the_seed_form_is_refused():
 @pytest.mark.parametrize("variant", ["triway", "gbm"])
 def test_chains_come_to_the_data(variant):
     """Scenes of two kinds; a machine that is far too full. The frequencies of its own scenes are
-    nearer to the data's by far after the updates, and the anchor holds the weights back."""
+    at most half as far from the data's after the updates, and the anchor holds the weights back."""
     v = torch.zeros(40, WIDE)
     v[:20, :4], v[20:, 6:10] = 1, 1
     data = tensors([scene(row.nonzero().squeeze(1).tolist()) for row in v], WIDE)
@@ -90,11 +108,11 @@ def test_chains_come_to_the_data(variant):
 
     (before, none), (after, much), (held, little) = (
         polished(updates=0),
-        polished(updates=150, anchor=0.0),
-        polished(updates=150, anchor=10.0),
+        polished(updates=400, anchor=0.0),
+        polished(updates=400, anchor=10.0),
     )
     assert none == 0
-    assert distance(after) < 0.25 * distance(before)
+    assert distance(after) < 0.5 * distance(before)
     assert 0 < little < 0.2 * much
     assert distance(held) < distance(before)
 
