@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 # Radians below which two rectangles count as parallel. Only parallel edges can coincide, so that
 # cutting along edges, which would count a shared edge twice, never meets one.
 _PARALLEL: Final = 1e-6
+# In place of edges of no length, which nothing can be divided by.
+_SHORTEST: Final = 1e-150
 _SIGNS: Final = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
 
@@ -46,7 +48,9 @@ def overlap_and_gap(
         skew = np.flatnonzero(~parallel)
         area[skew], gap[skew] = _skew(offset[skew], half_a[skew], yaw[skew], half_b[skew])
     smaller = np.minimum(size_a.prod(axis=1), size_b.prod(axis=1))
-    return area / smaller, gap
+    # An area too small for a float is a point's, and lies wholly in what it touches.
+    share = np.divide(area, smaller, out=(gap == 0).astype(np.float64), where=smaller > 0)
+    return share, gap
 
 
 def _parallel(offset: Array, half_a: Array, half_b: Array) -> tuple[Array, Array]:
@@ -89,7 +93,9 @@ def _inside(corners: Array, half: Array) -> Array:
     where no part is."""
     start = corners
     along = np.roll(corners, -1, axis=1) - corners
-    # The edges are skew to the box, so no component of `along` is zero.
+    # The edges are skew to the box, so a component of `along` is zero only where all its length was
+    # lost to rounding; such an edge bounds no area wherever it is cut.
+    along = np.where(along == 0, _SHORTEST, along)
     one = (-half[:, None] - start) / along
     other = (half[:, None] - start) / along
     enter = np.maximum(np.minimum(one, other).max(axis=-1), 0.0)

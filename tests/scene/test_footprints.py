@@ -123,3 +123,15 @@ def test_no_pairs() -> None:
     empty, points = np.zeros(0), np.zeros((0, 2))
     share, gap = overlap_and_gap(points, points, empty, points, points, empty)
     assert share.shape == gap.shape == (0,)
+
+
+def test_a_footprint_too_small_for_its_area_is_a_point() -> None:
+    """1e-300 m squared underflows to 0: it lies wholly in what it touches, else not at all."""
+    tiny, table = np.full((2, 2), 1e-300), np.ones((2, 2))
+    centres = np.array([[0.0, 0.0], [3.0, 0.0]])
+    share, gap = overlap_and_gap(
+        centres, tiny, np.zeros(2), np.zeros((2, 2)), table, np.array([0.0, 0.3])
+    )
+    assert share.tolist() == [1.0, 0.0]
+    assert gap[0] == 0
+    assert gap[1] > 2

@@ -104,7 +104,7 @@ def test_chains_come_to_the_data(variant):
         machine.requires_grad_()
         start = machine.W.detach().clone()
         polish(machine, data, PolishConfig(learning_rate=0.05, **changes), 0.5, 1)
-        return machine, float((machine.W - start).abs().mean())
+        return machine, float((machine.W.detach() - start).abs().mean())
 
     (before, none), (after, much), (held, little) = (
         polished(updates=0),

@@ -97,7 +97,7 @@ def test_structure_is_no_end_of_a_relation():
 
 
 def test_what_is_scored_sees_no_relation():
-    """T1a asks with all relations hidden, and with one instance of each class if so wished."""
+    """T1a asks with all relations hidden, and with nobody having counted if so wished."""
     seen = []
 
     def spy(batch):
@@ -108,7 +108,7 @@ def test_what_is_scored_sees_no_relation():
     score_scenes(data, spy)
     score_scenes(data, spy, counts=False)
     assert not any(bool(batch.holds.any()) or bool(batch.observed.any()) for batch in seen)
-    assert [batch.counts.tolist() for batch in seen] == [[[1, 2]], [[1, 1]]]
+    assert [batch.counts.tolist() for batch in seen] == [[[1, 2]], [[0, 0]]]
 
 
 def test_expected_hits_shares_ties():
