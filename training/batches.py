@@ -26,7 +26,6 @@ class Batch:
         classes, counts: (B, n) int64, classes -1 where padded, counts 0 where nobody counted.
         holds, observed: (B, A, n, n) relations between those classes.
         room: (B,) int64, -1 where nobody said.
-        annotated: (B, V) bool: the source mentions the class at all; elsewhere v says nothing.
     """
 
     v: Tensor
@@ -35,7 +34,6 @@ class Batch:
     holds: Tensor
     observed: Tensor
     room: Tensor
-    annotated: Tensor
 
     def __len__(self) -> int:
         return len(self.v)
@@ -84,7 +82,6 @@ class SceneTensors:
             holds=torch.from_numpy(holds),
             observed=torch.from_numpy(observed),
             room=self.room[index],
-            annotated=self.annotated_classes[self.source[index]],
         )
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from app.boltzmann import BoltzmannMachine
 from app.boltzmann.bernoulli import bernoulli
 from app.boltzmann.fantasies import pack_scenes
-from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state
+from app.boltzmann.gibbs import Clamp, State, initial_state, run
 from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import SceneTensors
 from training.config import PolishConfig
@@ -70,7 +70,7 @@ def polish(
     optimiser = torch.optim.Adam(weights, lr=config.learning_rate)
     cycle = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(config.updates, 1))
     for _ in range(config.updates):
-        state = _sweep(machine, state, room, generator, config.k)
+        state = run(machine, state, generator, config.k, Clamp(room=room), relations=False)
         data_v, data_room, _ = scenes(len(v))
         with torch.no_grad():
             field = mean_field(machine, Evidence(data_v, room=data_room))
@@ -89,7 +89,8 @@ def polish(
         for name, weight in zip(_NAMES, weights, strict=True):
             weight.copy_(average[name])
     if machine.spec.N:
-        state = _sweep(machine, state, every_room, generator, _SWEEPS)
+        clamp = Clamp(room=every_room)
+        state = run(machine, state, generator, _SWEEPS, clamp, relations=False)
         machine.fantasies.copy_(pack_scenes(state.v[: machine.spec.N]))
         machine.fantasy_rooms.copy_(every_room[: machine.spec.N])
 
@@ -105,11 +106,3 @@ def _settled(
         h1=bernoulli(field.y.sigmoid(), generator),
         h2=bernoulli(field.h2, generator),
     )
-
-
-def _sweep(
-    machine: BoltzmannMachine, state: State, room: Tensor, generator: torch.Generator, count: int
-) -> State:
-    for _ in range(count):
-        state = gibbs_step(machine, state, generator, Clamp(room=room), relations=False)
-    return state

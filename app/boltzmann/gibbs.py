@@ -18,7 +18,6 @@ contrastive divergence, whose one step need not mix.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,30 +130,15 @@ def run(
     machine: BoltzmannMachine,
     state: State,
     generator: torch.Generator,
-    temperatures: Iterable[float],
+    sweeps: int,
     clamp: Clamp = FREE,
     *,
     relations: bool = True,
 ) -> State:
-    """One Gibbs step per entry of an annealing schedule of temperatures T > 0.
-
-    Tempering scales the weights by 1 / T, which in the seed form is p^(1/T); in the local form it
-    keeps relations locally normalised.
-
-    Raises:
-        ValueError: a temperature is not positive.
-    """
-    for temperature in temperatures:
-        if not temperature > 0:
-            raise ValueError(f"temperature must be positive, not {temperature}")
-        tempered = machine if temperature == 1 else machine.scaled(1 / temperature)
-        state = gibbs_step(tempered, state, generator, clamp, relations=relations)
+    """So many Gibbs steps; see `gibbs_step`."""
+    for _ in range(sweeps):
+        state = gibbs_step(machine, state, generator, clamp, relations=relations)
     return state
-
-
-def linear_schedule(steps: int, start: float, end: float = 1.0) -> list[float]:
-    """`steps` temperatures from start to end, evenly spaced."""
-    return torch.linspace(start, end, steps, dtype=torch.float64).tolist()
 
 
 def sample_h1(

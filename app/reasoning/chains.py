@@ -10,7 +10,7 @@ from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine
 from app.boltzmann.fantasies import Fantasies
-from app.boltzmann.gibbs import Clamp, State, gibbs_step
+from app.boltzmann.gibbs import Clamp, State, gibbs_step, run
 from app.reasoning.evidence import Observation
 
 CHAINS = 8
@@ -81,7 +81,5 @@ def sweep(
 ) -> State:
     """Gibbs sweeps. In the local form relations do not act on the rest: the last one draws them."""
     always = machine.spec.form == "seed"
-    for last in range(1, steps + 1):
-        relations = always or last == steps
-        state = gibbs_step(machine, state, generator, clamp, relations=relations)
-    return state
+    state = run(machine, state, generator, steps - 1, clamp, relations=always)
+    return gibbs_step(machine, state, generator, clamp)

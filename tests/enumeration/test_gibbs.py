@@ -20,7 +20,6 @@ from app.boltzmann.gibbs import (
     State,
     gibbs_step,
     initial_state,
-    linear_schedule,
     present_classes,
     run,
 )
@@ -172,13 +171,17 @@ def test_tempering_scales_the_energy_in_the_seed_form():
     torch.testing.assert_close(energy, 0.5 * joint.energy)
 
 
-def test_run_refuses_a_temperature_that_is_not_positive():
+@pytest.mark.parametrize("sweeps", [0, 1, 3])
+def test_run_makes_the_sweeps_asked_for(sweeps):
     machine = small_machine("rbm")
     generator = torch.Generator().manual_seed(0)
-    state = initial_state(machine, torch.zeros(1, 2).double(), generator)
-    with pytest.raises(ValueError, match="temperature must be positive"):
-        run(machine, state, generator, [1.0, 0.0])
-    assert linear_schedule(3, 2.0) == [2.0, 1.5, 1.0]
+    state = initial_state(machine, torch.zeros(40, 2).double(), generator)
+    ran = run(machine, state, generator.manual_seed(1), sweeps)
+    generator.manual_seed(1)
+    for _ in range(sweeps):
+        state = gibbs_step(machine, state, generator)
+    for name in ("v", "h1", "h2", "r"):
+        assert torch.equal(getattr(ran, name), getattr(state, name)), name
 
 
 def test_present_classes_puts_leading_ones_first():

@@ -235,11 +235,12 @@ def test_a_chain_makes_the_sweeps_asked_for_at_its_temperature(name, steps, monk
     """Nine scenes take two blocks. Relations are drawn in every sweep only where they act back."""
     machine, made = ARTIFACTS[name].machine, []
 
-    def recorded(tempered, state, generator, clamp, *, relations):
+    def recorded(tempered, state, generator, clamp, *, relations=True):
         made.append((tempered, relations))
         return gibbs_step(tempered, state, generator, clamp, relations=relations)
 
-    monkeypatch.setattr("app.reasoning.chains.gibbs_step", recorded)
+    for place in ("app.boltzmann.gibbs", "app.reasoning.chains"):
+        monkeypatch.setattr(f"{place}.gibbs_step", recorded)
     generate(ARTIFACTS[name], scene_of([0]), count=9, seed=0, steps=steps, temperature=2.0)
     block = [machine.spec.form == "seed"] * (steps - 1) + [True]
     assert [relations for _, relations in made] == block * 2

@@ -135,7 +135,7 @@ def log_partition(
     below = ais(machine, betas, settings.chains, generator, base)
     start = torch.randint(len(train), (settings.chains,), generator=generator)
     state = initial_state(machine, train.v[start], generator)
-    state = run(machine, state, generator, [1.0] * settings.burn_in)
+    state = run(machine, state, generator, settings.burn_in)
     return below, reverse_ais(machine, betas, state, generator, base)
 
 
