@@ -44,6 +44,20 @@ class LogPartition:
     standard_error: float
     bound: float
 
+    @classmethod
+    def of_weights(cls, base: float, log_weight: Tensor, *, reverse: bool = False) -> LogPartition:
+        """From the log weights (chains,) of runs from, or with `reverse` to, a base.
+
+        Args:
+            base: log Z of the base.
+            log_weight: of either direction, as its own path accumulates them.
+        """
+        sign, count = (-1 if reverse else 1), len(log_weight)
+        mean = float(log_weight.logsumexp(0)) - math.log(count)
+        ratio = (log_weight - mean).exp()
+        error = float(ratio.std()) / math.sqrt(count) if count > 1 else math.inf
+        return cls(base + sign * mean, error, base + sign * float(log_weight.mean()))
+
 
 def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> BoltzmannMachine:
     """The machine at beta = 0: objects independent with log-odds b (the machine's own by default).
@@ -89,7 +103,7 @@ def ais(
         warm = machine.scaled(previous, base)
         log_weight += (_free_energy(warm, state) - _free_energy(cold, state)).double()
         state = gibbs_step(cold, state, generator)
-    return _summary(base_log_partition(machine, base), log_weight, sign=1)
+    return LogPartition.of_weights(base_log_partition(machine, base), log_weight)
 
 
 @torch.no_grad()
@@ -109,7 +123,8 @@ def reverse_ais(
         warm = machine.scaled(previous, base)
         state = gibbs_step(cold, state, generator)
         log_weight += (_free_energy(cold, state) - _free_energy(warm, state)).double()
-    return _summary(base_log_partition(machine, base), log_weight, sign=-1)
+    log_base = base_log_partition(machine, base)
+    return LogPartition.of_weights(log_base, log_weight, reverse=True)
 
 
 def _free_energy(machine: BoltzmannMachine, state: State) -> Tensor:
@@ -117,14 +132,6 @@ def _free_energy(machine: BoltzmannMachine, state: State) -> Tensor:
     if machine.spec.form == "local":
         return machine.free_energy(state.v, h2=h2)
     return machine.free_energy(state.v, state.r, state.edges, h2)
-
-
-def _summary(base: float, log_weight: Tensor, sign: int) -> LogPartition:
-    count = len(log_weight)
-    mean = float(log_weight.logsumexp(0)) - math.log(count)
-    ratio = (log_weight - mean).exp()
-    error = float(ratio.std()) / math.sqrt(count) if count > 1 else math.inf
-    return LogPartition(base + sign * mean, error, base + sign * float(log_weight.mean()))
 
 
 def _check(betas: Sequence[float]) -> None:

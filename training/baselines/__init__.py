@@ -1,8 +1,8 @@
 """Baselines that an evaluation trains in the same run, on the same scenes.
 
-`OBJECTS` are scored on T2 and T3, `RELATIONS` on T1a and T3b, `COMPLETIONS` on T1b and `PLACED` on
-T2-at; the scores have the types of `training.evaluation`. Each is a `Baseline`, whose `fit` tunes
-it on validation and returns every trial.
+`OBJECTS` are scored on T2 and T3, `RELATIONS` on T1a and T3b, `COMPLETIONS` on T1b, `PLACED` on
+T2-at and `DENSITIES` on Density; the scores have the types of `training.evaluation`. Each is a
+`Baseline`, whose `fit` tunes it on validation and returns every trial.
 
 A class that a source never mentions counts as absent from its scenes. Our own objective leaves such
 classes out of its losses; but a score is not told the source and has to rank all classes, so there
@@ -32,11 +32,13 @@ from training.baselines import (
 from training.baselines.fitting import Baseline, Fitted, Trial
 from training.baselines.judges import (
     completion_r_precision,
+    log_likelihood,
     missing_mrr,
     placed_mrr,
     r_precision,
 )
 from training.baselines.placed_table import PlacedTable
+from training.evaluation.density import ObjectDensity
 from training.evaluation.missing import ObjectScore
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
@@ -68,6 +70,10 @@ PLACED: Final[tuple[Baseline[PlacedScore], ...]] = (
     Baseline("frequency table p(i | a, j)", placed_table.propose, placed_mrr),
 )
 
+DENSITIES: Final[tuple[Baseline[ObjectDensity], ...]] = (
+    Baseline("pairwise, by likelihood", pairwise.propose_densities, log_likelihood),
+)
+
 
 def placed_product(objects: Fitted[ObjectScore], table: PlacedTable) -> Baseline[PlacedScore]:
     """The T2-at row of a fitted object baseline times the fitted table."""
@@ -77,6 +83,7 @@ def placed_product(objects: Fitted[ObjectScore], table: PlacedTable) -> Baseline
 
 __all__ = [
     "COMPLETIONS",
+    "DENSITIES",
     "OBJECTS",
     "PLACED",
     "RELATIONS",

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from training.batches import SceneTensors
 from training.evaluation.completion import complete_scenes
+from training.evaluation.density import ObjectDensity
 from training.evaluation.missing import ObjectScore, leave_one_out
 from training.evaluation.placed import PlacedScore, leave_one_out_at
 from training.evaluation.relations import RelationScore, rank, rank_relations
@@ -46,3 +47,8 @@ def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: Relat
         ValueError: no scene has two relations.
     """
     return rank(complete_scenes(scenes, structure, score), len(scenes)).pooled().value
+
+
+def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:
+    """Density: mean log-likelihood of the objects, nats, with the upper estimate of log Z."""
+    return float(density.log_unnormalised(scenes.v).double().mean()) - density.upper

@@ -14,6 +14,7 @@ from app.registry import Calibration
 from app.scene import Vocabulary
 from training.baselines import (
     COMPLETIONS,
+    DENSITIES,
     OBJECTS,
     PLACED,
     RELATIONS,
@@ -31,6 +32,7 @@ from training.evaluation.contenders import (
     fitted_alarm,
     machine_contender,
 )
+from training.evaluation.density import ObjectDensity
 from training.evaluation.missing import ObjectScore
 from training.evaluation.outliers import intruder_scores
 from training.evaluation.placed import PlacedScore
@@ -93,6 +95,8 @@ def baseline_entries(seed: int, names: Sequence[str] | None = None) -> Iterator[
         makers[name] = partial(_completion, completion, seed), completion.stochastic
     for placed in PLACED:
         makers[placed.name] = partial(_placed, placed, seed), placed.stochastic
+    for density in DENSITIES:
+        makers[density.name] = partial(_density, density, seed), density.stochastic
     if unknown := sorted(set(names or ()) - set(makers)):
         raise ValueError(f"unknown baselines {unknown}, must be of {list(makers)}")
     for name, (make, stochastic) in makers.items():
@@ -157,6 +161,13 @@ def _placed(
 ) -> Rival:
     score = _fit(baseline, material.data, seed, folder, say).score
     return _always(Contender(placed=score))
+
+
+def _density(
+    baseline: Baseline[ObjectDensity], seed: int, material: Material, folder: Path, say: Progress
+) -> Rival:
+    density = _fit(baseline, material.data, seed, folder, say).score
+    return _always(Contender(density=lambda: density))
 
 
 def _independent(material: Material, folder: Path, say: Progress) -> Rival:  # noqa: ARG001

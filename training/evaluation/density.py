@@ -1,11 +1,10 @@
 """Log-likelihood of a scene's objects, with log Z by AIS from below and from above.
 
-Classes that the scene's source never annotates are unobserved, and summed out; all others count,
-structure among them. The room type is withheld. In the local form relations drop out of p(v), so
-the machine is annealed without them. With h1 drawn from its mean field q given the scene,
+All classes of the vocabulary count, structure among them; what a scene does not list is absent, as
+it is in training. The room type is withheld. In the local form relations drop out of p(v), so the
+machine is annealed without them. With h1 drawn from its mean field q given the scene,
 
-    log p(v) = log mean_h [ exp(b·v + h·(c1 + v'W)) prod_l (1 + exp(c2 + h'J)_l)
-               prod_{i unobserved} (1 + exp(b_i + W_i·h)) / q(h) ] - log Z
+    log p(v) = log mean_h [ exp(b·v + h·(c1 + v'W)) prod_l (1 + exp(c2 + h'J)_l) / q(h) ] - log Z
 
 The mean is unbiased, so its log is too low in expectation; with the upper estimate of log Z the
 log-likelihood is conservative twice over.
@@ -27,6 +26,7 @@ from app.boltzmann.gibbs import initial_state, run
 from app.boltzmann.mean_field import Evidence, mean_field
 from app.boltzmann.partition import LogPartition, ais, independent_base, reverse_ais
 from training.batches import SceneTensors
+from training.evaluation.ising import Ising
 from training.trainer import log_odds_of
 
 _BLOCK = 16
@@ -47,32 +47,57 @@ class DensitySettings:
     burn_in: int = 2000
     draws: int = 256
 
+    def betas(self) -> list[float]:
+        """From 0 to 1, denser where the model is nearly itself: most of the change lies there."""
+        return [float(x) for x in 1 - np.linspace(1.0, 0.0, self.temperatures) ** 2]
+
 
 @dataclass(frozen=True, eq=False)
 class ObjectDensity:
     """A density over presence vectors.
 
     Attributes:
-        log_unnormalised: presence (B, V), annotated (B, V) bool -> (B,) log-likelihood + log Z.
+        log_unnormalised: presence (B, V) -> (B,) log-likelihood + log Z.
         lower, upper: log Z from below and from above, equal where it is exact.
         notes: what is known of the two estimates.
     """
 
-    log_unnormalised: Callable[[Tensor, Tensor], Tensor]
+    log_unnormalised: Callable[[Tensor], Tensor]
     lower: float
     upper: float
     notes: dict[str, float] = field(default_factory=dict)
 
 
 def independent_density(train: SceneTensors) -> ObjectDensity:
-    """Independent classes at their smoothed frequency where annotated."""
-    annotated = train.annotated_classes[train.source].float()
-    logits = log_odds_of((train.v * annotated).sum(0), annotated.sum(0))
+    """Independent classes at their smoothed frequency."""
+    logits = _log_odds(train)
 
-    def log_p(v: Tensor, annotated: Tensor) -> Tensor:
-        return (torch.where(v > 0, logsigmoid(logits), logsigmoid(-logits)) * annotated).sum(1)
+    def log_p(v: Tensor) -> Tensor:
+        return torch.where(v > 0, logsigmoid(logits), logsigmoid(-logits)).sum(1)
 
     return ObjectDensity(log_p, 0.0, 0.0)
+
+
+def ising_density(
+    b: Tensor,
+    W: Tensor,
+    train: SceneTensors,
+    settings: DensitySettings = DensitySettings(),
+    seed: int = 0,
+) -> ObjectDensity:
+    """The density of a pairwise model with biases b (V,) and edges W (V, V).
+
+    Raises:
+        ValueError: see `Ising`.
+    """
+    model = Ising(b.double().numpy(), W.double().numpy())
+    generator = torch.Generator().manual_seed(seed)
+    start = torch.randint(len(train), (settings.chains,), generator=generator)
+    base = _log_odds(train).double().numpy()
+    below, above = model.log_partition(
+        base, train.v[start], settings.betas(), settings.burn_in, seed
+    )
+    return _density(model.log_unnormalised, below, above)
 
 
 def machine_density(
@@ -95,13 +120,15 @@ def machine_density(
     objects = object_part(machine)
     below, above = log_partition(objects, train, settings, seed)
 
-    def log_unnormalised(v: Tensor, annotated: Tensor) -> Tensor:
-        parts = [
-            _log_sum(objects, v[index], annotated[index], settings.draws)
-            for index in torch.arange(len(v)).split(_BLOCK)
-        ]
-        return torch.cat(parts)
+    def log_unnormalised(v: Tensor) -> Tensor:
+        return torch.cat([_log_sum(objects, some, settings.draws) for some in v.split(_BLOCK)])
 
+    return _density(log_unnormalised, below, above)
+
+
+def _density(
+    log_unnormalised: Callable[[Tensor], Tensor], below: LogPartition, above: LogPartition
+) -> ObjectDensity:
     notes = {
         "log Z, AIS": below.log_z,
         "standard error, AIS": below.standard_error,
@@ -128,10 +155,8 @@ def log_partition(
 ) -> tuple[LogPartition, LogPartition]:
     """(forward, reverse) AIS of a machine without relation units."""
     generator = torch.Generator().manual_seed(seed)
-    # Denser where the machine is nearly itself: most of the change lies there.
-    betas = (1 - np.linspace(1.0, 0.0, settings.temperatures) ** 2).tolist()
-    frequency = log_odds_of(train.v.sum(0), torch.tensor(float(len(train))))
-    base = independent_base(machine, frequency)
+    betas = settings.betas()
+    base = independent_base(machine, _log_odds(train))
     below = ais(machine, betas, settings.chains, generator, base)
     start = torch.randint(len(train), (settings.chains,), generator=generator)
     state = initial_state(machine, train.v[start], generator)
@@ -140,16 +165,17 @@ def log_partition(
 
 
 @torch.no_grad()
-def _log_sum(machine: BoltzmannMachine, v: Tensor, annotated: Tensor, draws: int) -> Tensor:
-    """log of the sum over h1, h2 and the classes that are not annotated, (B,)."""
-    v = v * annotated
-    field = mean_field(machine, Evidence(v))
-    if not machine.spec.H2 and bool(annotated.all()):
+def _log_sum(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tensor:
+    """log of the sum over h1 and h2, (B,)."""
+    if not machine.spec.H2:
         return -machine.free_energy(v)
-    y = field.y
+    y = mean_field(machine, Evidence(v)).y
     h1 = (fixed_uniforms(draws, machine.spec.H1).to(y.dtype).unsqueeze(1) < y.sigmoid()).to(y.dtype)
     log_q = (h1 * logsigmoid(y) + (1 - h1) * logsigmoid(-y)).sum(-1)
-    free = (softplus(machine.object_logits(h1)) * ~annotated).sum(-1)
     second = softplus(machine.second_layer_logits(h1)).sum(-1)
-    target = v @ machine.b + (h1 * (machine.c1 + v @ machine.W)).sum(-1) + second + free
+    target = v @ machine.b + (h1 * (machine.c1 + v @ machine.W)).sum(-1) + second
     return (target - log_q).logsumexp(0) - float(np.log(draws))
+
+
+def _log_odds(train: SceneTensors) -> Tensor:
+    return log_odds_of(train.v.sum(0), torch.tensor(float(len(train))))

@@ -318,10 +318,9 @@ def density_task(contender: Contender, setting: Setting) -> Outcome | None:
         return None
     scenes = setting.some()
     density = contender.density()
-    annotated = scenes.annotated_classes[scenes.source]
-    log_sum = density.log_unnormalised(scenes.v, annotated).double().numpy()
+    log_sum = density.log_unnormalised(scenes.v).double().numpy()
     independent = independent_density(setting.train)
-    base = independent.log_unnormalised(scenes.v, annotated).double().numpy()
+    base = independent.log_unnormalised(scenes.v).double().numpy()
     one = np.ones(len(scenes))
     metrics: dict[str, Metric] = {
         "log-likelihood, upper log Z": Ratio(log_sum - density.upper, one),

@@ -10,7 +10,6 @@ import torch
 
 from tests.enumeration.small_machines import binary, enumerate_joint, same, small_machine
 from tests.training.evaluation.scenes import scene, tensors
-from training.batches import scene_tensors
 from training.evaluation.density import (
     DensitySettings,
     independent_density,
@@ -18,6 +17,7 @@ from training.evaluation.density import (
     machine_density,
     object_part,
 )
+from training.evaluation.ising import Ising, State
 
 LOCAL = ["rbm-local", "gbm-local", "triway-local", "triway-local-two-layers"]
 TRAIN = tensors([scene([0]), scene([0, 1]), scene([1]), scene([0, 1])], 2)
@@ -26,16 +26,14 @@ SETTINGS = DensitySettings(chains=200, temperatures=200, burn_in=50, draws=1024)
 
 @pytest.mark.parametrize("name", LOCAL)
 def test_log_likelihoods_are_those_of_the_joint(name):
-    """Every v with both classes annotated, and with either unobserved, within .03 nats."""
+    """Every v, within .03 nats."""
     machine = small_machine(name)
     joint = enumerate_joint(machine)
     density = machine_density(machine, TRAIN, SETTINGS)
-    for annotated in ([True, True], [True, False], [False, True]):
-        known = torch.tensor(annotated)
-        for v in binary(2):
-            exact = joint.log_sum(same(joint.v[:, known], v[known]))
-            ours = density.log_unnormalised(v.float().unsqueeze(0), known.unsqueeze(0))
-            assert float(ours) == pytest.approx(exact, abs=0.03)
+    for v in binary(2):
+        exact = joint.log_sum(same(joint.v, v))
+        ours = density.log_unnormalised(v.float().unsqueeze(0))
+        assert float(ours) == pytest.approx(exact, abs=0.03)
 
 
 @pytest.mark.parametrize("name", LOCAL)
@@ -55,19 +53,56 @@ def test_the_seed_form_has_no_density_of_objects_here():
 
 
 def test_independent_classes_by_hand():
-    """Frequencies (3.5/5, 3.5/5) after smoothing; a class that is not annotated says nothing."""
+    """Frequencies (3.5/5, 3.5/5) after smoothing."""
     density = independent_density(TRAIN)
-    v = torch.tensor([[1.0, 0], [1, 0]])
-    annotated = torch.tensor([[True, True], [True, False]])
     p = 3.5 / 5
-    assert density.log_unnormalised(v, annotated).tolist() == pytest.approx(
-        [math.log(p) + math.log(1 - p), math.log(p)]
-    )
+    value = density.log_unnormalised(torch.tensor([[1.0, 0]]))
+    assert float(value) == pytest.approx(math.log(p) + math.log(1 - p))
 
 
-def test_frequencies_are_taken_where_a_class_is_annotated():
-    scenes = [scene([0], source="a"), scene([0], source="b")]
-    tables = {"a": np.array([True, True]), "b": np.array([True, False])}
-    density = independent_density(scene_tensors(scenes, tables, 2))
-    value = density.log_unnormalised(torch.tensor([[0.0, 1]]), torch.tensor([[False, True]]))
-    assert float(value) == pytest.approx(math.log(0.5 / 2))
+def small_ising(V: int = 6) -> Ising:
+    rng = np.random.default_rng(0)
+    half = np.triu(rng.normal(0, 1, (V, V)), 1)
+    return Ising(rng.normal(-0.5, 1, V), half + half.T)
+
+
+def test_the_pairwise_model_by_enumeration():
+    """Its conditionals are logistic in the others; log Z lies within 5 standard errors."""
+    model = small_ising()
+    V = len(model.b)
+    every = binary(V).float()
+    values = model.log_unnormalised(every)
+    on = every.clone()
+    on[:, 2] = 1.0
+    off = on.clone()
+    off[:, 2] = 0.0
+    ratio = model.log_unnormalised(on) - model.log_unnormalised(off)
+    logits = model.b[2] + every.double().numpy() @ model.W[:, 2]
+    assert ratio.numpy() == pytest.approx(logits)
+    exact = float(values.logsumexp(0))
+    start = torch.zeros(400, V)
+    below, above = model.log_partition(np.zeros(V), start, np.linspace(0, 1, 200).tolist(), 50, 0)
+    assert below.log_z == pytest.approx(exact, abs=5 * below.standard_error)
+    assert above.log_z == pytest.approx(exact, abs=5 * above.standard_error)
+    assert below.bound - 0.02 <= exact <= above.bound + 0.02
+
+
+def test_sweeps_of_the_pairwise_model_sample_it():
+    """Marginals of 2,000 chains, each within 5 standard errors (.056)."""
+    model = small_ising()
+    every = binary(len(model.b)).float()
+    p = model.log_unnormalised(every).softmax(0)
+    exact = (p.unsqueeze(1) * every).sum(0).numpy()
+    rng = np.random.default_rng(1)
+    state = State(model, np.zeros((len(model.b), 2000)))
+    for _ in range(50):
+        state.sweep(np.zeros(len(model.b)), 1.0, rng)
+    assert state.v.mean(1) == pytest.approx(exact, abs=0.056)
+    assert state.field == pytest.approx(model.W @ state.v)
+
+
+def test_edges_must_be_symmetric():
+    with pytest.raises(ValueError, match="symmetric"):
+        Ising(np.zeros(2), np.array([[0.0, 1], [2, 0]]))
+    with pytest.raises(ValueError, match=r"\(2, 2\)"):
+        Ising(np.zeros(2), np.zeros((3, 3)))
