@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 from typing import Annotated, NoReturn
 
+import httpx
 import torch
 import typer
 from rich.console import Console
@@ -17,15 +18,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 from torch import Tensor
 
-from app.registry import RegistryError, Store, load_model_set
+from app.registry import Artifact, RegistryError, Store, load_model_set
 from training.ablation.command import ablate
-from training.baselines.bernoulli_rbm import fit_bernoulli_rbm
 from training.batches import SceneTensors
 from training.benchmark.command import benchmark
 from training.checkpoints import CheckpointError
 from training.config import Config, ConfigError, load_config, shipped_configs
 from training.datasets import DatasetError
-from training.evaluation.report import Row, by_source, evaluate, missing_rows
+from training.evaluation.cases import some_scenes
+from training.evaluation.report import Row, by_source, evaluate
+from training.evaluation.service import ServiceError, directly, over_http
+from training.evaluation.service import metrics as service_metrics
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run
 from training.runs import RunError, load_run, save_run
@@ -91,10 +94,17 @@ def evaluate_command(
     store: StorePath = _STORE,
     source: Annotated[list[str] | None, typer.Option(help="only these sources")] = None,
     part: Annotated[str, typer.Option(help="train, validation or test")] = "test",
-    baseline: Annotated[bool, typer.Option(help="train scikit-learn's BernoulliRBM too")] = False,
+    url: Annotated[
+        str | None, typer.Option(help="ask a running service too, and compare what it answers")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="scenes a source, with --url")] = 30,
     output: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
 ) -> None:
-    """Evaluate stored models on the split they were trained with; T1a, T2 and T3."""
+    """Evaluate stored models on the split they were trained with; T1a, T2 and T3.
+
+    With --url the tasks are put to a service as well, scene by scene, as distinct classes; it must
+    serve the same model. The baselines' figures are those of `benchmark`.
+    """
     try:
         tables: dict[str, list[Row]] = {}
         for reference in models:
@@ -116,13 +126,13 @@ def evaluate_command(
             ]
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
+                if url is not None:
+                    tables |= _asked(url, reference, artifact, test, tensors.structure, limit)
+                    continue
                 tables[reference] = evaluate(
                     artifact.machine, test, tensors.structure, progress=status.update
                 )
-                if baseline and "BernoulliRBM" not in str(tables):
-                    status.update("training the baseline")
-                    tables["BernoulliRBM"] = _baseline(tensors.train, test, tensors.structure)
-    except (ConfigError, DatasetError, RegistryError) as error:
+    except (ConfigError, DatasetError, RegistryError, ServiceError) as error:
         _fail(error)
     _show(tables)
     if output is not None:
@@ -208,13 +218,26 @@ def _publish(
     console.print(f"published {manifest.name}@{manifest.version}, digest {artifact.digest[:12]}")
 
 
-def _baseline(train: SceneTensors, test: SceneTensors, structure: Tensor) -> list[Row]:
-    rows: list[Row] = []
-    for source, some in by_source(test):
-        index = [k for k, scene in enumerate(train.scenes) if scene.source == source]
-        machine = fit_bernoulli_rbm(train.v[index])
-        rows += missing_rows(machine, some, structure, source)
-    return rows
+def _asked(
+    url: str,
+    reference: str,
+    artifact: Artifact,
+    scenes: SceneTensors,
+    structure: Tensor,
+    limit: int | None,
+) -> dict[str, list[Row]]:
+    """The figures of a model as it is, and as a service answers for it."""
+    tables: dict[str, list[Row]] = {reference: [], f"{reference} at {url}": []}
+    with httpx.Client(base_url=url, timeout=60) as client:
+        ways = (directly(artifact), over_http(client, reference, artifact))
+        for source, every in by_source(scenes):
+            some = some_scenes(every, limit, 0)
+            for rows, asked in zip(tables.values(), ways, strict=True):
+                found = service_metrics(asked, artifact, some, structure)
+                for name, metric in found.items():
+                    task, _, figure = name.partition(" ")
+                    rows.append(Row(task, source, figure, metric.figure()))
+    return tables
 
 
 def _show(tables: dict[str, list[Row]]) -> None:

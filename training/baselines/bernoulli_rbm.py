@@ -23,22 +23,6 @@ _EPOCHS = 60
 _BATCH = 32
 
 
-def fit_bernoulli_rbm(
-    v: Tensor, *, hidden: int = 200, learning_rate: float = 0.05, epochs: int = 60, seed: int = 0
-) -> BoltzmannMachine:
-    """Train by scikit-learn's own `fit`: persistent CD-1 at a constant rate.
-
-    Args:
-        v: (N, V) binary presence.
-        hidden: H1.
-        learning_rate, epochs: as scikit-learn's `learning_rate` and `n_iter`; batches of 10.
-    """
-    rbm = BernoulliRBM(
-        n_components=hidden, learning_rate=learning_rate, n_iter=epochs, random_state=seed
-    )
-    return _as_machine(rbm.fit(v.numpy()))
-
-
 def fit_annealed(
     v: Tensor, *, hidden: int, learning_rate: float, epochs: int, seed: int
 ) -> BoltzmannMachine:

@@ -29,8 +29,14 @@ ObjectScore = Callable[[Tensor], Tensor]
 # The same given room types (B,) as well, -1 where none is known.
 RoomScore = Callable[[Tensor, Tensor], Tensor]
 
+_PROBED = 8
+
 TOP = (1, 2, 3, 5, 10, 20, 50)
 """Lengths of the lists in which a removed object is looked for."""
+
+
+class LeakError(RuntimeError):
+    """A score knows more than it was shown."""
 
 
 @dataclass(frozen=True)
@@ -146,11 +152,32 @@ def _removed(
         r, t = row[start : start + block], target[start : start + block]
         v = scenes.v[r].scatter(1, t.unsqueeze(1), 0.0)
         values = score(v, scenes.room[r])
+        if start == 0:
+            _check_blind(score, v, scenes.room[r], values)
         yield r, t, values.masked_fill((v > 0) | structure, -torch.inf)
 
 
+def _check_blind(score: RoomScore, v: Tensor, room: Tensor, values: Tensor) -> None:
+    """Raise where a score follows from anything but what it is shown.
+
+    Whoever knows the scene behind a row (by its turn, or by relations that dangle where an object
+    was) answers otherwise when the same rows are shown in another order.
+
+    Raises:
+        LeakError: it does.
+    """
+    v, room = v[:_PROBED].flip(0), room[:_PROBED].flip(0)
+    again = score(v, room).flip(0)
+    if not torch.allclose(again, values[:_PROBED], rtol=1e-3, atol=1e-3, equal_nan=True):
+        raise LeakError("the same scenes in another order get other scores: something leaks")
+
+
 def leave_one_out(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> LeaveOneOut:
-    """Rank every removed object; see `removed_objects`."""
+    """Rank every removed object; see `removed_objects`.
+
+    Raises:
+        LeakError: the score depends on more than the objects that are left.
+    """
     return leave_one_out_in_rooms(scenes, structure, lambda v, _: score(v))
 
 
