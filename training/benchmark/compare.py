@@ -209,7 +209,7 @@ def write_results(
         text += f"\n{_protocol_text(protocol)}"
     if shuffled is not None:
         values["shuffled"] = {task: found.to_dict() for task, found in shuffled.items()}
-        text += f"\n{_shuffled_text(shuffled)}"
+        text += f"\n{shuffled_text(shuffled)}"
     (folder / "results.json").write_text(json.dumps(values, indent=1), encoding="utf-8")
     (folder / "results.md").write_text(text, encoding="utf-8")
     return text
@@ -236,7 +236,8 @@ The paper's own figures, on its own data:
 """
 
 
-def _shuffled_text(shuffled: Mapping[str, Results]) -> str:
+def shuffled_text(shuffled: Mapping[str, Results]) -> str:
+    """The section on the control, by task."""
     parts = [
         """## Shuffled labels
 
