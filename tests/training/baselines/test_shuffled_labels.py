@@ -3,7 +3,7 @@
 Whoever does was told something that these scenes do not say: of those it is asked about, perhaps.
 Every baseline and every variant of the machines is asked about the same real scenes after learning
 from real and from shuffled ones. 300 scenes leave chance patterns of their own: over three
-permutations no row was more than .08 above popularity, and none less than .3 above it where it had
+permutations no row was more than .07 above popularity, and none less than .3 above it where it had
 learnt from real scenes. `TOLERANCE` lies between.
 """
 
