@@ -21,6 +21,7 @@ from training.datasets import (
     indoor_vocabulary,
     read_scenes,
     rooms_vocabulary,
+    shuffle_objects,
     source_vocabulary,
     split,
     with_typical_sizes,
@@ -61,6 +62,18 @@ class SplitScenes:
             relations=len(CANONICAL),
             room_types=len(self.vocabulary.room_types),
         )
+
+    def shuffled(self, seed: int) -> SplitScenes:
+        """The same with the objects of training and validation scenes permuted between scenes.
+
+        Test scenes stay as they are.
+        """
+        structure = self.vocabulary.structure
+        permuted = {
+            part: shuffle_objects(self.parts[part], structure, seed)
+            for part in ("train", "validation")
+        }
+        return replace(self, parts=self.parts | permuted)
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:

@@ -6,7 +6,7 @@ measure.py   a row's reports, with files that it resumes from
 workers.py   rows measured by several processes
 summary.py   means over training seeds, paired differences, JSON and Markdown
 plots.py     what is drawn beside the tables
-compare.py   a domain from its scenes to its tables, and the seed paper's protocol
+compare.py   a domain from its scenes to its tables, the seed paper's protocol, shuffled labels
 command.py   the command line
 """
 

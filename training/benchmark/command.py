@@ -14,9 +14,11 @@ from rich.progress import Progress as Bar
 
 from training.benchmark.compare import (
     SEED_PROTOCOL,
+    SHUFFLED,
     Options,
     compare_by_seed_protocol,
     compare_domain,
+    compare_on_shuffled,
     write_results,
 )
 from training.benchmark.domains import default_configs, read_domains
@@ -61,6 +63,9 @@ def benchmark(
     seed_protocol: Annotated[
         bool, typer.Option("--seed-protocol", help="the seed paper's protocol as well")
     ] = False,
+    shuffled: Annotated[
+        bool, typer.Option("--shuffled", help="the same rows trained on shuffled scenes as well")
+    ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="a small run, to see it work")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="forget earlier reports")] = False,
 ) -> None:
@@ -79,16 +84,23 @@ def benchmark(
             quick=quick,
             fresh=fresh,
         )
+        if shuffled:
+            options.shuffled_tasks()  # a request that cannot be met fails before hours of training
         for domain in read_domains(machines or default_configs()):
             place = folder / domain.name
             with _Shown() as shown:
                 results = compare_domain(domain, data, place, options, shown.begin)
-                protocol = None
+                protocol = control = None
                 if seed_protocol:
                     protocol = compare_by_seed_protocol(
                         domain, data, place / SEED_PROTOCOL, options, shown.begin
                     )
-            console.print(write_results(place, domain.name, results, protocol), markup=False)
+                if shuffled:
+                    control = compare_on_shuffled(
+                        domain, data, place / SHUFFLED, options, shown.begin
+                    )
+            text = write_results(place, domain.name, results, protocol, control)
+            console.print(text, markup=False)
             console.print(f"every figure: {place / 'results.json'}; plots beside it")
     except (
         ConfigError, DatasetError, BenchmarkError, CheckpointError, BrokenProcessPool,

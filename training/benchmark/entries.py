@@ -104,6 +104,24 @@ def baseline_entries(seed: int, names: Sequence[str] | None = None) -> Iterator[
             yield Entry(name, seed, f"{name}, seed {seed}", make)
 
 
+def plain_baseline_entries(seed: int, task: str) -> Iterator[Entry]:
+    """Every baseline of one task, T1a or T2, fitted for that task alone.
+
+    Raises:
+        ValueError: another task.
+    """
+    if task == "T2 missing":
+        for objects in OBJECTS:
+            identity = f"{objects.name}, seed {seed}"
+            yield Entry(objects.name, seed, identity, partial(_objects_alone, objects, seed))
+    elif task == "T1a relations":
+        for relations in RELATIONS:
+            identity = f"{relations.name}, seed {seed}"
+            yield Entry(relations.name, seed, identity, partial(_relations, relations, seed))
+    else:
+        raise ValueError(f"{task!r} is neither T1a relations nor T2 missing")
+
+
 def reference_entries() -> Iterator[Entry]:
     """What drawn scenes and densities are held against; nothing is trained."""
     yield Entry("independent classes", 0, "independent classes", _independent)
@@ -120,7 +138,7 @@ def machine_entry(config: Config) -> Entry:
 
 
 def bare_machine_entry(config: Config) -> Entry:
-    """A machine as it was trained: what the seed protocol samples from."""
+    """A machine as it was trained, as the seed protocol and the shuffled scenes ask it."""
     return Entry(config.name, config.training.seed, config.digest, partial(_bare, config))
 
 
@@ -140,6 +158,14 @@ def _objects(
     return _always(
         Contender(objects=fitted.score, alarm=alarm, placed=product.score, parameters=size)
     )
+
+
+def _objects_alone(
+    baseline: Baseline[ObjectScore], seed: int, material: Material, folder: Path, say: Progress
+) -> Rival:
+    """T2 without what the other tasks need of the row."""
+    score = _fit(baseline, material.data, seed, folder, say).score
+    return _always(Contender(objects=score, parameters=parameter_count(score)))
 
 
 def _relations(

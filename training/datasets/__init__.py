@@ -5,6 +5,7 @@ from training.datasets.names import Names, curated_names
 from training.datasets.readers import READERS, Reader, read_all, read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.rooms import generate_rooms, rooms_vocabulary
+from training.datasets.shuffling import shuffle_objects
 from training.datasets.splits import FRACTIONS, split
 from training.datasets.vocabulary import (
     build_vocabulary,
@@ -34,6 +35,7 @@ __all__ = [
     "read_all",
     "read_scenes",
     "rooms_vocabulary",
+    "shuffle_objects",
     "source_vocabulary",
     "split",
     "with_typical_sizes",

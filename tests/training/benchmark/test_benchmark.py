@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from training.benchmark import (
@@ -17,11 +18,12 @@ from training.benchmark import (
     summarise,
 )
 from training.benchmark.command import chosen_tasks
+from training.benchmark.compare import shuffled_text
 from training.benchmark.domains import default_configs, read_domains
-from training.benchmark.entries import baseline_entries
+from training.benchmark.entries import baseline_entries, plain_baseline_entries
 from training.benchmark.measure import slug
 from training.benchmark.plots import read_curve, recall_points
-from training.benchmark.summary import Cell, Results, is_better
+from training.benchmark.summary import Cell, Difference, Results, is_better
 from training.cli import app
 from training.config import ConfigError, load_config
 from training.evaluation.contenders import Contender
@@ -72,7 +74,7 @@ def finished(tmp_path_factory):
     where = folder / "reports"
     arguments = (
         write(folder), write(folder, variant="rbm"), "--folder", str(where), "--quick", *BASELINES,
-        "--seed-protocol", *HERE,
+        "--seed-protocol", "--shuffled", *HERE,
     )  # fmt: skip
     code, output = run(*arguments)
     assert code == 0, output
@@ -130,6 +132,68 @@ def test_the_seed_protocol_has_a_section_of_its_own(finished, results):
         (finished[1] / "seed-protocol/rooms-rbm/seed-0/run/config.json").read_text()
     )
     assert config["data"]["split"] == "random"
+
+
+def test_the_shuffled_control_has_a_section_of_its_own(finished, results):
+    """With the rows that were wanted, and those that the others must fall to."""
+    control = results["shuffled"]
+    rows = {task: {cell["row"] for cell in part["cells"]} for task, part in control.items()}
+    machines = {"rooms-triway", "rooms-rbm"}
+    assert rows == {
+        "T1a relations": {"relation popularity"} | machines,
+        "T2 missing": {"popularity", "EASE"} | machines,
+    }
+    for task, part in control.items():
+        assert {cell["task"] for cell in part["cells"]} == {task}
+        compared = {d["row"] for d in part["differences"]}
+        assert compared == rows[task] - {part["ours"]}
+    text = (finished[1] / "results.md").read_text()
+    section = text[text.index("## Shuffled labels") :]
+    assert "Above popularity with the whole interval: " in section
+    assert "R-precision, instance counts" not in section
+
+
+def test_the_control_learns_from_other_scenes_and_is_asked_about_the_same(finished, results):
+    """Popularity finds what it always finds: no class is in more or fewer training scenes."""
+    for part in ("shuffled/", ""):
+        assert (finished[1] / f"{part}rooms-rbm/seed-0/run/config.json").is_file()
+    cells = {
+        (c["row"], c["source"]): c["figure"]
+        for c in results["cells"]
+        if (c["task"], c["metric"]) == ("T2 missing", "MRR")
+    }
+    control = {
+        (c["row"], c["source"]): c["figure"]
+        for c in results["shuffled"]["T2 missing"]["cells"]
+        if c["metric"] == "MRR"
+    }
+    assert control["popularity", "pooled"] == cells["popularity", "pooled"]
+    assert control["EASE", "pooled"] != cells["EASE", "pooled"]
+    first, second = (
+        load_run(finished[1] / part / "rooms-rbm/seed-0/run").machine for part in ("", "shuffled")
+    )
+    assert not torch.equal(first.W, second.W)
+
+
+def test_rows_above_the_yardstick_are_named():
+    figures = {"sees more": Figure(-0.2, -0.3, -0.1, 9), "falls": Figure(-0.1, -0.2, 0.1, 9)}
+    differences = tuple(
+        Difference(row, "T2 missing", source, "MRR", figure)
+        for row, figure in figures.items()
+        for source in ("x", "pooled")
+    )
+    text = shuffled_text({"T2 missing": Results("popularity", (), differences)})
+    assert "Above popularity with the whole interval: sees more by 0.200." in text
+    none = shuffled_text({"T2 missing": Results("popularity", (), ())})
+    assert "with the whole interval: no row." in none
+
+
+def test_only_two_tasks_are_asked_on_shuffled_scenes(tmp_path):
+    code, output = run(write(tmp_path), "--quick", "--shuffled", "--task", "T3", *HERE)
+    assert code == 1
+    assert "only T1a relations and T2 missing are asked" in output
+    with pytest.raises(ValueError, match="'Density' is neither T1a relations nor T2 missing"):
+        list(plain_baseline_entries(0, "Density"))
 
 
 def test_plots_lie_beside_the_results(finished):
