@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +28,7 @@ from training.benchmark.measure import (
     place_of,
 )
 from training.benchmark.summary import summarise
+from training.benchmark.workers import fill
 from training.checkpoints import CheckpointError
 from training.config import Config, ConfigError, load_config, with_settings
 from training.datasets import DatasetError
@@ -48,6 +51,7 @@ def ablate(
     limit: Annotated[int | None, typer.Option(min=10, help="scenes a source")] = None,
     asked: Annotated[int, typer.Option(min=1, help="scenes a source where a task is slow")] = 300,
     epochs: Annotated[int | None, typer.Option(min=1, help="at most, for every row")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="processes, of one thread each")] = 2,
     data: Annotated[Path, typer.Option("--data", help="folder with the scene files")] = Path(
         "../shared/data"
     ),
@@ -78,8 +82,10 @@ def ablate(
         ]
         if fresh:
             forget(place, entries)
-        reports, failures = _run(plan, entries)
-    except (ConfigError, DatasetError, BenchmarkError, CheckpointError) as error:
+        reports, failures = _run(plan, entries, workers)
+    except (
+        ConfigError, DatasetError, BenchmarkError, CheckpointError, BrokenProcessPool,
+    ) as error:  # fmt: skip
         console.print(f"[red]error:[/red] {error}")
         raise typer.Exit(1) from None
     except KeyboardInterrupt:
@@ -146,7 +152,7 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
 
 
 def _run(
-    plan: Plan, entries: Sequence[Entry]
+    plan: Plan, entries: Sequence[Entry], workers: int
 ) -> tuple[dict[tuple[str, int], dict[str, SourceReport]], dict[str, str]]:
     """Reports by row and seed, pools among them; and why rows are missing there."""
     reports: dict[tuple[str, int], dict[str, SourceReport]] = {}
@@ -166,6 +172,11 @@ def _run(
             if note in (DONE, KNOWN):
                 bar.advance(task)
 
+        if workers > 1:
+            # A row that diverges stops the workers; below it is named, and the rest is measured.
+            with suppress(FloatingPointError):
+                fill(plan, entries, show, workers)
+            bar.update(task, completed=0)
         for number, entry in enumerate(entries, 1):
             try:
                 found = measure_entries(plan, [entry], show)

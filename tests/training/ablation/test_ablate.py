@@ -55,7 +55,8 @@ def arguments(folder, *, rows=ROWS):
     config.write_text(CONFIG)
     path.write_text(rows)
     where = ("--rows", str(path), "--folder", str(folder / "ablation"))
-    return "ablate", str(config), *where, "--epochs", "2"
+    # In this process, where tests can look on.
+    return "ablate", str(config), *where, "--epochs", "2", "--workers", "1"
 
 
 def run(*arguments):
@@ -65,9 +66,9 @@ def run(*arguments):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """The folder of a finished ablation."""
+    """The folder of a finished ablation, most of it made by two workers."""
     folder = tmp_path_factory.mktemp("ablation")
-    code, output = run(*arguments(folder))
+    code, output = run(*arguments(folder), "--workers", "2")
     assert code == 0, output
     return folder
 
