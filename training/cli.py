@@ -233,7 +233,7 @@ def _asked(
         for source, every in by_source(scenes):
             some = some_scenes(every, limit, 0)
             for rows, asked in zip(tables.values(), ways, strict=True):
-                found = service_metrics(asked, artifact, some, structure)
+                found = service_metrics(asked, some, structure)
                 for name, metric in found.items():
                     task, _, figure = name.partition(" ")
                     rows.append(Row(task, source, figure, metric.figure()))

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
+from importlib.metadata import packages_distributions
+from pathlib import Path
 
+import httpx
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from app.reasoning import generate, missing, outliers, relations
 from app.registry import Store
 from app.scene import Scene, SceneObject
 from tests.http.conftest import launch
+from tests.http.stores import make_store
 from training.cli import app
+from training.evaluation.service import ServiceError, over_http
+
+ROOT = Path(__file__).parents[2]
 
 CONFIG = """
 name = "rooms-{variant}"
@@ -58,6 +69,38 @@ def same_through_a_service(folder, *store: str) -> None:
     )
     assert {task for task, _ in ours} == {"T1a", "T1b", "T2", "T2-at", "T3", "T3b"}
     assert served == pytest.approx(ours, abs=1e-6)
+
+
+def pinned(name: str) -> set[str]:
+    """The packages of a lock file."""
+    lines = (ROOT / name).read_text().splitlines()
+    return {line.split("==")[0] for line in lines if "==" in line}
+
+
+def test_training_imports_nothing_that_only_checks_need():
+    """The training image has `requirements-training.lock` alone."""
+    checks = pinned("requirements-dev.lock") - pinned("requirements-training.lock")
+    modules = [
+        module
+        for module, names in packages_distributions().items()
+        if {re.sub(r"[-_.]+", "-", name).lower() for name in names} <= checks
+    ]
+    assert "pytest" in modules
+    blocked = f"import sys; sys.modules.update(dict.fromkeys({modules!r}))"
+    code = f"{blocked}; import training.cli"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_what_is_no_service_is_told(tmp_path):
+    """A page where a service was expected, and nobody at all."""
+    store = make_store(tmp_path / "store")
+    artifact = Store(store).load("home", "1.0.0")
+    for reply in ("<html>", "[]", "{}"):
+        transport = httpx.MockTransport(lambda _, reply=reply: httpx.Response(200, text=reply))
+        with httpx.Client(transport=transport, base_url="http://nobody") as client:
+            asked = over_http(client, "default", artifact)
+            with pytest.raises(ServiceError, match="no answer of this service"):
+                asked.objects(torch.zeros(1, len(artifact.vocabulary)))
 
 
 @pytest.mark.parametrize("variant", SHAPES)

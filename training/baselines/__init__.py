@@ -4,10 +4,10 @@
 T2-at and `DENSITIES` on Density; the scores have the types of `training.evaluation`. Each is a
 `Baseline`, whose `fit` tunes it on validation and returns every trial.
 
-A class that a source never mentions counts as absent from its scenes. Our own objective leaves such
-classes out of its losses; but a score is not told the source and has to rank all classes, so there
-the same care weakens a baseline (validation MRR: EASE .398 to .381, denoising autoencoder .397 to
-.335, popularity .152 to .145). The stronger rivals were kept.
+A class that a source never mentions counts as absent from its scenes, as in our own objective: a
+score is not told the source and has to rank all classes. Leaving such classes out weakens a
+baseline (validation MRR: EASE .398 to .381, denoising autoencoder .397 to .335, popularity .152 to
+.145).
 """
 
 from __future__ import annotations

@@ -86,7 +86,8 @@ def annotated_classes(
     """Per source, (V,) the classes whose absence from a scene means something.
 
     These are the classes that the source ever mentions, or all of them in a source of open
-    vocabulary, less those in `LEFT_OUT`. The others are unobserved there, not absent.
+    vocabulary, less those in `LEFT_OUT`. Initial biases are frequencies over the sources that
+    mention a class, and generated scenes are compared in these.
     """
     annotated: dict[str, NDArray[np.bool_]] = {}
     for scene in scenes:

@@ -101,6 +101,9 @@ class Ratio(SceneMetric):
 class Macro(SceneMetric):
     """The mean over groups (classes, say) of the mean over a group's items.
 
+    Rare groups drop out of resamples, which lifts their mean where rare groups do worse: the
+    resamples are centred on the value, so that they tell its spread alone.
+
     Attributes:
         scene, group: (N,) of each item; value_of: (N,).
         count: scenes given.
@@ -132,6 +135,9 @@ class Macro(SceneMetric):
         top = np.bincount(self.group, weights=item * self.value_of)
         some = below > 0
         return float((top[some] / below[some]).mean()) if some.any() else float("nan")
+
+    def resampled(self, resamples: int, seed: int) -> Floats:
+        return _centred(super().resampled(resamples, seed), self.value)
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
@@ -182,7 +188,8 @@ class Scored(SceneMetric):
     def resampled(self, resamples: int, seed: int) -> Floats:
         # Items are sorted once for all resamples.
         function = self._function()
-        return resample(lambda weight: function(weight[self.scene]), self.count, resamples, seed)
+        drawn = resample(lambda weight: function(weight[self.scene]), self.count, resamples, seed)
+        return _centred(drawn, self.value) if self.statistic in _GROWING else drawn
 
     def _function(self) -> Callable[[Floats], float]:
         return STATISTICS[self.statistic](self.score, self.truth)
@@ -224,7 +231,7 @@ class Resampled(Metric):
         """
         point = statistic(np.ones(scenes))
         drawn = resample(statistic, scenes, resamples)
-        return cls(point, drawn + (point - np.nanmean(drawn)), scenes, items)
+        return cls(point, _centred(drawn, point), scenes, items)
 
     @property
     def scenes(self) -> int:
@@ -243,6 +250,13 @@ class Resampled(Metric):
             raise ValueError(f"only the resamples of seed 0 were kept, not those of {seed}")
         return self.drawn[:resamples]
 
+
+def _centred(drawn: Floats, value: float) -> Floats:
+    return drawn + (value - np.nanmean(drawn)) if np.isfinite(drawn).any() else drawn
+
+
+# Calibration errors grow under resampling, as if there were fewer answers.
+_GROWING = ("ECE",)
 
 _KINDS: dict[str, type[Metric]] = {
     "ratio": Ratio,

@@ -85,7 +85,7 @@ class IntruderScores:
 
 
 def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Weights (N, V): in how many training scenes of all sources each class is."""
+    """Weights (N, V): in how many of the training scenes each class is."""
     return train.v.sum(0).expand(len(scenes), -1)
 
 

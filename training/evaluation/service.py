@@ -14,12 +14,15 @@ from typing import Any
 import httpx
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from app.reasoning.calibration import exclusive, false_log_odds, relation_probability
+from app.reasoning.units import NO_UNIT
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES
 from training.batches import Batch, SceneTensors
+from training.datasets import EncodedScene
 from training.evaluation.completion import complete_scenes, given_score
 from training.evaluation.contenders import calibrated_alarm
 from training.evaluation.intervals import Metric
@@ -48,18 +51,18 @@ class Asked:
         relations: probabilities (B, A, n, n) given the observed relations of a batch.
         stated: the same for the relations that a batch states: the higher, the likelier true.
         placed: scores of what is missing at a place.
-        intruders: T3's scores of some scenes.
+        intruders: T3's scores of some scenes, and by its side which of them raise the alarm.
     """
 
     objects: Callable[[Tensor], Tensor]
     relations: RelationScore
     stated: RelationScore
     placed: PlacedScore
-    intruders: Callable[[SceneTensors, Tensor, int], IntruderScores]
+    intruders: Callable[[SceneTensors, Tensor, int], tuple[IntruderScores, NDArray[np.bool_]]]
 
 
 def metrics(
-    asked: Asked, artifact: Artifact, scenes: SceneTensors, structure: Tensor, seed: int = 0
+    asked: Asked, scenes: SceneTensors, structure: Tensor, seed: int = 0
 ) -> dict[str, Metric]:
     """T1a, T1b, T2, T2-at, T3 and T3b; those for which the scenes hold something.
 
@@ -68,9 +71,8 @@ def metrics(
     """
     found: dict[str, Metric] = {}
     size = len(scenes)
-    holds = [scene.evidence.holds for scene in scenes.scenes]
-    one_way = torch.tensor([k for k, r in enumerate(holds) if not (r & r.swapaxes(1, 2)).any()])
-    consistent = subset(scenes, one_way.long())
+    one_way = [k for k, scene in enumerate(scenes.scenes) if not _both_ways(scene, structure)]
+    consistent = subset(scenes, torch.tensor(one_way, dtype=torch.int64))
     plain = candidates(score_scenes(scenes, asked.relations), structure)
     if any(scene.truth.any() for scene in plain):
         found["T1a R-precision"] = rank(plain, size).pooled()
@@ -84,27 +86,42 @@ def metrics(
     placed = leave_one_out_at(scenes, structure, asked.placed, seed=seed)
     if len(placed.relation):
         found["T2-at MRR"] = placed.mrr()
-    outliers = asked.intruders(scenes, structure, seed)
+    outliers, loud = asked.intruders(scenes, structure, seed)
     if len(outliers.scene):
-        alarm = calibrated_alarm(artifact.calibration)
         found["T3 hit@1"] = outliers.hit_at_1()
         found["T3 AUROC"] = outliers.auroc()
-        found["T3 alarms"] = outliers.false_alarms(alarm.suspicion(outliers), alarm.threshold)
+        found["T3 alarms"] = outliers.false_alarms(loud.astype(float), 0.5)
     false = placement_scores(consistent, structure, asked.stated, seed=seed)
     if len(false.scene):
         found["T3b hit@1"] = false.hit_at_1()
     return found
 
 
+def _both_ways(scene: EncodedScene, structure: Tensor) -> bool:
+    """Some a(x, y) and a(y, x) hold between two classes that are asked about."""
+    holds, classes = scene.evidence.holds, scene.evidence.classes
+    plain = ~structure.numpy()[classes]
+    asked = plain[:, None] & plain & ~np.eye(len(classes), dtype=np.bool_)
+    return bool((holds & holds.swapaxes(1, 2) & asked).any())
+
+
 def directly(artifact: Artifact) -> Asked:
-    """The model under the harness's scores, without a service."""
+    """The model under the harness's scores, without a service.
+
+    Raises:
+        ServiceError: it is of the seed form, where the two are different estimates.
+    """
     machine, calibration = artifact.machine, artifact.calibration
+    if machine.spec.form != "local":
+        raise ServiceError("in the seed form the service draws contexts, the scores do not")
     weight = calibration.placed_relation_weight * calibration.placed_temperature
     objects, given = machine_score(machine), given_score(machine)
     place = placed_score(machine, relation_weight=weight)
 
     def log_odds(batch: Batch) -> Tensor:
-        return given(replace(batch, counts=(batch.classes >= 0).long()))
+        values = given(replace(batch, counts=(batch.classes >= 0).long()))
+        # What has no unit is never, to a service too.
+        return values.clamp(min=NO_UNIT)
 
     def relations(batch: Batch) -> Tensor:
         values = log_odds(batch)
@@ -118,8 +135,12 @@ def directly(artifact: Artifact) -> Asked:
     def placed(places: Places) -> Tensor:
         return place(replace(places, counts=places.v))
 
-    def intruders(scenes: SceneTensors, structure: Tensor, seed: int) -> IntruderScores:
-        return intruder_scores(scenes, structure, objects, seed=seed)
+    def intruders(
+        scenes: SceneTensors, structure: Tensor, seed: int
+    ) -> tuple[IntruderScores, NDArray[np.bool_]]:
+        found = intruder_scores(scenes, structure, objects, seed=seed)
+        alarm = calibrated_alarm(calibration)
+        return found, alarm.suspicion(found) >= alarm.threshold
 
     return Asked(objects, relations, stated, placed, intruders)
 
@@ -191,9 +212,11 @@ class _Service:
                 found[row, CANONICAL.index(entry["relation"]), x, y] = -entry["probability"]
         return found
 
-    def intruders(self, scenes: SceneTensors, structure: Tensor, seed: int) -> IntruderScores:
+    def intruders(
+        self, scenes: SceneTensors, structure: Tensor, seed: int
+    ) -> tuple[IntruderScores, NDArray[np.bool_]]:
         added = draw_intruders(scenes, structure, seed=seed)
-        columns: list[tuple[int, float, bool, int, bool]] = []
+        columns: list[tuple[int, float, bool, int, bool, bool]] = []
         for k in (added >= 0).nonzero().squeeze(1).tolist():
             clean = scenes.v[k]
             for intruder in (-1, int(added[k])):
@@ -205,9 +228,12 @@ class _Service:
                     index = of[entry["object"]]
                     if not structure[index]:
                         bad = index == intruder
-                        columns.append((k, entry["log_odds"], bad, len(classes), intruder < 0))
-        place, log_odds, bad, sizes, untouched = zip(*columns, strict=True) if columns else [()] * 5
-        return IntruderScores(
+                        facts = (entry["log_odds"], bad, len(classes), intruder < 0)
+                        columns.append((k, *facts, entry["is_outlier"]))
+        place, log_odds, bad, sizes, untouched, loud = (
+            zip(*columns, strict=True) if columns else [()] * 6
+        )
+        scores = IntruderScores(
             np.array(place, dtype=np.int64),
             np.array(log_odds, dtype=np.float64),
             np.array(bad, dtype=np.bool_),
@@ -216,6 +242,7 @@ class _Service:
             scenes=len(scenes),
             skipped=len(scenes) - len(set(place)),
         )
+        return scores, np.array(loud, dtype=np.bool_)
 
     def _missing(self, v: Tensor, value: str, at: Mapping[str, str] | None = None) -> Tensor:
         body: dict[str, Any] = {"objects": self._labels(v.nonzero().squeeze(1)), "top_k": len(v)}
@@ -243,10 +270,14 @@ class _Service:
             raise ServiceError(f"{path} was not answered: {error}") from error
         if answer.status_code != httpx.codes.OK:
             raise ServiceError(f"{path} answered {answer.status_code}: {answer.text[:500]}")
-        found: dict[str, Any] = answer.json()
-        if found["model"]["digest"] != self.artifact.digest:
+        try:
+            found: dict[str, Any] = answer.json()
+            digest: str = found["model"]["digest"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ServiceError(f"{path} answered what is no answer of this service") from error
+        if digest != self.artifact.digest:
             raise ServiceError(
-                f"the service's {self.model} has digest {found['model']['digest'][:12]}, not "
+                f"the service's {self.model} has digest {digest[:12]}, not "
                 f"{self.artifact.digest[:12]}"
             )
         return found

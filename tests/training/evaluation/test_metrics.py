@@ -82,3 +82,22 @@ def test_an_unknown_kind_is_an_error():
         metric_from_dict({"kind": "guess"})
     with pytest.raises(ValueError, match="unknown statistic"):
         Scored("guess", ints(0), floats(0), np.array([True]), 1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_interval_holds_its_value_though_rare_groups_drop_out(seed):
+    """Most groups are in one scene and do badly: resamples without them would be too good."""
+    rng = np.random.default_rng(seed)
+    group = np.concatenate([np.zeros(100, np.int64), np.arange(1, 60)])
+    scene = rng.integers(100, size=len(group))
+    value = np.where(group == 0, 0.9, rng.random(len(group)) * 0.1)
+    figure = Macro(scene, group, value, 100).figure()
+    assert figure.low < figure.value < figure.high
+
+
+def test_the_interval_of_a_calibration_error_holds_its_value():
+    rng = np.random.default_rng(0)
+    probability = rng.random(300)
+    truth = rng.random(300) < probability
+    figure = Scored("ECE", np.arange(300) % 50, probability, truth, 50).figure()
+    assert figure.low < figure.value < figure.high

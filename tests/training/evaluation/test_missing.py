@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from tests.training.evaluation.scenes import NO_STRUCTURE, V, scene, tensors, toy
+from tests.training.evaluation.scenes import (
+    NO_STRUCTURE,
+    WIDE,
+    WIDE_STRUCTURE,
+    scene,
+    tensors,
+    toy,
+)
 from tests.training.test_objectives import toy_machine
 from training.evaluation.missing import (
     LeakError,
@@ -77,24 +84,40 @@ def test_the_removed_object_cannot_leak():
     assert shown.tolist() == [[0, 1, 1, 0, 0], [1, 0, 1, 0, 0], [1, 1, 0, 0, 0]]
 
 
-def test_a_planted_cheater_is_caught():
-    """It knows whose turn it is, and reads the relations that dangle where the object was."""
-    data = tensors([scene([0, 1, 2], [(0, 0, 1)]), scene([1, 3, 4], [(2, 1, 4)])])
+def turns(data, hint):
+    """What a cheater answers who knows whose turn it is: a hint for each removed object in turn."""
     hints = []
     for entry in data.scenes:
         for x, target in enumerate(entry.evidence.classes.tolist()):
-            hint = torch.zeros(V)
-            hint[target] = float(
-                entry.evidence.holds[:, x].any() or entry.evidence.holds[..., x].any()
-            )
-            hints.append(hint)
-    turns = iter(hints * 2)
+            row = torch.zeros(data.v.shape[1])
+            for told in hint(entry.evidence, x, target):
+                row[told] = 1.0
+            hints.append(row)
+    return iter(hints * 3)
+
+
+CHEATERS = {
+    "its relations dangle": lambda evidence, x, target: (
+        [target] if evidence.holds[:, x].any() or evidence.holds[:, :, x].any() else []
+    ),
+    "the whole scene": lambda evidence, x, target: evidence.classes.tolist(),
+    "the removed object": lambda evidence, x, target: [target],
+}
+
+
+@pytest.mark.parametrize("cheater", CHEATERS)
+@pytest.mark.parametrize("first", [3, 9])
+def test_a_planted_cheater_is_caught(cheater, first):
+    """However many objects the first scene has: rows of all scenes are asked for again."""
+    large = scene(range(first), [(0, 0, 1), (1, 1, 2)])
+    data = tensors([large, scene([1, 3, 4], [(2, 1, 4)]), scene([0, 10])], WIDE)
+    answers = turns(data, CHEATERS[cheater])
 
     def cheat(v):
-        return torch.stack([next(turns) for _ in v])
+        return torch.stack([next(answers) for _ in v])
 
     with pytest.raises(LeakError, match="something leaks"):
-        leave_one_out(data, NO_STRUCTURE, cheat)
+        leave_one_out(data, WIDE_STRUCTURE, cheat)
 
 
 def test_unknown_labels_score_zero():
