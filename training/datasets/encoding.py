@@ -17,6 +17,7 @@ from app.scene import (
     Vocabulary,
     canonicalise,
     derive_relations,
+    label_key,
     pool_instances,
     to_viewer_frame,
 )
@@ -47,7 +48,7 @@ class EncodedScene:
         instance_classes: (N,) int64, the class of each instance.
         instance_holds: (A, N, N) bool, relations between instances.
         instance_observed: (A, N, N) bool, whether they were observed, on or off.
-        unknown: mentions outside the vocabulary, which are left out.
+        unknown: distinct labels outside the vocabulary, which are left out.
     """
 
     scene_id: str
@@ -138,7 +139,13 @@ class _Encoder:
             instance_classes=instance_classes,
             instance_holds=holds,
             instance_observed=observed,
-            unknown=classes.count(None),
+            unknown=len(
+                {
+                    label_key(thing.label)
+                    for thing, index in zip(scene.objects, classes, strict=True)
+                    if index is None
+                }
+            ),
         )
 
     def _index(self, label: str) -> int | None:

@@ -86,13 +86,14 @@ class LeaveOneOut:
         return Macro(self.scene, self.target, values, self.scenes)
 
     def with_unknown(self, unknown: NDArray[np.int64]) -> Ratio:
-        """MRR where mentions outside the vocabulary count as removed objects that score 0.
+        """MRR where labels outside the vocabulary count as removed objects that score 0.
 
         Args:
-            unknown: (scenes,) such mentions per scene.
+            unknown: (scenes,) such labels of each scene; skipped scenes stay skipped.
         """
         known = self.ratio(self.reciprocal_rank())
-        return Ratio(known.numerators, known.denominators + unknown)
+        scored = known.denominators > 0
+        return Ratio(known.numerators, known.denominators + unknown * scored)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,7 +48,9 @@ def triples(found: Any) -> set[tuple[int, int, int]]:
 
 
 def test_classes_counts_and_unknown_labels() -> None:
-    found = encoded(things("Screens", "desk", "goblet", "monitor", "wall"), room_type="Toilet")
+    found = encoded(
+        things("Screens", "desk", "goblet", "Goblets", "monitor", "wall"), room_type="Toilet"
+    )
     assert found.instance_classes.tolist() == [MONITOR, DESK, MONITOR, WALL]
     assert found.evidence.classes.tolist() == [DESK, MONITOR, WALL]
     assert found.evidence.counts.tolist() == [1, 2, 1]
