@@ -1,9 +1,10 @@
 """Calibration: what the service answers with a probability, and whether it was so.
 
-Each answer means what `api.md` says of it: an annotator would list the relation for this pair; the
-class was taken away, given that exactly one was (and where it stood); the object is an intruder,
-where half of the scenes are clean; the relation is false, where one was altered in half of the
-scenes. Requests name no room type and take every default, so only answers returned count.
+Each answer means what the contract says of it: an annotator would list the relation for this pair
+(of objects that are there, whatever is known of others, or of one that is not with one that is);
+the class was taken away, given that exactly one was (and where it stood); the object is an
+intruder, where half of the scenes are clean; the relation is false, where one was altered in half
+of the scenes. Requests name no room type and take every default, so only answers returned count.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from app.reasoning import misplaced, missing, outliers, relations
 from app.registry import Artifact, Calibration, CountSlope, Slope
-from app.scene import CANONICAL, Scene, SceneObject
+from app.scene import CANONICAL, Scene, SceneObject, canonicalise
 from training.batches import SceneTensors
 from training.calibrate import altered_case, placed_case, scene_of
 from training.datasets import EncodedScene
@@ -103,6 +104,51 @@ def ask_relations(
     return found
 
 
+def ask_given(
+    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
+) -> Answered | None:
+    """Relations between some pairs of a scene, given those between the others.
+
+    Which pairs are told about is decided without looking at what holds between them: had half of
+    the relations been given, a pair of which nothing is said would be likelier to have none.
+    """
+    size = len(encoded.instance_classes)
+    half = np.triu(rng.random((size, size)) < 0.5, 1)
+    told = half | half.T
+    plain = ~artifact.vocabulary.structure[encoded.instance_classes]
+    triples = np.argwhere(encoded.instance_holds & told & plain[:, None] & plain).tolist()
+    if not triples:
+        return None
+    given = [(int(a), int(x), int(y)) for a, x, y in triples]
+    scene = replace(scene_of(encoded, range(size), given), room_type=None)
+    found: Answered = []
+    for answer in relations(artifact, scene):
+        triple = CANONICAL.index(answer.relation), answer.subject, answer.object
+        if not told[triple[1:]]:
+            found.append((answer.probability, bool(encoded.instance_holds[triple])))
+    return found or None
+
+
+def ask_placements(
+    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
+) -> Answered | None:
+    """Where an object that was taken away stood, one instance of it."""
+    classes = encoded.evidence.classes
+    removable = classes[~artifact.vocabulary.structure[classes]]
+    if len(removable) < 2 or not encoded.instance_observed.any():
+        return None
+    target = int(rng.choice(removable))
+    gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
+    kept = [k for k, c in enumerate(encoded.instance_classes) if c != target]
+    found: Answered = []
+    for answer in missing(artifact, _bare(encoded, kept), candidates=[target]):
+        for place in answer.placements:
+            a, subject, _ = canonicalise(gone, place.relation, kept[place.object])
+            pair = (gone, kept[place.object]) if subject == gone else (kept[place.object], gone)
+            found.append((place.probability, bool(encoded.instance_holds[(a, *pair)])))
+    return found or None
+
+
 def ask_missing(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
@@ -168,6 +214,8 @@ def ask_misplaced(
 
 QUESTIONS: dict[str, Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]] = {
     "relations": ask_relations,
+    "relations, others given": ask_given,
+    "placements": ask_placements,
     "missing": ask_missing,
     "missing at a place": ask_placed,
     "outliers": ask_outliers,
