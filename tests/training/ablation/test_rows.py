@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from training.ablation import load_rows, shipped_ablations
@@ -37,7 +39,7 @@ def test_the_way_to_the_full_model_is_one_step_at_a_time():
     full = {row.name: row for row in load_rows(shipped_ablations()["indoor-triway"], FULL)}
     way = ["seed-form-cd1", "seed-form", "local-form", "local-form-implications", "no-polish"]
     configs = [*(full[name] for name in way), FULL]
-    assert [changed(a, b) for a, b in zip(configs, configs[1:], strict=False)] == [
+    assert [changed(a, b) for a, b in pairwise(configs)] == [
         {"objective.name", "objective.k"},
         {"machine.form"},
         {"machine.G"},
