@@ -106,7 +106,8 @@ def alarm_threshold(
     group = np.array([scene.group for scene in scenes.scenes])
     source = scenes.source.numpy()
     kinds, sizes = np.unique(source[judged], return_counts=True)
-    # A quantile of a few scenes says nothing: such a source is judged with all.
+    # A quantile of a few scenes says nothing: a small source is left to what large ones ask for,
+    # and where none is large, all are judged together.
     large = [judged & (source == kind) for kind in kinds[sizes >= _SOURCE_SCENES]]
     bounds = [_bound(worst[some], group[some], rng) for some in large or [judged]]
     # What reaches the threshold raises the alarm, and many scenes may have one and the same worst
