@@ -31,16 +31,12 @@ from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject
 from training.batches import SceneTensors
 from training.datasets import EncodedScene
+from training.evaluation.alarms import alarm_threshold, judged_scenes
 from training.evaluation.missing import ObjectScore, machine_score, removed_objects
 from training.evaluation.outliers import IntruderScores, intruder_scores
 from training.evaluation.relations import machine_score as relation_score
 from training.trainer import subset
 
-# An alarm in at most 5 % of untouched scenes is promised; the margin is for places unlike any here.
-_ALARM_SHARE = 0.035
-_RESAMPLES = 200
-# Scenes of a source whose share of alarms is kept by itself.
-_ALARM_SCENES = 200
 _SCENES = 1500
 # Cases a scene: with one of some 300 scenes, the weight moved by a third from draw to draw.
 _PLACED_CASES = 2
@@ -56,7 +52,7 @@ def calibrate(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> Calibr
     """
     generator = torch.Generator().manual_seed(seed)
     pick = torch.randperm(len(scenes), generator=generator)
-    sample = subset(scenes, pick[:_SCENES])
+    sample = judged_scenes(scenes, seed)
     annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
     related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64))
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
@@ -104,9 +100,6 @@ def fit_outlier(
 ) -> tuple[CountSlope, float]:
     """Logistic regression of "is the intruder", half of the scenes clean, and the alarm threshold.
 
-    The share of false alarms is kept in each source by itself: a robot's scenes are of one kind,
-    and one quantile over all kinds would alarm often in the most varied one and never in others.
-
     Args:
         scenes: those that were scored.
     """
@@ -117,32 +110,7 @@ def fit_outlier(
     slope, size, intercept = _logistic(features[used], scores.intruder[used])
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
     logits = intercept + features @ np.array([slope, size])
-    worst = np.full(len(scenes), -np.inf)
-    np.maximum.at(worst, scores.scene[scores.clean], logits[scores.clean])
-    judged = np.isfinite(worst)
-    group = np.array([scene.group for scene in scenes.scenes])
-    kinds, sizes = np.unique(scenes.source.numpy()[judged], return_counts=True)
-    # A quantile of a few scenes says nothing: such a source is judged with all.
-    large = [judged & (scenes.source.numpy() == kind) for kind in kinds[sizes >= _ALARM_SCENES]]
-    bounds = [_alarm_bound(worst[some], group[some], rng) for some in large or [judged]]
-    return entry, float(_sigmoid(max(bounds)))
-
-
-def _alarm_bound(
-    worst: NDArray[np.float64], group: NDArray[np.str_], rng: np.random.Generator
-) -> float:
-    """The threshold that an `_ALARM_SHARE` of scenes exceeds, on the safe side.
-
-    Scenes of one place raise alarms together, so the share in new places is uncertain: the 95 %
-    quantile of the threshold over resampled groups.
-    """
-    members = [worst[group == name] for name in np.unique(group)]
-    found = []
-    for _ in range(_RESAMPLES):
-        drawn = rng.integers(len(members), size=len(members))
-        scenes = np.concatenate([members[k] for k in drawn])
-        found.append(np.quantile(scenes, 1 - _ALARM_SHARE))
-    return float(np.quantile(found, 0.95))
+    return entry, _sigmoid(alarm_threshold(logits, scores, scenes, rng))
 
 
 def fit_relations(artifact: Artifact, scenes: SceneTensors) -> tuple[CountSlope, ...]:

@@ -100,7 +100,7 @@ def evaluate_command(
     limit: Annotated[int | None, typer.Option(min=1, help="scenes a source, with --url")] = 30,
     output: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
 ) -> None:
-    """Evaluate stored models on the split they were trained with; T1a, T2 and T3.
+    """Evaluate stored models on the split they were trained with: what a model card shows.
 
     With --url the tasks are put to a service as well, scene by scene, as distinct classes; it must
     serve the same model. The baselines' figures are those of `benchmark`.
@@ -130,7 +130,7 @@ def evaluate_command(
                     tables |= _asked(url, reference, artifact, test, tensors.structure, limit)
                     continue
                 tables[reference] = evaluate(
-                    artifact.machine, test, tensors.structure, progress=status.update
+                    artifact, test, tensors.structure, tensors.train, progress=status.update
                 )
     except (ConfigError, DatasetError, RegistryError, ServiceError) as error:
         _fail(error)

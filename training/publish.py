@@ -48,7 +48,8 @@ def publish_run(
     relations = machine.spec.A
     draft = draft_artifact(machine, scenes.vocabulary)
     calibration = calibrate(draft, data.validation, run.config.training.seed)
-    rows = evaluate(machine, data.test, data.structure, progress=progress)
+    calibrated = draft_artifact(machine, scenes.vocabulary, calibration)
+    rows = evaluate(calibrated, data.test, data.structure, data.train, progress=progress)
     progress("publishing")
     description = Description(
         name=run.config.name,

@@ -33,7 +33,7 @@ def test_names_data_terms_metrics_and_limits() -> None:
     page = card(data=[source("rooms", research_only=False)])
     assert page.startswith("# tiny 1.0.0\n")
     assert "| rooms | 8,133 | terms of rooms | `cdcdcdcdcdcdcdcd…` |" in page
-    assert "| missing | generated | MRR | 0.5 | 0.4 – 0.6 | 34 |" in page
+    assert "| missing | MRR | 0.500 [0.400, 0.600] |" in page
     assert "Terms of the weights: Apache-2.0" in page
     assert "18 (stored as float16, float32, int32)" in page
     assert "3, of which 2 may be proposed" in page
@@ -50,6 +50,24 @@ def test_warns_of_research_data_by_name_and_of_no_other() -> None:
     warned = card(data=[free, bound])
     assert "learned from bound, whose" in warned
     assert warned.index("commercial robot") < warned.index("## Model"), "before anything else"
+
+
+def test_a_source_is_a_column_and_a_figure_stands_once() -> None:
+    """Sources that list no relations leave their cells empty."""
+    figure = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 34}
+    measured = [("T1", "R", "a"), ("T2", "MRR", "a"), ("T2", "MRR", "b"), ("T4", "MMD", "pooled")]
+    page = card(metrics=[{"task": t, "metric": m, "source": s} | figure for t, m, s in measured])
+    cell = "0.500 [0.400, 0.600]"
+    lines = page.splitlines()
+    first = lines.index("| Task | Metric | a | b | pooled |")
+    assert lines[first + 2 : first + 6] == [
+        f"| T1 | R | {cell} |  |  |",
+        f"| T2 | MRR | {cell} | {cell} |  |",
+        f"| T4 | MMD |  |  | {cell} |",
+        "",
+    ]
+    # What the probabilities are calibrated to stands beside their figures.
+    assert "- misplaced: the relation is false" in page
 
 
 def test_says_so_where_nothing_was_measured() -> None:

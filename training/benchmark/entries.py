@@ -26,15 +26,14 @@ from training.baselines.size import parameter_count
 from training.calibrate import calibrate
 from training.config import Config
 from training.draft import as_stored, draft_artifact
+from training.evaluation.alarms import fitted_alarm
 from training.evaluation.contenders import (
     Contender,
     artifact_contender,
-    fitted_alarm,
     machine_contender,
 )
 from training.evaluation.density import ObjectDensity
 from training.evaluation.missing import ObjectScore
-from training.evaluation.outliers import intruder_scores
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
 from training.evaluation.tasks import Setting, floor_contender, independent_contender
@@ -148,8 +147,8 @@ def _objects(
     """T2 and T3; T2-at by the product with the frequency table."""
     data = material.data
     fitted = _fit(baseline, data, seed, folder, say)
-    clean = intruder_scores(data.validation, data.structure, fitted.score, seed=seed)
-    alarm, size = fitted_alarm(clean), parameter_count(fitted.score)
+    alarm = fitted_alarm(fitted.score, data.validation, data.structure, seed)
+    size = parameter_count(fitted.score)
     if not _related(data):
         return _always(Contender(objects=fitted.score, alarm=alarm, parameters=size))
     (first, *_) = PLACED

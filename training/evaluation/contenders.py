@@ -6,55 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
-import numpy as np
-from numpy.typing import NDArray
-
 from app.boltzmann import BoltzmannMachine
-from app.registry import Artifact, Calibration
+from app.registry import Artifact
 from training.batches import SceneTensors
 from training.evaluation import missing, placed, relations
+from training.evaluation.alarms import Alarm, calibrated_alarm
 from training.evaluation.completion import given_score
 from training.evaluation.density import DensitySettings, ObjectDensity, machine_density
 from training.evaluation.generation import Sampler
 from training.evaluation.missing import ObjectScore, RoomScore
-from training.evaluation.outliers import IntruderScores
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
 from training.evaluation.sampling import machine_sampler
-
-
-@dataclass(frozen=True, eq=False)
-class Alarm:
-    """When a scene is called wrong.
-
-    Attributes:
-        suspicion: scores (N,) of each judged object, higher = more an intruder.
-        threshold: from which an object raises the alarm.
-    """
-
-    suspicion: Callable[[IntruderScores], NDArray[np.float64]]
-    threshold: float
-
-
-def calibrated_alarm(calibration: Calibration) -> Alarm:
-    """The service's own: its probability of an intruder, and its default threshold."""
-    entry = calibration.outlier
-
-    def suspicion(scores: IntruderScores) -> NDArray[np.float64]:
-        size = entry.log_count * np.log(scores.size)
-        logits = entry.intercept + entry.slope * scores.log_odds + size
-        return np.asarray(1 / (1 + np.exp(-logits)))
-
-    return Alarm(suspicion, calibration.outlier_threshold)
-
-
-def fitted_alarm(validation: IntruderScores, share: float = 0.05) -> Alarm:
-    """An alarm in `share` of the untouched validation scenes, by log-odds alone."""
-    worst = np.full(validation.scenes, -np.inf)
-    clean = validation.clean
-    np.maximum.at(worst, validation.scene[clean], -validation.log_odds[clean])
-    threshold = float(np.quantile(worst[np.isfinite(worst)], 1 - share, method="higher"))
-    return Alarm(lambda scores: -scores.log_odds, threshold)
 
 
 @dataclass(frozen=True, eq=False)

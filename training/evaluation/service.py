@@ -23,8 +23,8 @@ from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES
 from training.batches import Batch, SceneTensors
 from training.datasets import EncodedScene
+from training.evaluation.alarms import calibrated_alarm
 from training.evaluation.completion import complete_scenes, given_score
-from training.evaluation.contenders import calibrated_alarm
 from training.evaluation.intervals import Metric
 from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.outliers import IntruderScores, draw_intruders, intruder_scores

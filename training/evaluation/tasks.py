@@ -110,6 +110,7 @@ Task = Callable[[Contender, Setting], Outcome | None]
 
 FIRST = (1, 2, 5, 10, 20, 50, 100)
 """Numbers of predictions, per scene, among which annotated relations are looked for."""
+_RECALLS = (20, 50, 100)
 
 
 def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
@@ -132,10 +133,7 @@ def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
     metrics |= _by_relation(with_counts, len(scenes))
     for k in FIRST:
         metrics[f"R@{k}"] = rank(with_counts, len(scenes), first=k).per_scene()
-    if setting.seen is not None:
-        new = unseen(with_counts, setting.seen, scenes.v.shape[1])
-        if any(scene.truth.any() for scene in new):
-            metrics["R-precision, zero-shot"] = rank(new, len(scenes)).pooled()
+    metrics |= _zero_shot(with_counts, setting)
     return Outcome(metrics, len(scenes), ranking.skipped)
 
 
@@ -153,6 +151,9 @@ def completion_task(contender: Contender, setting: Setting) -> Outcome | None:
         "R-precision, mean over scenes": ranking.per_scene(),
     }
     metrics |= _by_relation(given, len(scenes))
+    for k in _RECALLS:
+        metrics[f"R@{k}"] = rank(given, len(scenes), first=k).per_scene()
+    metrics |= _zero_shot(given, setting)
     if contender.relations is not None:
         blind = complete_scenes(scenes, setting.structure, contender.relations, seed=setting.seed)
         metrics["R-precision, nothing given"] = rank(blind, len(scenes)).pooled()
@@ -166,6 +167,16 @@ def _by_relation(scored: list[Candidates], scenes: int) -> dict[str, Metric]:
         if any(scene.truth.any() for scene in some):
             metrics[f"R-precision, {name}"] = rank(some, scenes).pooled()
     return metrics
+
+
+def _zero_shot(scored: list[Candidates], setting: Setting) -> dict[str, Metric]:
+    """R-precision over the triples that training never had, where that is known and any hold."""
+    if setting.seen is None:
+        return {}
+    new = unseen(scored, setting.seen, setting.scenes.v.shape[1])
+    if not any(scene.truth.any() for scene in new):
+        return {}
+    return {"R-precision, zero-shot": rank(new, len(setting.scenes)).pooled()}
 
 
 def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
@@ -351,6 +362,8 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
             metrics[f"ECE, {name}, uncalibrated"] = before.ece()
             metrics[f"Brier skill, {name}"] = found.brier_skill()
             metrics[f"Brier skill, {name}, uncalibrated"] = before.brier_skill()
+    # Skill is undefined where no answer was true, or every one.
+    metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, len(scenes), skipped) if metrics else None
 
 

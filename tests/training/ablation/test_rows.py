@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from training.ablation import load_rows, shipped_ablations
@@ -19,6 +21,47 @@ def test_shipped_rows_learn_from_the_scenes_of_the_full_model(name):
     # Each is another model, not another name.
     changed = [row.model_copy(update={"name": "", "description": ""}) for row in (full, *rows)]
     assert len({row.digest for row in changed}) == len(changed)
+
+
+def settings(config):
+    """Every entry by its name, as in "machine.G"."""
+    dumped = config.model_dump(exclude={"name", "description", "data"})
+    return {f"{part}.{name}": x for part, some in dumped.items() for name, x in some.items()}
+
+
+def changed(before, after):
+    ours, theirs = settings(before), settings(after)
+    return {name for name in ours if ours[name] != theirs[name]}
+
+
+def test_the_way_to_the_full_model_is_one_step_at_a_time():
+    """Steps that bundle are those that the file's head names."""
+    full = {row.name: row for row in load_rows(shipped_ablations()["indoor-triway"], FULL)}
+    way = ["seed-form-cd1", "seed-form", "local-form", "local-form-implications", "no-polish"]
+    configs = [*(full[name] for name in way), FULL]
+    assert [changed(a, b) for a, b in pairwise(configs)] == [
+        {"objective.name", "objective.k"},
+        {"machine.form"},
+        {"machine.G"},
+        {"objective.generative_weight"},
+        {"machine.N", "polish.updates"},
+    ]
+
+
+def test_without_one_part_the_rest_is_as_shipped():
+    rows = load_rows(shipped_ablations()["indoor-triway"], FULL)
+    own = {"local-rbm", "local-gbm", "local-product-rbm"}
+    several = {
+        row.name: found
+        for row in rows
+        if row.name not in own
+        and not row.name.startswith(("paper-", "seed-form", "local-form"))
+        and len(found := changed(FULL, row)) > 1
+    }
+    assert several == {"no-polish": {"machine.N", "polish.updates"}}
+    assert changed(FULL, next(row for row in rows if row.name == "no-count-dropout")) == {
+        "objective.count_dropout"
+    }
 
 
 def rows(tmp_path, text):

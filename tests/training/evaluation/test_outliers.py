@@ -8,7 +8,6 @@ import torch
 
 from tests.training.evaluation.scenes import NO_STRUCTURE, V, scene, tensors, toy
 from tests.training.test_objectives import toy_machine
-from training.evaluation.contenders import fitted_alarm
 from training.evaluation.missing import machine_score
 from training.evaluation.outliers import (
     IntruderScores,
@@ -60,8 +59,6 @@ def test_metrics_by_hand():
     assert scores.false_alarms(suspicion, 0.0).value == pytest.approx(1 / 2)
     assert scores.false_alarms(suspicion, 0.5).value == 0.0
     assert scores.caught(suspicion, 0.5).value == pytest.approx(1 / 2)
-    alarm = fitted_alarm(scores, share=0.5)
-    assert scores.false_alarms(alarm.suspicion(scores), alarm.threshold).value <= 0.5
 
 
 def test_intruders_are_absent_and_no_structure():

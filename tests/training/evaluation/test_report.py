@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from tests.reasoning.artifacts import LARGER, artifact_of
-from tests.training.evaluation.scenes import flat, random_scenes, scene, tensors
+from tests.training.evaluation.scenes import flat, knowing, random_scenes, scene, tensors
 from tests.training.evaluation.test_completion import larger_machine
 from training.batches import seen_triples
+from training.evaluation.answers import QUESTIONS
 from training.evaluation.cases import some_scenes
 from training.evaluation.contenders import Contender, artifact_contender, machine_contender
 from training.evaluation.density import DensitySettings
@@ -40,7 +41,8 @@ DATA = tensors(random_scenes(40, V), V)
 SEEN = seen_triples(TRAIN.scenes, V)
 SETTING = Setting(DATA, NO_STRUCTURE, TRAIN, SEEN)
 EFFORT = DensitySettings(chains=8, temperatures=10, burn_in=5, draws=8)
-CONTENDER = artifact_contender(artifact_of(larger_machine("triway-local")), TRAIN, EFFORT)
+ARTIFACT = artifact_of(larger_machine("triway-local"))
+CONTENDER = artifact_contender(ARTIFACT, TRAIN, EFFORT)
 
 
 def flat_objects(v):
@@ -173,9 +175,80 @@ def test_references_stand_on_either_side():
 
 
 def test_publishing_measures_the_published_tasks_on_every_source():
-    rows = evaluate(larger_machine("triway-local"), DATA, NO_STRUCTURE)
-    assert {row.task for row in rows} == {"T1a relations", "T2 missing", "T3 outliers, uniform"}
-    assert {row.source for row in rows} == {"toy"}
+    """Of the calibrated artifact, on each source; generation on all together."""
+    scenes = [replace(s, source="ab"[k % 2]) for k, s in enumerate(DATA.scenes)]
+    rows = evaluate(ARTIFACT, tensors(scenes, V), NO_STRUCTURE, TRAIN)
+    found = {(row.task, row.source, row.metric) for row in rows}
+    assert len(found) == len(rows)
+    expected = {
+        "T1a relations": {"R-precision, distinct classes", "R-precision, instance counts"},
+        "T1b completion": {"R-precision"},
+        "T2 missing": {"MRR", "top-1", "top-10"},
+        "T2-at missing at a place": {"MRR"},
+        "T3 outliers, uniform": {"hit@1", "AUROC", "alarms in untouched scenes"},
+        "T3b placement": {"hit@1"},
+        "Calibration": {f"{f}, {q}" for f in ("ECE", "Brier skill") for q in QUESTIONS},
+    }
+    for source in "ab":
+        assert {
+            task: {metric for t, s, metric in found if (t, s) == (task, source)}
+            for task in expected
+        } == expected
+    assert {(t, m) for t, s, m in found if s == "pooled"} == {
+        ("T4 generate", "MMD², free"),
+        ("T4 generate", "pair correlation, free"),
+    }
+    assert {source for _, source, _ in found} == {"a", "b", "pooled"}
+
+
+def test_what_is_published_is_the_calibrated_artifact_s():
+    """Another threshold, other alarms; and no more scenes than the limit allows."""
+
+    def alarms(threshold, limit=None):
+        calibration = ARTIFACT.calibration.model_copy(update={"outlier_threshold": threshold})
+        rows = evaluate(
+            replace(ARTIFACT, calibration=calibration), DATA, NO_STRUCTURE, TRAIN, limit=limit
+        )
+        assert {row.source for row in rows} == {"toy"}
+        (row,) = (row for row in rows if row.metric == "alarms in untouched scenes")
+        return row.figure
+
+    assert alarms(0.0).value == 1.0
+    assert alarms(1.0).value == 0.0
+    assert (alarms(0.5).n, alarms(0.5, limit=7).n) == (40, 7)
+
+
+def test_completion_has_the_metrics_of_relations():
+    """R@k and zero-shot R-precision, of the half that is asked for."""
+    knows = Contender(completion=knowing(DATA))
+    setting = replace(SETTING, seen=SEEN[:0])
+    metrics = TASKS["T1b completion"](knows, setting).metrics
+    assert metrics["R@100"].value == 1.0
+    # Nothing was seen: every triple is new.
+    assert metrics["R-precision, zero-shot"].n == metrics["R-precision"].n
+    some = TASKS["T1b completion"](knows, SETTING).metrics
+    assert 0 < some["R-precision, zero-shot"].n < some["R-precision"].n
+    ignorant = TASKS["T1b completion"](Contender(completion=flat), setting).metrics
+    recalls = [ignorant[f"R@{k}"].value for k in (20, 50, 100)]
+    assert recalls == sorted(recalls)
+    assert 0 < recalls[0] < 1
+    unknown = TASKS["T1b completion"](knows, replace(SETTING, seen=None)).metrics
+    assert "R-precision, zero-shot" not in unknown
+
+
+def test_a_skill_that_is_undefined_is_left_out(tmp_path, monkeypatch):
+    """No answer was true: the calibration error stands, and the report can be written."""
+
+    def never(artifact, scene, rng):
+        return [(0.25, False), (0.5, False)]
+
+    monkeypatch.setitem(QUESTIONS, "missing", never)
+    report = measure(tmp_path / "toy.json", CONTENDER, SETTING, "toy", tasks=("Calibration",))
+    metrics = report.outcomes["Calibration"].metrics
+    assert metrics["ECE, missing"].value == pytest.approx(0.375)
+    assert "Brier skill, missing" not in metrics
+    assert "Brier skill, relations" in metrics
+    assert (tmp_path / "toy.json").exists()
 
 
 def test_some_scenes_are_the_same_for_everybody():
