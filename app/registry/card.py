@@ -29,7 +29,8 @@ _PROBABILITIES = """\
 Calibrated on validation scenes to this, ECE 0 and Brier skill 1 being perfect (0: no better than
 how often such answers are true):
 
-- relations: an annotator would list this relation for this pair of objects
+- relations: an annotator would list this relation for this pair of objects, whatever is known of
+  others; placements: or for a missing object and one that is there
 - missing: this class was taken away, given that exactly one was; at a place: given where it stood
   as well
 - outliers: the object is an intruder, where half of the scenes are clean; the default threshold is
