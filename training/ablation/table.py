@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from training.benchmark.summary import Results
+from training.benchmark.summary import UNLISTED, Results
 from training.config import Config
 from training.evaluation.intervals import Figure
 
@@ -80,6 +80,7 @@ def _table(results: Results, rows: Sequence[Config], source: str) -> str:
         f"### {source}",
         "",
         f"In brackets: the row minus {results.ours}, 95 % interval over the same scenes.",
+        f"{UNLISTED} in T1a and T1b.",
         "",
         "| | " + " | ".join(heading for heading, *_ in columns) + " |",
         "|---" * (len(columns) + 1) + "|",
