@@ -76,11 +76,12 @@ def _table(results: Results, rows: Sequence[Config], source: str) -> str:
         if gap.source == source
     }
     columns = [column for column in COLUMNS if (results.ours, *column[1:]) in figures]
+    precision = {"T1a", "T1b"} & {heading for heading, *_ in columns}
     lines = [
         f"### {source}",
         "",
         f"In brackets: the row minus {results.ours}, 95 % interval over the same scenes.",
-        f"{UNLISTED} in T1a and T1b.",
+        *([f"{UNLISTED} in T1a and T1b."] if precision else []),
         "",
         "| | " + " | ".join(heading for heading, *_ in columns) + " |",
         "|---" * (len(columns) + 1) + "|",

@@ -25,7 +25,7 @@ from training.baselines import (
 from training.baselines.size import parameter_count
 from training.batches import SceneTensors
 from training.calibrate import calibrate
-from training.config import Config
+from training.config import Config, ConfigError
 from training.draft import as_stored, draft_artifact
 from training.evaluation.contenders import (
     Contender,
@@ -61,7 +61,16 @@ class Material:
 
     @classmethod
     def of(cls, scenes: SplitScenes) -> Material:
-        """All of some split scenes."""
+        """All of some split scenes.
+
+        Raises:
+            ConfigError: a part of them is empty.
+        """
+        for part, some in scenes.parts.items():
+            if not some:
+                raise ConfigError(
+                    f"no scene is in the {part} part: take more scenes, or of more groups"
+                )
         return cls(scenes.training_data(), scenes.vocabulary, scenes.digest)
 
     @property

@@ -169,8 +169,8 @@ def claim(place: Path, entry: Entry, material: str) -> None:
             )
         if known.get("material") != material:
             raise BenchmarkError(
-                f"{place} learnt from other scenes than these: another file, source, limit, split "
-                "or vocabulary; give --fresh or another folder"
+                f"{place} learnt from other scenes than these, or does not say from which: another "
+                "file, source, limit, split or vocabulary; give --fresh or another folder"
             )
         return
     place.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from training.benchmark.compare import compare_on_shuffled
 from training.benchmark.entries import baseline_entries
 from training.benchmark.sections import YARDSTICKS
 from training.cli import app
-from training.config import DataConfig
+from training.config import ConfigError, DataConfig
 from training.pipeline import read_sources, split_and_encode
 
 CONFIG = """
@@ -113,6 +113,14 @@ def test_all_that_decides_what_is_learnt_is_in_the_digest(tmp_path):
     others.append(material(tmp_path))
     assert len({scenes.digest, *(other.digest for other in others)}) == len(others) + 1
     assert Material.of(scenes).digest == scenes.digest
+
+
+def test_every_part_needs_scenes(tmp_path):
+    write_scenes(tmp_path, "flats")
+    scenes = material(tmp_path)
+    for part in scenes.parts:
+        with pytest.raises(ConfigError, match=f"no scene is in the {part} part"):
+            Material.of(replace(scenes, parts=scenes.parts | {part: []}))
 
 
 def test_relations_are_needed_to_learn_from_and_to_tune_on(tmp_path):
