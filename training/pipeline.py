@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,15 +35,33 @@ class SplitScenes:
     """Encoded scenes of every part, with what they were read from.
 
     Attributes:
+        data: the section that named them.
         vocabulary: class indices of the scenes.
         parts: per part, its scenes over all sources.
         counts, digests: per source, scenes read and sha256 of what was read.
+        shuffle: seed of the permutation, None where the scenes are as they were read.
     """
 
+    data: DataConfig
     vocabulary: Vocabulary
     parts: dict[str, list[EncodedScene]]
     counts: dict[str, int]
     digests: dict[str, str]
+    shuffle: int | None = None
+
+    @property
+    def digest(self) -> str:
+        """sha256 of all that decides what is learnt from: contents, vocabulary, split, shuffling.
+
+        Names alone would not do: a corrected file has the same ones.
+        """
+        decisive = {
+            "data": self.data.model_dump(mode="json"),
+            "contents": self.digests,
+            "vocabulary": self.vocabulary.to_dict(),
+            "shuffle": self.shuffle,
+        }
+        return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
 
     def training_data(self) -> TrainingData:
         """Tensors for the trainer. What a source annotates is learnt from its training part."""
@@ -73,7 +92,7 @@ class SplitScenes:
             part: shuffle_objects(self.parts[part], structure, seed)
             for part in ("train", "validation")
         }
-        return replace(self, parts=self.parts | permuted)
+        return replace(self, parts=self.parts | permuted, shuffle=seed)
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
@@ -126,6 +145,7 @@ def split_and_encode(
     if vocabulary is None:
         vocabulary = build_vocabulary(data, list(parts["train"]))
     return SplitScenes(
+        data=data,
         vocabulary=vocabulary,
         parts={part: encode(some, vocabulary) for part, some in parts.items()},
         counts={source: len(some) for source, some in scenes.items()},

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -70,11 +69,8 @@ def ablate(
         configs = _configs(configuration, rows, row, limit, epochs)
         place = folder / configs[0].name
         with console.status("reading and encoding scenes"):
-            split = prepare(configs[0], data)
-            scenes = split.training_data()
-        plan = Plan(
-            place, Material(scenes, split.vocabulary), _settings(scenes, asked), tasks=TASKS
-        )
+            material = Material.of(prepare(configs[0], data))
+        plan = Plan(place, material, _settings(material.data, asked), tasks=TASKS)
         entries = [
             machine_entry(with_settings(config, {"training.seed": seed}))
             for config in configs
@@ -172,13 +168,14 @@ def _run(
             if note in (DONE, KNOWN):
                 bar.advance(task)
 
+        failed: dict[tuple[str, int], Exception] = {}
         if workers > 1:
-            # A row that diverges stops the workers; below it is named, and the rest is measured.
-            with suppress(FloatingPointError):
-                fill(plan, entries, show, workers)
+            failed = fill(plan, entries, show, workers, failures=(FloatingPointError,))
             bar.update(task, completed=0)
         for number, entry in enumerate(entries, 1):
             try:
+                if error := failed.get((entry.name, entry.seed)):
+                    raise error
                 found = measure_entries(plan, [entry], show)
             except FloatingPointError as error:
                 failures[entry.name] = f"seed {entry.seed}: {error}"

@@ -5,6 +5,8 @@ entries.py   the rows of the tables: what each is, and how it is trained
 measure.py   a row's reports, with files that it resumes from
 workers.py   rows measured by several processes
 summary.py   means over training seeds, paired differences, JSON and Markdown
+remarks.py   what has to be said beside the figures
+sections.py  results of a domain, from those of its sections
 plots.py     what is drawn beside the tables
 compare.py   a domain from its scenes to its tables, the seed paper's protocol, shuffled labels
 command.py   the command line

@@ -13,16 +13,15 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
 from training.benchmark.compare import (
-    SEED_PROTOCOL,
-    SHUFFLED,
     Options,
     compare_by_seed_protocol,
     compare_domain,
     compare_on_shuffled,
-    write_results,
+    require_groups,
 )
 from training.benchmark.domains import default_configs, read_domains
 from training.benchmark.measure import DONE, KNOWN, BenchmarkError, Progress
+from training.benchmark.sections import SEED_PROTOCOL, SHUFFLED, assemble
 from training.checkpoints import CheckpointError
 from training.config import ConfigError
 from training.datasets import DatasetError
@@ -71,8 +70,9 @@ def benchmark(
 ) -> None:
     """Train every baseline and machine on the same groups and evaluate all on the same scenes.
 
-    Writes results.json, results.md and plots into a folder for each domain. Ctrl-C loses at most
-    the task at hand; the same command goes on from there.
+    Writes results.json, results.md and plots into a folder for each domain; what was asked beside
+    the tables has a folder and results of its own there. Ctrl-C loses at most the task at hand; the
+    same command goes on from there.
     """
     try:
         options = Options(
@@ -86,20 +86,25 @@ def benchmark(
         )
         if shuffled:
             options.shuffled_tasks()  # a request that cannot be met fails before hours of training
-        for domain in read_domains(machines or default_configs()):
+        domains = read_domains(machines or default_configs())
+        for domain in domains:
+            if shuffled or not seed_protocol:
+                require_groups(domain)
+        for domain in domains:
             place = folder / domain.name
             with _Shown() as shown:
-                results = compare_domain(domain, data, place, options, shown.begin)
-                protocol = control = None
+                # The seed protocol is all that may be asked of a random split.
+                if not domain.leaks:
+                    compare_domain(domain, data, place, options, shown.begin)
+                    assemble(place, domain.name)
                 if seed_protocol:
-                    protocol = compare_by_seed_protocol(
+                    compare_by_seed_protocol(
                         domain, data, place / SEED_PROTOCOL, options, shown.begin
                     )
+                    assemble(place, domain.name)
                 if shuffled:
-                    control = compare_on_shuffled(
-                        domain, data, place / SHUFFLED, options, shown.begin
-                    )
-            text = write_results(place, domain.name, results, protocol, control)
+                    compare_on_shuffled(domain, data, place / SHUFFLED, options, shown.begin)
+            text = assemble(place, domain.name)
             console.print(text, markup=False)
             console.print(f"every figure: {place / 'results.json'}; plots beside it")
     except (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,27 +25,26 @@ from training.benchmark.measure import (
     parameters,
 )
 from training.benchmark.plots import write_plots
-from training.benchmark.summary import SEED_PRIMARY, Results, summarise
+from training.benchmark.sections import (
+    TABLES,
+    YARDSTICKS,
+    write_protocol,
+    write_shuffled,
+    write_tables,
+)
+from training.benchmark.summary import Results, summarise
 from training.benchmark.workers import fill
-from training.config import Config, DataConfig
+from training.config import Config, ConfigError, DataConfig
 from training.evaluation.report import SourceReport, settings_by_source
-from training.evaluation.seed_protocol import PAPER, SEED_TASKS
+from training.evaluation.seed_protocol import SEED_TASKS
 from training.evaluation.tasks import Setting
 from training.pipeline import SplitScenes, prepare
-
-SEED_PROTOCOL = "seed-protocol"
-SHUFFLED = "shuffled"
-
-YARDSTICKS = {
-    "T1a relations": ("relation popularity", "R-precision, distinct classes"),
-    "T2 missing": ("popularity", "MRR"),
-}
-"""What rows that learnt from shuffled scenes are asked: the row they must fall to, and in what."""
 
 # What a quick run does instead: it shows that everything works, its figures mean nothing.
 _QUICK_SCENES = 150
 _QUICK_EPOCHS = 2
 _QUICK_LIMIT = 30
+_RELATIONS = "T1a relations"
 _QUICK_BASELINES = ("popularity", "EASE", "frequency table", "frequency table, completing")
 
 # Called with the number of (row, source) pairs of what begins now; returns who hears of them.
@@ -114,23 +112,27 @@ class Options:
 def compare_domain(
     domain: Domain, data: Path, folder: Path, options: Options, begin: Begin
 ) -> Results:
-    """Every row of a domain on its test scenes; results and plots are written into the folder.
+    """Every row of a domain on its test scenes; the tables and plots are written into the folder.
 
     Raises:
-        ConfigError, DatasetError: the scenes cannot be read.
+        ConfigError: see `require_groups`; the scenes cannot be found.
+        DatasetError: they cannot be read.
         BenchmarkError: see `Plan.known`.
         ValueError: an unknown baseline.
     """
+    require_groups(domain)
     scenes = _scenes(domain, data, options)
     plan = _plan(folder, scenes, options, options.tasks)
+    related = plan.material.related
     entries: list[Entry] = []
     for seed in range(1 if options.quick else options.seeds):
         entries += [machine_entry(config) for config in options.configs(domain, seed)]
-        entries += baseline_entries(seed, options.chosen_baselines)
+        entries += baseline_entries(seed, options.chosen_baselines, related=related)
     entries += reference_entries()
     reports = _measured(plan, entries, options, begin(domain.name, plan_size(plan, entries)))
     ours = domain.configs[0].name
     results = summarise(reports, ours, parameters(folder, entries))
+    write_tables(folder / TABLES, results, scenes.digests)
     machines = [entry for entry in entries if entry.name in {c.name for c in domain.configs}]
     write_plots(plan, machines, reports, results)
     return results
@@ -141,13 +143,16 @@ def compare_by_seed_protocol(
 ) -> Results:
     """The machines of a domain, trained once on the random split, asked as the seed paper asks."""
     domain = domain.split_at_random()
-    plan = _plan(folder, _scenes(domain, data, options), options, tuple(SEED_TASKS))
+    scenes = _scenes(domain, data, options)
+    plan = _plan(folder, scenes, options, tuple(SEED_TASKS))
     entries = [bare_machine_entry(config) for config in options.configs(domain, 0)]
     title = f"{domain.name}, seed protocol"
     reports = _measured(plan, entries, options, begin(title, plan_size(plan, entries)))
     results = summarise(reports, domain.configs[0].name, parameters(folder, entries))
     # Nobody is called better by these figures.
-    return replace(results, differences=())
+    results = replace(results, differences=())
+    write_protocol(folder, results, scenes.digests)
+    return results
 
 
 def compare_on_shuffled(
@@ -159,10 +164,18 @@ def compare_on_shuffled(
     In each task "ours" is the yardstick; it is measured whichever baselines are wanted.
 
     Raises:
-        ValueError: see `Options.shuffled_tasks`.
+        ConfigError: see `require_groups`.
+        ValueError: see `Options.shuffled_tasks`; it is relations alone, and there are none.
     """
+    require_groups(domain)
+    scenes = _scenes(domain, data, options).shuffled(seed=0)
     tasks, names = options.shuffled_tasks(), options.chosen_baselines
-    plan = _plan(folder, _scenes(domain, data, options).shuffled(seed=0), options, tasks)
+    plan = _plan(folder, scenes, options, tasks)
+    if not plan.material.related:
+        tasks = tuple(task for task in tasks if task != _RELATIONS)
+        if not tasks:
+            raise ValueError(f"{domain.name} has no relations to shuffle: {_RELATIONS} is empty")
+        plan = replace(plan, tasks=tasks)
     entries = [bare_machine_entry(config) for config in options.configs(domain, 0)]
     for task in tasks:
         yardstick, _ = YARDSTICKS[task]
@@ -174,9 +187,26 @@ def compare_on_shuffled(
     title = f"{domain.name}, shuffled"
     reports = _measured(plan, entries, options, begin(title, plan_size(plan, entries)))
     weights = parameters(folder, entries)
-    return {
+    results = {
         task: summarise(_of_task(reports, task), YARDSTICKS[task][0], weights) for task in tasks
     }
+    write_shuffled(folder, results, scenes.digests)
+    return results
+
+
+def require_groups(domain: Domain) -> None:
+    """In tables that rank rows no group of scenes may be in two parts.
+
+    Raises:
+        ConfigError: the domain splits its scenes otherwise.
+    """
+    if domain.leaks:
+        names = ", ".join(config.name for config in domain.configs)
+        raise ConfigError(
+            f'{names}: data.split = "{domain.data.split}" leaves near-duplicates of test scenes in '
+            'the training part; tables and shuffled scenes need "group". --seed-protocol asks such '
+            "a configuration, without tables"
+        )
 
 
 def _of_task(reports: Measured, task: str) -> dict[tuple[str, int], dict[str, SourceReport]]:
@@ -194,84 +224,19 @@ def plan_size(plan: Plan, entries: Sequence[Entry]) -> int:
     return len(entries) * len(plan.settings)
 
 
-def write_results(
-    folder: Path,
-    name: str,
-    results: Results,
-    protocol: Results | None,
-    shuffled: Mapping[str, Results] | None,
-) -> str:
-    """results.json and results.md of a domain; returns the latter."""
-    values = results.to_dict()
-    text = f"# {name}\n\n{results.markdown()}"
-    if protocol is not None:
-        values["seed_protocol"] = protocol.to_dict() | {"paper": PAPER}
-        text += f"\n{_protocol_text(protocol)}"
-    if shuffled is not None:
-        values["shuffled"] = {task: found.to_dict() for task, found in shuffled.items()}
-        text += f"\n{shuffled_text(shuffled)}"
-    (folder / "results.json").write_text(json.dumps(values, indent=1), encoding="utf-8")
-    (folder / "results.md").write_text(text, encoding="utf-8")
-    return text
-
-
-def _protocol_text(protocol: Results) -> str:
-    names = list(dict.fromkeys(name for row in PAPER.values() for name in row))
-    lines = [f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
-    for figure, values in PAPER.items():
-        shown = [f"{values[name]:.4f}" if name in values else "" for name in names]
-        lines.append(f"| {figure} | {' | '.join(shown)} |")
-    paper = "\n".join(lines)
-    return f"""## Seed protocol
-
-One stochastic reconstruction answers, and scenes are split at random (60 / 30 / 10). These figures
-are not comparable with the tables above, and they leak: near-duplicates of test scenes are in the
-training part; relations that are left on hold or betray the removed object; switching on more
-relations can only help T1, and returning a scene as it was given scores 1/V in T3.
-
-{protocol.markdown(SEED_PRIMARY)}
-The paper's own figures, on its own data:
-
-{paper}
-"""
-
-
-def shuffled_text(shuffled: Mapping[str, Results]) -> str:
-    """The section on the control, by task."""
-    parts = [
-        """## Shuffled labels
-
-Rows trained on scenes whose objects were permuted between scenes: each scene has as many classes as
-before and each class is in as many scenes, but what is there together is chance. Test scenes are
-real. To be expected: MRR falls to that of popularity, R-precision over distinct classes to that of
-relation popularity. A row that stays above was told something that training scenes do not say.
-A star: the row in bold is better, with the whole interval.
-"""
-    ]
-    for task, results in shuffled.items():
-        _, metric = YARDSTICKS[task]
-        above = [
-            f"{d.row} by {-d.figure.value:.3f}"
-            for d in results.differences
-            if (d.source, d.metric) == (POOLED, metric) and d.figure.high < 0
-        ]
-        said = f"Above {results.ours} with the whole interval: {', '.join(above) or 'no row'}."
-        parts.append(f"{results.markdown({task: (metric,)})}\n{said}\n")
-    return "\n".join(parts)
-
-
 def _scenes(domain: Domain, data: Path, options: Options) -> SplitScenes:
     config = domain.configs[0].model_copy(update={"data": options.data(domain)})
     return prepare(config, data)
 
 
 def _plan(folder: Path, scenes: SplitScenes, options: Options, tasks: tuple[str, ...]) -> Plan:
-    data = scenes.training_data()
+    material = Material.of(scenes)
+    data = material.data
     seen = seen_triples(data.train.scenes, data.train.v.shape[1])
     limit = _QUICK_LIMIT if options.quick else options.limit
     settings = dict(settings_by_source(data.test, data.structure, data.train, seen, limit=limit))
     settings[POOLED] = Setting(data.test, data.structure, data.train, seen, limit)
-    return Plan(folder, Material(data, scenes.vocabulary), settings, tasks)
+    return Plan(folder, material, settings, tasks)
 
 
 def _measured(

@@ -30,6 +30,11 @@ class Domain:
         """The scenes of all of them."""
         return self.configs[0].data
 
+    @property
+    def leaks(self) -> bool:
+        """Scenes of one group are in several parts: near-duplicates of what is asked are learnt."""
+        return self.data.split != "group"
+
     def split_at_random(self) -> Domain:
         """The same under the seed paper's split: every scene on its own."""
         data = self.data.model_copy(update={"split": "random"})

@@ -23,8 +23,9 @@ from training.baselines import (
     placed_product,
 )
 from training.baselines.size import parameter_count
+from training.batches import SceneTensors
 from training.calibrate import calibrate
-from training.config import Config
+from training.config import Config, ConfigError
 from training.draft import as_stored, draft_artifact
 from training.evaluation.alarms import fitted_alarm
 from training.evaluation.contenders import (
@@ -37,16 +38,44 @@ from training.evaluation.missing import ObjectScore
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
 from training.evaluation.tasks import Setting, floor_contender, independent_contender
+from training.pipeline import SplitScenes
 from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer, TrainingData
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What the rows of a domain learn from: tensors of the three parts, and their vocabulary."""
+    """What the rows of a domain learn from.
+
+    Attributes:
+        data: tensors of the three parts.
+        vocabulary: their classes.
+        digest: of the scenes' contents and how they were split; with a row's identity it decides
+            whether what a folder holds is gone on with.
+    """
 
     data: TrainingData
     vocabulary: Vocabulary
+    digest: str
+
+    @classmethod
+    def of(cls, scenes: SplitScenes) -> Material:
+        """All of some split scenes.
+
+        Raises:
+            ConfigError: a part of them is empty.
+        """
+        for part, some in scenes.parts.items():
+            if not some:
+                raise ConfigError(
+                    f"no scene is in the {part} part: take more scenes, or of more groups"
+                )
+        return cls(scenes.training_data(), scenes.vocabulary, scenes.digest)
+
+    @property
+    def related(self) -> bool:
+        """Relations are there to be learnt, and to tune on."""
+        return has_relations(self.data.train) and has_relations(self.data.validation)
 
 
 CALIBRATION = "calibration.json"
@@ -65,8 +94,8 @@ class Entry:
     Attributes:
         name: of the row; rows of one name differ by their seed.
         seed: of the training.
-        identity: of everything that decides the figures but the scenes; reports of another
-            identity are not gone on with.
+        identity: of everything that decides the figures but the scenes, which `Material.digest`
+            stands for; reports of another identity are not gone on with.
         make: trains it, or reads back what was trained, in a folder of its own.
     """
 
@@ -76,30 +105,40 @@ class Entry:
     make: Maker
 
 
-def baseline_entries(seed: int, names: Sequence[str] | None = None) -> Iterator[Entry]:
+def baseline_entries(
+    seed: int, names: Sequence[str] | None = None, *, related: bool = True
+) -> Iterator[Entry]:
     """Every baseline of the registries, or those named.
 
     Where the seed changes nothing, there is an entry for seed 0 alone.
+
+    Args:
+        related: there are relations to learn from; otherwise those that need them are left out.
 
     Raises:
         ValueError: an unknown name.
     """
     makers: dict[str, tuple[Maker, bool]] = {}
+    needy: set[str] = set()
     for objects in OBJECTS:
         makers[objects.name] = partial(_objects, objects, seed), objects.stochastic
     for relations in RELATIONS:
         makers[relations.name] = partial(_relations, relations, seed), relations.stochastic
+        needy.add(relations.name)
     for completion in COMPLETIONS:
         name = f"{completion.name}, completing"
         makers[name] = partial(_completion, completion, seed), completion.stochastic
+        needy.add(name)
     for placed in PLACED:
         makers[placed.name] = partial(_placed, placed, seed), placed.stochastic
+        needy.add(placed.name)
     for density in DENSITIES:
         makers[density.name] = partial(_density, density, seed), density.stochastic
     if unknown := sorted(set(names or ()) - set(makers)):
         raise ValueError(f"unknown baselines {unknown}, must be of {list(makers)}")
     for name, (make, stochastic) in makers.items():
-        if (names is None or name in names) and (stochastic or seed == 0):
+        wanted = (names is None or name in names) and (related or name not in needy)
+        if wanted and (stochastic or seed == 0):
             yield Entry(name, seed, f"{name}, seed {seed}", make)
 
 
@@ -149,7 +188,7 @@ def _objects(
     fitted = _fit(baseline, data, seed, folder, say)
     alarm = fitted_alarm(fitted.score, data.validation, data.structure, seed)
     size = parameter_count(fitted.score)
-    if not _related(data):
+    if not material.related:
         return _always(Contender(objects=fitted.score, alarm=alarm, parameters=size))
     (first, *_) = PLACED
     table = _fit(first, data, seed, folder, say)
@@ -244,15 +283,19 @@ def _always(contender: Contender) -> Rival:
 def _fit(
     baseline: Baseline[Any], data: TrainingData, seed: int, folder: Path, say: Progress
 ) -> Fitted[Any]:
-    """Fit, and write down every trial."""
+    """Fit, and write down every trial; those of an earlier, interrupted fit give way to them."""
     fitted = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
     trials.parent.mkdir(parents=True, exist_ok=True)
-    with trials.open("a", encoding="utf-8") as file:
-        for trial in fitted.trials:
-            file.write(json.dumps({"model": fitted.name, **asdict(trial)}) + "\n")
+    before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []
+    lines = [line for line in before if json.loads(line)["model"] != fitted.name]
+    lines += [json.dumps({"model": fitted.name, **asdict(trial)}) for trial in fitted.trials]
+    draft = trials.with_name(trials.name + ".part")
+    draft.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    draft.replace(trials)
     return fitted
 
 
-def _related(data: TrainingData) -> bool:
-    return any(scene.evidence.holds.any() for scene in data.validation.scenes)
+def has_relations(scenes: SceneTensors) -> bool:
+    """Any scene is annotated with a relation."""
+    return any(scene.evidence.holds.any() for scene in scenes.scenes)

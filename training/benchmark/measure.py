@@ -1,6 +1,6 @@
 """The loop over rows and sources; whatever a file holds already is not computed again.
 
-<folder>/<row>/seed-<n>/entry.json        the row's identity and its number of weights
+<folder>/<row>/seed-<n>/entry.json        its identity, what it learnt from, how many weights
                         trials.jsonl      every trial of its tuning
                         run/              the training run of a machine, and its calibration
                         <source>.json     its report on a source
@@ -63,9 +63,9 @@ class Plan:
 
         Raises:
             BenchmarkError: the folder holds reports of other scenes, or of a row that was
-                configured otherwise.
+                configured otherwise or learnt from other scenes.
         """
-        claim(self.place(entry), entry)
+        claim(self.place(entry), entry, self.material.digest)
         found = {}
         for source, setting in self.settings.items():
             path = self.place(entry) / f"{source}.json"
@@ -150,23 +150,32 @@ def parameters(folder: Path, entries: Sequence[Entry]) -> dict[str, int]:
     return found
 
 
-def claim(place: Path, entry: Entry) -> None:
+def claim(place: Path, entry: Entry, material: str) -> None:
     """Write down whose folder this is.
+
+    Args:
+        material: digest of what the row learns from.
 
     Raises:
         BenchmarkError: it is another one's.
     """
     path = place / "entry.json"
     if path.exists():
-        identity = json.loads(path.read_text(encoding="utf-8"))["identity"]
-        if identity != entry.identity:
+        known = json.loads(path.read_text(encoding="utf-8"))
+        if known["identity"] != entry.identity:
             raise BenchmarkError(
                 f"{place} holds another configuration of {entry.name}; give --fresh or another "
                 "folder"
             )
+        if known.get("material") != material:
+            raise BenchmarkError(
+                f"{place} learnt from other scenes than these, or does not say from which: another "
+                "file, source, limit, split or vocabulary; give --fresh or another folder"
+            )
         return
     place.mkdir(parents=True, exist_ok=True)
-    _write(path, {"name": entry.name, "seed": entry.seed, "identity": entry.identity})
+    values = {"name": entry.name, "seed": entry.seed, "identity": entry.identity}
+    _write(path, values | {"material": material})
 
 
 def read_report(path: Path, setting: Setting) -> SourceReport:

@@ -31,10 +31,24 @@ _plan: Plan
 _messages: Queue[_Message]
 
 
-def fill(plan: Plan, entries: Sequence[Entry], progress: Progress, workers: int) -> None:
+def fill(
+    plan: Plan,
+    entries: Sequence[Entry],
+    progress: Progress,
+    workers: int,
+    *,
+    failures: tuple[type[Exception], ...] = (),
+) -> dict[tuple[str, int], Exception]:
     """Measure entries; the reports are on disk afterwards.
 
-    KeyboardInterrupt stops the workers at once and passes through.
+    KeyboardInterrupt stops the workers at once and passes through, and so does any error but those
+    of a row itself.
+
+    Args:
+        failures: errors that end the row in which they arise and leave the others alone.
+
+    Returns:
+        These errors, by (name, seed) of the row.
 
     Raises:
         BrokenProcessPool: a worker died.
@@ -49,16 +63,17 @@ def fill(plan: Plan, entries: Sequence[Entry], progress: Progress, workers: int)
             workers, context, initializer=_begin, initargs=(material, messages)
         ) as pool,
     ):
-        futures = [pool.submit(_measure, entry) for entry in entries]
+        futures = {
+            pool.submit(_measure, entry, failures): (entry.name, entry.seed) for entry in entries
+        }
         try:
             while True:
                 done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
                 for message in _pending(messages):
                     progress(*message)
-                for future in done:
-                    future.result()
+                failed = {futures[future]: error for future in done if (error := future.result())}
                 if not waiting:
-                    return
+                    return failed
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
@@ -88,8 +103,13 @@ def _begin(material: bytes, messages: Queue[_Message]) -> None:
     _plan, _messages = pickle.loads(material), messages
 
 
-def _measure(entry: Entry) -> None:
-    _plan.measure(entry, lambda *message: _messages.put(message))
+def _measure(entry: Entry, failures: tuple[type[Exception], ...]) -> Exception | None:
+    """The row's own failure: caught here, where it does not stop the others."""
+    try:
+        _plan.measure(entry, lambda *message: _messages.put(message))
+    except failures as error:
+        return error
+    return None
 
 
 def _pending(messages: Queue[_Message]) -> Iterator[_Message]:

@@ -102,6 +102,21 @@ def test_a_row_that_diverges_is_reported_and_left_out(finished):
     assert "- diverging was not measured: seed 0" in markdown(finished)
 
 
+def test_a_row_that_diverges_leaves_the_others_to_the_workers(tmp_path, monkeypatch):
+    """Workers do not see what is changed in this process: nothing is trained here."""
+    monkeypatch.setattr(Trainer, "run", None)
+    rows = ("--row", "diverging", "--row", "no-counts")
+    code, output = run(*arguments(tmp_path), *rows, "--workers", "2")
+    assert code == 0, output
+    found = results(tmp_path)
+    assert list(found["failures"]) == ["diverging"]
+    assert {cell["row"] for cell in found["cells"]} == {"rooms-triway", "no-counts"}
+
+
+def test_the_tables_say_what_a_precision_means(finished):
+    assert "An unlisted relation counts as wrong in T1a and T1b" in markdown(finished)
+
+
 def markdown(folder):
     return (folder / "ablation/rooms-triway/results.md").read_text()
 

@@ -12,17 +12,18 @@ from typer.testing import CliRunner
 from training.benchmark import (
     BenchmarkError,
     Entry,
+    Material,
     MeanOverSeeds,
     Plan,
     measure_entries,
     summarise,
 )
 from training.benchmark.command import chosen_tasks
-from training.benchmark.compare import shuffled_text
 from training.benchmark.domains import default_configs, read_domains
 from training.benchmark.entries import baseline_entries, plain_baseline_entries
 from training.benchmark.measure import slug
 from training.benchmark.plots import read_curve, recall_points
+from training.benchmark.sections import shuffled_text
 from training.benchmark.summary import Cell, Difference, Results, is_better
 from training.cli import app
 from training.config import ConfigError, load_config
@@ -435,12 +436,12 @@ def test_interrupting_keeps_what_is_finished(tmp_path):
     assert made == ["first", "second", "second"]
 
 
-def _plan(folder):
+def _plan(folder, material="these scenes"):
     class Nothing:
         scenes = ()
 
     settings = {"none": Setting(scenes=Nothing(), structure=None)}
-    return Plan(folder, None, settings, ["T2 missing"])
+    return Plan(folder, Material(None, None, material), settings, ["T2 missing"])
 
 
 def test_a_changed_row_is_refused(tmp_path):
@@ -448,6 +449,22 @@ def test_a_changed_row_is_refused(tmp_path):
     measure_entries(_plan(tmp_path), [first], print)
     with pytest.raises(BenchmarkError, match="another configuration of row"):
         measure_entries(_plan(tmp_path), [second], print)
+
+
+def test_a_row_that_learnt_from_other_scenes_is_refused(tmp_path):
+    entry = Entry("row", 0, "row", lambda *_: lambda _: Contender())
+    measure_entries(_plan(tmp_path), [entry], print)
+    with pytest.raises(BenchmarkError, match="learnt from other scenes"):
+        measure_entries(_plan(tmp_path, "other scenes"), [entry], print)
+
+
+def test_a_folder_that_does_not_say_what_it_learnt_from_is_refused(tmp_path):
+    entry = Entry("row", 0, "row", lambda *_: lambda _: Contender())
+    place = tmp_path / "row/seed-0"
+    place.mkdir(parents=True)
+    (place / "entry.json").write_text(json.dumps({"identity": "row"}))
+    with pytest.raises(BenchmarkError, match="learnt from other scenes"):
+        measure_entries(_plan(tmp_path), [entry], print)
 
 
 def test_names_of_folders():
