@@ -45,7 +45,13 @@ _QUICK_SCENES = 150
 _QUICK_EPOCHS = 2
 _QUICK_LIMIT = 30
 _RELATIONS = "T1a relations"
-_QUICK_BASELINES = ("popularity", "EASE", "frequency table", "frequency table, completing")
+QUICK_BASELINES = (
+    "popularity",
+    "EASE",
+    "frequency table",
+    "frequency table, completing",
+    "frequency table p(i | a, j)",
+)
 
 # Called with the number of (row, source) pairs of what begins now; returns who hears of them.
 Begin = Callable[[str, int], Progress]
@@ -77,7 +83,7 @@ class Options:
     @property
     def chosen_baselines(self) -> tuple[str, ...] | None:
         """Names of baselines, None for all."""
-        return _QUICK_BASELINES if self.quick and self.baselines is None else self.baselines
+        return QUICK_BASELINES if self.quick and self.baselines is None else self.baselines
 
     def shuffled_tasks(self) -> tuple[str, ...]:
         """The tasks of `YARDSTICKS` that are wanted.

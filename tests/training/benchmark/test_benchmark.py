@@ -19,6 +19,7 @@ from training.benchmark import (
     summarise,
 )
 from training.benchmark.command import chosen_tasks
+from training.benchmark.compare import QUICK_BASELINES
 from training.benchmark.domains import default_configs, read_domains
 from training.benchmark.entries import baseline_entries, plain_baseline_entries
 from training.benchmark.measure import slug
@@ -54,6 +55,7 @@ epochs = {epochs}
 BASELINES = ("--baseline", "popularity", "--baseline", "EASE")
 # In this process, where tests can look on; workers have a test of their own.
 HERE = ("--workers", "1")
+MACHINES = {"rooms-triway", "rooms-gbm", "rooms-rbm"}
 REFERENCES = {"independent classes", "held-out scenes (floor)"}
 
 
@@ -74,7 +76,8 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("benchmark")
     where = folder / "reports"
     arguments = (
-        write(folder), write(folder, variant="rbm"), "--folder", str(where), "--quick", *BASELINES,
+        *(write(folder, variant=variant) for variant in ("triway", "gbm", "rbm")),
+        "--folder", str(where), "--quick",
         "--seed-protocol", "--shuffled", *HERE,
     )  # fmt: skip
     code, output = run(*arguments)
@@ -90,7 +93,7 @@ def results(finished):
 def test_every_row_is_measured_and_compared(finished, results):
     assert results["ours"] == "rooms-triway"
     rows = {cell["row"] for cell in results["cells"]}
-    assert rows == {"rooms-triway", "rooms-rbm", "popularity", "EASE"} | REFERENCES
+    assert rows == MACHINES | set(QUICK_BASELINES) | REFERENCES
     cells = {(c["row"], c["source"], c["task"], c["metric"]): c["figure"] for c in results["cells"]}
     for difference in results["differences"]:
         key = (difference["source"], difference["task"], difference["metric"])
@@ -104,7 +107,7 @@ def test_every_row_is_measured_and_compared(finished, results):
 def test_machines_are_measured_as_they_are_published(results):
     """Calibrated, with the default alarm, told the room type where the table says so."""
     found = {(c["row"], c["task"], c["metric"]) for c in results["cells"]}
-    for row in ("rooms-triway", "rooms-rbm"):
+    for row in MACHINES:
         assert (row, "T3 outliers, uniform", "alarms in untouched scenes") in found
         assert (row, "T2 missing, room type given", "MRR, room type withheld") in found
         for question in ("relations", "missing", "outliers", "misplaced"):
@@ -113,7 +116,7 @@ def test_machines_are_measured_as_they_are_published(results):
 
 def test_references_stand_in_the_tables_of_generation(results):
     rows = {c["row"] for c in results["cells"] if c["task"] == "T4 generate"}
-    assert rows == {"rooms-triway", "rooms-rbm"} | REFERENCES
+    assert rows == MACHINES | REFERENCES
 
 
 def test_weights_are_counted(finished, results):
@@ -126,7 +129,7 @@ def test_weights_are_counted(finished, results):
 def test_the_seed_protocol_has_a_section_of_its_own(finished, results):
     protocol = results["seed_protocol"]
     assert {cell["task"] for cell in protocol["cells"]} == {"Seed T1", "Seed T2", "Seed T3"}
-    assert {cell["row"] for cell in protocol["cells"]} == {"rooms-triway", "rooms-rbm"}
+    assert {cell["row"] for cell in protocol["cells"]} == MACHINES
     assert protocol["paper"]["T3 error measure"]["Triway"] == 0.0789
     assert "## Seed protocol" in (finished[1] / "results.md").read_text()
     config = json.loads(
@@ -139,10 +142,9 @@ def test_the_shuffled_control_has_a_section_of_its_own(finished, results):
     """With the rows that were wanted, and those that the others must fall to."""
     control = results["shuffled"]
     rows = {task: {cell["row"] for cell in part["cells"]} for task, part in control.items()}
-    machines = {"rooms-triway", "rooms-rbm"}
     assert rows == {
-        "T1a relations": {"relation popularity"} | machines,
-        "T2 missing": {"popularity", "EASE"} | machines,
+        "T1a relations": {"relation popularity", "frequency table"} | MACHINES,
+        "T2 missing": {"popularity", "EASE"} | MACHINES,
     }
     for task, part in control.items():
         assert {cell["task"] for cell in part["cells"]} == {task}
@@ -199,9 +201,9 @@ def test_only_two_tasks_are_asked_on_shuffled_scenes(tmp_path):
 
 def test_plots_lie_beside_the_results(finished):
     names = {path.stem for path in finished[1].glob("*.png") if path.stat().st_size > 5000}
-    assert names == {
-        "learning-curves", "recall", "scenes", "reliability-rooms-rbm", "reliability-rooms-triway",
-    }  # fmt: skip
+    assert names == {"learning-curves", "recall", "scenes"} | {
+        f"reliability-{machine}" for machine in MACHINES
+    }
 
 
 def test_a_curve_is_read_back(finished):
