@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 from typer.testing import CliRunner
@@ -196,6 +197,15 @@ def test_a_trial_below_the_median_is_given_up(tmp_path):
     again = Study(tmp_path / "study", config, data, {}, "both")
     assert again.trials == study.trials
     assert isinstance(again.known(good[0]), Trial)
+
+
+def test_test_scenes_are_never_looked_at(tmp_path):
+    """Training and judging a trial go as well without any."""
+    arguments(tmp_path)
+    config = load_config(str(tmp_path / "config.toml"))
+    data = replace(prepare(config, tmp_path).training_data(), test=None)
+    study = Study(tmp_path / "study", config, data, {}, "both")
+    assert study.run({"training.epochs": 1}, quiet, prune=False).state == "finished"
 
 
 def test_a_difference_is_paired_and_that_of_the_pooled_figures(finished):
