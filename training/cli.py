@@ -97,7 +97,7 @@ def evaluate_command(
     url: Annotated[
         str | None, typer.Option(help="ask a running service too, and compare what it answers")
     ] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="scenes a source, with --url")] = 30,
+    limit: Annotated[int, typer.Option(min=1, help="scenes a source, with --url")] = 30,
     output: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
 ) -> None:
     """Evaluate stored models on the split they were trained with: what a model card shows.
@@ -224,7 +224,7 @@ def _asked(
     artifact: Artifact,
     scenes: SceneTensors,
     structure: Tensor,
-    limit: int | None,
+    limit: int,
 ) -> dict[str, list[Row]]:
     """The figures of a model as it is, and as a service answers for it."""
     tables: dict[str, list[Row]] = {reference: [], f"{reference} at {url}": []}

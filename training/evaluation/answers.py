@@ -133,13 +133,11 @@ def ask_placements(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
     """Where an object that was taken away stood, one instance of it."""
-    classes = encoded.evidence.classes
-    removable = classes[~artifact.vocabulary.structure[classes]]
-    if len(removable) < 2 or not encoded.instance_observed.any():
+    taken = _taken_away(artifact, encoded, rng)
+    if taken is None or not encoded.instance_observed.any():
         return None
-    target = int(rng.choice(removable))
+    target, kept = taken
     gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
-    kept = [k for k, c in enumerate(encoded.instance_classes) if c != target]
     found: Answered = []
     for answer in missing(artifact, _bare(encoded, kept), candidates=[target]):
         for place in answer.placements:
@@ -153,12 +151,10 @@ def ask_missing(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
     """The class that was taken away."""
-    classes = encoded.evidence.classes
-    removable = classes[~artifact.vocabulary.structure[classes]]
-    if len(removable) < 2:
+    taken = _taken_away(artifact, encoded, rng)
+    if taken is None:
         return None
-    target = int(rng.choice(removable))
-    kept = [k for k, c in enumerate(encoded.instance_classes) if c != target]
+    target, kept = taken
     label = artifact.vocabulary.labels[target]
     return [(a.probability, a.label == label) for a in missing(artifact, _bare(encoded, kept))]
 
@@ -225,3 +221,15 @@ QUESTIONS: dict[str, Callable[[Artifact, EncodedScene, np.random.Generator], Ans
 
 def _bare(encoded: EncodedScene, kept: range | list[int]) -> Scene:
     return replace(scene_of(encoded, list(kept), triples=()), room_type=None)
+
+
+def _taken_away(
+    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
+) -> tuple[int, list[int]] | None:
+    """(a class drawn from those that may be missing, the instances of all others)."""
+    classes = encoded.evidence.classes
+    removable = classes[~artifact.vocabulary.structure[classes]]
+    if len(removable) < 2:
+        return None
+    target = int(rng.choice(removable))
+    return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
