@@ -32,7 +32,7 @@ test: $(EVERYTHING)  ## lint, format, types, import rules, then the tests
 	$(BIN)/python -m ruff format --quiet --check .
 	$(BIN)/python -m mypy --no-error-summary
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --dist loadscope $(ARGS)
 
 setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need
 
