@@ -37,7 +37,8 @@ def changed(before, after):
 def test_the_way_to_the_full_model_is_one_step_at_a_time():
     """Steps that bundle are those that the file's head names."""
     full = {row.name: row for row in load_rows(shipped_ablations()["indoor-triway"], FULL)}
-    way = ["seed-form-cd1", "seed-form", "local-form", "local-form-implications", "no-polish"]
+    steps = "seed-form-cd1 seed-form local-form local-form-implications no-polish two-layers"
+    way = steps.split()
     configs = [*(full[name] for name in way), FULL]
     assert [changed(a, b) for a, b in pairwise(configs)] == [
         {"objective.name", "objective.k"},
@@ -45,6 +46,7 @@ def test_the_way_to_the_full_model_is_one_step_at_a_time():
         {"machine.G"},
         {"objective.generative_weight"},
         {"machine.N", "polish.updates"},
+        {"machine.H2"},
     ]
 
 
@@ -58,7 +60,7 @@ def test_without_one_part_the_rest_is_as_shipped():
         and not row.name.startswith(("paper-", "seed-form", "local-form"))
         and len(found := changed(FULL, row)) > 1
     }
-    assert several == {"no-polish": {"machine.N", "polish.updates"}}
+    assert several == {"no-polish": {"machine.H2", "machine.N", "polish.updates"}}
     assert changed(FULL, next(row for row in rows if row.name == "no-count-dropout")) == {
         "objective.count_dropout"
     }
@@ -72,12 +74,12 @@ def rows(tmp_path, text):
 
 def test_a_row_changes_what_it_names_and_nothing_else(tmp_path):
     text = (
-        '[[row]]\nname = "shallow"\nwhat = "one layer"\nchanges = { "machine.H2" = 0 }\n'
+        '[[row]]\nname = "deep"\nwhat = "two layers"\nchanges = { "machine.H2" = 50 }\n'
         '[[row]]\nname = "old"\nwhat = "the paper"\nfrom = "seed-gbm"\n'
     )
-    shallow, old = rows(tmp_path, text)
-    assert (shallow.name, shallow.description, shallow.machine.H2) == ("shallow", "one layer", 0)
-    assert (shallow.objective, shallow.training) == (FULL.objective, FULL.training)
+    deep, old = rows(tmp_path, text)
+    assert (deep.name, deep.description, deep.machine.H2) == ("deep", "two layers", 50)
+    assert (deep.objective, deep.training) == (FULL.objective, FULL.training)
     paper = load_config("seed-gbm")
     assert (old.machine, old.training) == (paper.machine, paper.training)
     assert old.data == FULL.data != paper.data
