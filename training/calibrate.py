@@ -24,9 +24,7 @@ from scipy.optimize import minimize, minimize_scalar
 from sklearn.linear_model import LogisticRegression
 
 from app.reasoning import misplaced
-from app.reasoning.evidence import draw_context, observe
-from app.reasoning.objects import absent_log_odds
-from app.reasoning.placements import log_p_at
+from app.reasoning.posterior import posterior
 from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject
 from training.batches import SceneTensors
@@ -167,12 +165,13 @@ def fit_placed(
         if case is None:
             continue
         scene, relation, anchor, target = case
-        seen = observe(artifact.machine, scene)
-        absent = (~seen.present & ~torch.from_numpy(structure.copy())).nonzero().squeeze(1)
-        draws = draw_context(artifact.machine, seen.evidence)
-        odds = absent_log_odds(artifact, seen.evidence, absent, draws)
-        log_p = log_p_at(seen, draws, absent, relation, int(seen.row[anchor]), outgoing=True)
-        cases.append((odds.double(), log_p.double(), int((absent == target).nonzero())))
+        given = posterior(artifact, scene)
+        absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
+        row = int(given.present.row[anchor])
+        odds = given.absent_log_odds(absent).astype(np.float64)
+        log_p = given.placed_log_p(absent, relation, row, outgoing=True).astype(np.float64)
+        where = int(np.flatnonzero(absent == target)[0])
+        cases.append((torch.from_numpy(odds), torch.from_numpy(log_p), where))
     if len(cases) < 10:
         return 1.0, 1.0
 

@@ -13,10 +13,14 @@ weight below -17. Weights in float64, or too large for float32, are summed log b
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import logsigmoid, pad
+from torch.nn.functional import logsigmoid
 
+from app.boltzmann.elementary import log, logistic
 from app.boltzmann.machine import BoltzmannMachine
 
 # Of log of a product: float32 spans exp(±87).
@@ -25,6 +29,19 @@ _LOG_RANGE = 80.0
 _LARGEST_WEIGHT = 64.0
 # More factors a log gain nothing: by then the products take all the time.
 _LARGEST_GROUP = 25
+# Objects are taken in tiles of so many, whose factors stay in the first-level cache.
+_TILE = 64
+
+
+def group_size(W: Tensor) -> int:
+    """How many factors between 1 and exp(W) may be multiplied before a log must be taken.
+
+    0 where products of float32 are not safe at all.
+    """
+    largest = float(W.detach().abs().max()) if W.numel() else 0.0
+    if W.dtype == torch.float64 or largest > _LARGEST_WEIGHT:
+        return 0
+    return min(_LARGEST_GROUP, max(1, int(_LOG_RANGE / max(largest, 1.0))))
 
 
 class ContextScorer:
@@ -42,24 +59,17 @@ class ContextScorer:
 
     def __init__(self, machine: BoltzmannMachine) -> None:
         W = machine.W.detach()
-        self._dtype = W.dtype
         if not bool(W.isfinite().all()):
             raise ValueError("W must be finite to score with")
         self.V, self.H1 = W.shape
-        largest = float(W.abs().max())
-        exact = W.dtype == torch.float64 or largest > _LARGEST_WEIGHT
-        self._weights = W.T.double() if exact else None
-        limit = min(_LARGEST_GROUP, max(1, int(_LOG_RANGE / max(largest, 1.0))))
-        groups = -(-self.H1 // limit)
-        self._group = -(-self.H1 // groups)
-        # A divisor of H1 needs no padding, which costs more than some further logs.
-        divisor = max(size for size in range(1, limit + 1) if self.H1 % size == 0)
-        if 2 * divisor >= self._group:
-            self._group, groups = divisor, self.H1 // divisor
-        # Units that fill up the last group have W = 0, so their factor is 1.
-        self._padding = groups * self._group - self.H1
-        self._exp = torch.ones(self.H1 + self._padding, self.V)
-        torch.exp(W.T, out=self._exp[: self.H1])
+        self._dtype = W.dtype
+        self._group = group_size(W)
+        self._weights = None if self._group else W.T.double()
+        tiles = -(-self.V // _TILE)
+        self._exp = np.ones((tiles if self._group else 0, self.H1, _TILE), dtype=np.float32)
+        for number, tile in enumerate(self._exp):
+            rows = W[number * _TILE : (number + 1) * _TILE]
+            tile[:, : len(rows)] = rows.T.exp().numpy()
 
     def gain(self, x: Tensor) -> Tensor:
         """sum_k [softplus(x_k + W_ik) - softplus(x_k)], (B, V) in W's dtype, for x (B, H1).
@@ -70,22 +80,51 @@ class ContextScorer:
         if x.dim() != 2 or x.shape[1] != self.H1:
             raise ValueError(f"x must be (B, {self.H1}), not {tuple(x.shape)}")
         gains = torch.empty(len(x), self.V, dtype=self._dtype)
-        with torch.inference_mode():
-            for row, gain in zip(x.detach().to(self._dtype), gains, strict=True):
-                if self._weights is None:
-                    self._multiply(row, gain)
-                else:
-                    _add_logs(row, self._weights, gain)
+        for row, gain in zip(x.detach().to(self._dtype), gains, strict=True):
+            if self._weights is None:
+                _gain(row.numpy(), self._exp, self._group, gain.numpy())
+            else:
+                _add_logs(row, self._weights, gain)
         return gains
 
-    def _multiply(self, row: Tensor, gain: Tensor) -> None:
-        row = (pad(row, (0, self._padding)) if self._padding else row).unsqueeze(1)
-        factors = torch.mul(self._exp, row.sigmoid()).add_((-row).sigmoid())
-        products = factors.view(self._group, -1).prod(0).log_()
-        torch.sum(products.view(-1, self.V), 0, out=gain)
+    def row_gain(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The same for one row (H1,) of float32, (V,)."""
+        gain = np.empty(self.V, dtype=np.float32)
+        if self._weights is None:
+            _gain(x, self._exp, self._group, gain)
+        else:
+            gain[:] = self.gain(torch.from_numpy(x).unsqueeze(0))[0].numpy()
+        return gain
 
 
 def _add_logs(row: Tensor, weights: Tensor, gain: Tensor) -> None:
     """The same by one log a factor, in float64, for weights (H1, V)."""
     row = row.double().unsqueeze(1)
     gain.copy_(torch.logaddexp(logsigmoid(-row), logsigmoid(row) + weights).sum(0))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _gain(x, exp_w, group, out):
+    """One row: x (H1,), exp_w (tiles, H1, objects of a tile), out (V,)."""
+    tiles, units, width = exp_w.shape
+    on, off = np.empty(units, np.float32), np.empty(units, np.float32)
+    for k in range(units):
+        on[k] = logistic(x[k])
+        off[k] = logistic(-x[k])
+    product, total = np.empty(width, np.float32), np.empty(width, np.float32)
+    for t in range(tiles):
+        tile = exp_w[t]
+        for i in range(width):
+            total[i] = np.float32(0.0)
+        for start in range(0, units, group):
+            for i in range(width):
+                product[i] = np.float32(1.0)
+            for k in range(start, min(start + group, units)):
+                a, b, row = off[k], on[k], tile[k]
+                for i in range(width):
+                    product[i] *= a + b * row[i]
+            for i in range(width):
+                total[i] += log(product[i])
+        first = t * width
+        for i in range(min(width, len(out) - first)):
+            out[first + i] = total[i]

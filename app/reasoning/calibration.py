@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from app.registry.description import Calibration
 
+Floats = NDArray[np.floating[Any]]
 
-def relation_probability(calibration: Calibration, log_odds: Tensor, log_count: Tensor) -> Tensor:
+
+def sigmoid(x: Floats) -> Floats:
+    """1 / (1 + e^-x); beyond ±80 as there."""
+    return 1.0 / (1.0 + np.exp(-np.clip(x, -80.0, 80.0)))
+
+
+def softmax(scores: Floats) -> Floats:
+    """e^s over its sum, for scores (N,)."""
+    weight = np.exp(scores - scores.max())
+    return weight / weight.sum()
+
+
+def relation_probability(calibration: Calibration, log_odds: Floats, log_count: Floats) -> Floats:
     """Probability that a relation is listed for one pair of instances.
 
     Args:
@@ -16,36 +31,35 @@ def relation_probability(calibration: Calibration, log_odds: Tensor, log_count: 
         log_count: (n, m), log of the instance pairs of both classes.
     """
     entries = calibration.relation
-    table = [(entry.intercept, entry.slope, entry.log_count) for entry in entries]
-    intercept, slope, weight = log_odds.new_tensor(table).T[..., None, None].unbind(0)
-    return torch.sigmoid(intercept + slope * log_odds + weight * log_count)
+    table = np.array([(e.intercept, e.slope, e.log_count) for e in entries], dtype=log_odds.dtype)
+    intercept, slope, weight = table.T[:, :, None, None]
+    return sigmoid(intercept + slope * log_odds + weight * log_count)
 
 
-def exclusive(forward: Tensor, backward: Tensor) -> tuple[Tensor, Tensor]:
+def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
     """Scale p(a(x,y)) and p(a(y,x)), which exclude each other, down to a sum of at most 1."""
-    total = (forward + backward).clamp(min=1.0)
+    total = np.maximum(forward + backward, 1.0)
     return forward / total, backward / total
 
 
-def missing_scores(calibration: Calibration, log_odds: Tensor) -> Tensor:
+def missing_scores(calibration: Calibration, log_odds: Floats) -> Floats:
     """Logits of "this class was taken away"."""
     return log_odds / calibration.missing_temperature
 
 
-def placed_scores(calibration: Calibration, log_odds: Tensor, log_p: Tensor) -> Tensor:
+def placed_scores(calibration: Calibration, log_odds: Floats, log_p: Floats) -> Floats:
     """Logits of "this class was taken away from there", log_p of the relation that says where."""
     placed = log_odds / calibration.placed_temperature
     return placed + calibration.placed_relation_weight * log_p
 
 
-def intruder_log_odds(calibration: Calibration, log_odds: Tensor, classes: int) -> Tensor:
+def intruder_log_odds(calibration: Calibration, log_odds: Floats, classes: int) -> Floats:
     """Log-odds of being an intruder in a scene of so many distinct classes."""
     entry = calibration.outlier
-    size = torch.tensor(float(classes), dtype=log_odds.dtype).log()
-    return entry.intercept + entry.slope * log_odds + entry.log_count * size
+    return entry.intercept + entry.slope * log_odds + entry.log_count * float(np.log(classes))
 
 
-def false_log_odds(calibration: Calibration, log_odds: Tensor) -> Tensor:
+def false_log_odds(calibration: Calibration, log_odds: Floats) -> Floats:
     """Log-odds of a stated relation being false."""
     entry = calibration.misplaced
     return entry.intercept + entry.slope * log_odds

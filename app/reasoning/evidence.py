@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from app.boltzmann import BoltzmannMachine, Triway
 from app.boltzmann.draws import HiddenDraws, draw_hidden
 from app.boltzmann.mean_field import Evidence
+from app.reasoning.present import Present, present
 from app.reasoning.units import Units, units_between
 from app.scene.evidence import class_evidence
 from app.scene.scene import Scene
@@ -56,6 +56,7 @@ class Observation:
 
     Attributes:
         machine: whose units these are.
+        scene: its classes, in arrays.
         classes, counts: (n,) int64, the distinct classes, ascending, and their instances.
         row: (N,) int64, for each object of the scene the place of its class in `classes`.
         first: (n,) int64, position of the first object of each class.
@@ -66,6 +67,7 @@ class Observation:
     """
 
     machine: BoltzmannMachine
+    scene: Present
     classes: Tensor
     counts: Tensor
     row: Tensor
@@ -120,17 +122,8 @@ def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
         ValueError: an object outside the machine's classes, or a room type it does not have.
     """
     spec = machine.spec
-    for thing in scene.objects:
-        if thing.class_index is None or thing.class_index >= spec.V:
-            raise ValueError(
-                f"class_index of {thing.id!r} is {thing.class_index}, must be below V = {spec.V}"
-            )
-    if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
-        raise ValueError(f"room_type is {scene.room_type}, must be below C = {spec.C}")
+    present_ = present(scene, spec)
     found = class_evidence(scene)
-    labels = np.array([thing.class_index for thing in scene.objects], dtype=np.int64)
-    row = np.searchsorted(found.classes, labels)
-    first = np.searchsorted(row[order := row.argsort(kind="stable")], np.arange(len(found.classes)))
     classes, counts = torch.from_numpy(found.classes), torch.from_numpy(found.counts)
     v = torch.zeros(1, spec.V, dtype=machine.b.dtype)
     v[0, classes] = torch.from_numpy(found.confidence).to(v.dtype)
@@ -140,10 +133,11 @@ def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
     observed = torch.from_numpy(found.observed[: spec.A])
     observation = Observation(
         machine=machine,
+        scene=present_,
         classes=classes,
         counts=counts,
-        row=torch.from_numpy(row),
-        first=torch.from_numpy(order[first]),
+        row=torch.from_numpy(present_.row),
+        first=torch.from_numpy(present_.first),
         holds=holds,
         observed=observed,
         evidence=Evidence(v, room=room),

@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from app.reasoning.answers import MissingAnswer
-from app.reasoning.calibration import missing_scores, placed_scores
-from app.reasoning.evidence import draw_context, observe
-from app.reasoning.objects import absent_log_odds
-from app.reasoning.placements import log_p_at, placements
-from app.reasoning.relations import best
+from app.reasoning.calibration import missing_scores, placed_scores, softmax
+from app.reasoning.placements import placements
+from app.reasoning.posterior import posterior
+from app.reasoning.ranking import best
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene
 
 
-@torch.inference_mode()
 def missing(
     artifact: Artifact,
     scene: Scene,
@@ -43,34 +40,36 @@ def missing(
         ValueError: top_k below 1, a candidate outside the vocabulary, an unknown relation, or an
             anchor that is no object of the scene.
     """
-    machine, calibration = artifact.machine, artifact.calibration
+    spec, calibration = artifact.machine.spec, artifact.calibration
     if top_k < 1:
         raise ValueError(f"top_k must be at least 1, not {top_k}")
-    place = _place(scene, machine.spec.A, at)
-    observation = observe(machine, scene)
-    structure = torch.tensor(artifact.vocabulary.structure)
-    absent = (~observation.present & ~structure).nonzero().squeeze(1)
-    chosen = _chosen(absent, machine.spec.V, candidates)
-    if not bool(chosen.any()):
+    place = _place(scene, spec.A, at)
+    given = posterior(artifact, scene)
+    structure = artifact.vocabulary.structure
+    usable = ~structure
+    usable[given.present.classes] = False
+    absent = np.flatnonzero(usable)
+    chosen = _chosen(absent, spec.V, candidates)
+    if not chosen.any():
         return ()
-    draws = draw_context(machine, observation.evidence)
-    log_odds = absent_log_odds(artifact, observation.evidence, absent, draws)
-    scores = missing_scores(calibration, log_odds)
-    if place is not None:
+    log_odds = given.absent_log_odds(absent)
+    if place is None:
+        scores = missing_scores(calibration, log_odds)
+    else:
         relation, anchor, outgoing = place
-        row = int(observation.row[anchor])
-        log_p = log_p_at(observation, draws, absent, relation, row, outgoing=outgoing)
+        row = int(given.present.row[anchor])
+        log_p = given.placed_log_p(absent, relation, row, outgoing=outgoing)
         scores = placed_scores(calibration, log_odds, log_p)
     # By score: probabilities of far classes may all round to zero.
-    where = torch.from_numpy(best(scores.numpy(), chosen.numpy(), top_k))
-    anchors = (~structure[observation.classes]).nonzero().squeeze(1)
+    where = best(scores, chosen, top_k)
+    labels = artifact.vocabulary.labels
     return tuple(
-        MissingAnswer(artifact.vocabulary.labels[index], probability, value, standing)
+        MissingAnswer(labels[index], probability, value, standing)
         for index, probability, value, standing in zip(
             absent[where].tolist(),
-            torch.softmax(scores, dim=0)[where].tolist(),
+            softmax(scores)[where].tolist(),
             log_odds[where].tolist(),
-            placements(observation, draws, absent[where], anchors, calibration),
+            placements(given, absent[where], structure, calibration),
             strict=True,
         )
     )
@@ -91,11 +90,13 @@ def _place(
     return relation, anchor, subject == "missing"
 
 
-def _chosen(absent: Tensor, classes: int, candidates: Sequence[int] | None) -> Tensor:
+def _chosen(
+    absent: NDArray[np.int64], classes: int, candidates: Sequence[int] | None
+) -> NDArray[np.bool_]:
     """(N,) bool over the absent classes."""
     if candidates is None:
-        return torch.ones(len(absent), dtype=torch.bool)
+        return np.ones(len(absent), dtype=np.bool_)
     for index in candidates:
         if not 0 <= index < classes:
             raise ValueError(f"candidate {index} must be a class index below V = {classes}")
-    return torch.from_numpy(np.isin(absent.numpy(), np.array(candidates, dtype=np.int64)))
+    return np.isin(absent, np.array(candidates, dtype=np.int64))

@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from app.reasoning.answers import RelationAnswer
 from app.reasoning.calibration import exclusive, relation_probability
-from app.reasoning.evidence import Observation, draw_context, observe
-from app.reasoning.units import NO_UNIT, mean_log_p, units_between
+from app.reasoning.posterior import posterior
+from app.reasoning.ranking import best
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, OPPOSITES
 from app.scene.scene import Scene
 
 
-@torch.inference_mode()
 def relations(
     artifact: Artifact,
     scene: Scene,
@@ -48,21 +45,21 @@ def relations(
         raise ValueError(f"top_k must be at least 1, not {top_k}")
     if not 0 <= min_probability <= 1:
         raise ValueError(f"min_probability must be in [0, 1], not {min_probability}")
-    observation = observe(artifact.machine, scene)
+    given = posterior(artifact, scene)
     asked = _asked(artifact, scene, pairs)
     if not asked.any():
         return ()
-    log_odds = class_log_odds(observation)
-    logs = observation.counts.to(log_odds.dtype).log()
-    p = relation_probability(artifact.calibration, log_odds, logs[:, None] + logs)
-    p, _ = exclusive(p, p.mT)
+    log_odds = given.relation_log_odds()
+    log_counts = np.log(given.present.counts).astype(log_odds.dtype)
+    p = relation_probability(artifact.calibration, log_odds, log_counts[:, None] + log_counts)
+    p, backward = exclusive(p, p.swapaxes(1, 2))
     names = CANONICAL[: len(p)]
     if include_opposites:
-        p = torch.cat([p, p.mT])
+        p = np.concatenate([p, backward])
         names = names + tuple(OPPOSITES[name] for name in names)
-    row = observation.row
+    row = given.present.row
     # (N, N, relations): the flat order is that of positions, so a stable sort breaks ties by it.
-    grid = p.permute(1, 2, 0)[row][:, row].numpy()
+    grid = p[:, row[:, None], row].transpose(1, 2, 0)
     usable = asked[..., None] & (grid >= min_probability)
     where = best(grid.ravel(), usable.ravel(), top_k)
     subject, object_, relation = np.unravel_index(where, grid.shape)
@@ -72,7 +69,7 @@ def relations(
             subject.tolist(),
             object_.tolist(),
             relation.tolist(),
-            grid.reshape(-1)[where].tolist(),
+            grid.ravel()[where].tolist(),
             strict=True,
         )
     )
@@ -94,41 +91,3 @@ def _asked(
             raise ValueError(f"pair ({subject}, {object_}) must name two of the {size} objects")
         asked[subject, object_] = True
     return asked
-
-
-def best(values: NDArray[np.floating], usable: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
-    """Positions of the `count` largest usable values, largest first, earlier first among equals."""
-    where = np.flatnonzero(usable)
-    if len(where) > count:
-        # Everything at least as large as the last one wanted, so that ties are not cut at random.
-        last = np.partition(values[where], -count)[-count]
-        where = where[values[where] >= last]
-    order = np.argsort(-values[where], kind="stable")[:count]
-    return where[order]
-
-
-def class_log_odds(observation: Observation) -> Tensor:
-    """Log-odds of every relation between the classes of a scene, each without itself, (A, n, n).
-
-        p(r_e = 1 | rest) = E[ sigmoid(ℓ_e(h1) + x_e) ],   h1 from p(h1 | rest)
-
-    with x_e what the observed relations imply for e. The draws are made given all that is observed.
-    An observed unit is taken out of the evidence by reweighting them: w ← w / p(r_e | v, h1). A
-    relation without a unit has log-odds `NO_UNIT`.
-    """
-    machine, evidence = observation.machine, observation.evidence
-    draws = draw_context(machine, evidence)
-    classes, counts = observation.classes, observation.counts
-    units = units_between(machine, classes, classes, counts, counts)
-    logits = machine.relation_logits(units.edges, evidence.v, draws.h1).squeeze(1)
-    log_weight, implied = draws.log_weight, logits.new_zeros(())
-    if bool(observation.observed.any()):
-        observed = units.flat(observation.observed)
-        r = units.flat(observation.holds).to(logits.dtype)
-        gate = machine.gate(units.edges, evidence.v)
-        unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
-        log_weight = log_weight + unseen - machine.relation_term(logits, gate, r, observed)
-        # Where e is not observed, the difference is zero and the weights stay as they are.
-        implied = draws.implied(machine, units.edges, (r * observed).unsqueeze(0)).squeeze(0)
-    on, off = mean_log_p(torch.softmax(log_weight, dim=0), logits + implied)
-    return units.grid((on - off).clamp(min=NO_UNIT), NO_UNIT)

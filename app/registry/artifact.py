@@ -22,6 +22,7 @@ from app.scene.vocabulary import Vocabulary
 
 if TYPE_CHECKING:  # importing torch takes seconds; writing and listing artifacts does without
     from app.boltzmann import BoltzmannMachine
+    from app.boltzmann.closed_form import ClosedForm
     from app.boltzmann.fantasies import Fantasies
     from app.boltzmann.scoring import ContextScorer
 
@@ -54,6 +55,13 @@ class Artifact:
         from app.boltzmann.scoring import ContextScorer
 
         return ContextScorer(self.machine)
+
+    @cached_property
+    def closed_form(self) -> ClosedForm | None:
+        """Prepared log-odds of scenes without given relations, for machines that have them."""
+        from app.boltzmann.closed_form import ClosedForm
+
+        return ClosedForm(self.machine) if ClosedForm.fits(self.machine) else None
 
     @cached_property
     def fantasies(self) -> Fantasies:

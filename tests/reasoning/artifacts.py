@@ -28,6 +28,8 @@ LARGER: dict[str, MachineSpec] = {
     "product-rbm": MachineSpec("product_rbm", V=9, A=4, H1=6, K=3, T=40, form="local"),
     "triway-seed": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, form="seed"),
     "triway-local": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, form="local"),
+    # Wide enough for logits that are as good as normal, and so in closed form without relations.
+    "triway-wide": MachineSpec("triway", V=9, A=4, H1=90, K=3, T=60, C=2, G=2, form="local"),
     "triway-implications": MachineSpec(
         "triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, G=2, form="local"
     ),

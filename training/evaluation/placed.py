@@ -20,7 +20,7 @@ from app.boltzmann import BoltzmannMachine, Triway
 from app.boltzmann.draws import draw_hidden
 from app.boltzmann.edges import find_triples, pair_edges, triple_keys
 from app.boltzmann.mean_field import Evidence
-from app.reasoning.objects import presence_log_odds
+from app.reasoning.drawn import presence_log_odds
 from app.reasoning.units import NO_UNIT, mean_log_p
 from training.batches import SceneTensors
 from training.evaluation.cases import scene_rng

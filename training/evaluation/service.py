@@ -17,7 +17,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.reasoning.calibration import exclusive, false_log_odds, relation_probability
+from app.reasoning.calibration import (
+    exclusive,
+    false_log_odds,
+    relation_probability,
+    sigmoid,
+)
 from app.reasoning.units import NO_UNIT
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES
@@ -124,13 +129,12 @@ def directly(artifact: Artifact) -> Asked:
         return values.clamp(min=NO_UNIT)
 
     def relations(batch: Batch) -> Tensor:
-        values = log_odds(batch)
-        pairs = torch.zeros(values.shape[-2:])
-        p = torch.stack([relation_probability(calibration, one, pairs) for one in values])
-        return exclusive(p, p.mT)[0]
+        values = log_odds(batch).numpy()
+        p = relation_probability(calibration, values, np.zeros(values.shape[-2:], values.dtype))
+        return torch.from_numpy(exclusive(p, p.swapaxes(-1, -2))[0])
 
     def stated(batch: Batch) -> Tensor:
-        return -torch.sigmoid(false_log_odds(calibration, log_odds(batch)))
+        return -torch.from_numpy(sigmoid(false_log_odds(calibration, log_odds(batch).numpy())))
 
     def placed(places: Places) -> Tensor:
         return place(replace(places, counts=places.v))

@@ -10,11 +10,10 @@ import torch
 from app.boltzmann import Triway, build
 from app.boltzmann.log_odds import relation_log_odds
 from app.boltzmann.mean_field import Evidence
-from app.reasoning.evidence import observe
-from app.reasoning.relations import class_log_odds
+from app.reasoning.drawn import DrawnPosterior
 from app.reasoning.units import NO_UNIT
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
-from tests.reasoning.artifacts import LARGER
+from tests.reasoning.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,
@@ -123,7 +122,7 @@ def test_the_split_depends_on_the_scene_alone():
 
 @pytest.mark.parametrize("name", LARGER)
 def test_the_score_is_the_service_s(name):
-    """Observed triples without themselves, the others given them: `class_log_odds`."""
+    """Observed triples without themselves, the others given them."""
     machine = larger_machine(name)
     given = [(0, 1, 2), (1, 5, 0), (3, 2, 6)]
     entry = scene([0, 1, 2, 5, 5, 6], given)
@@ -132,9 +131,10 @@ def test_the_score_is_the_service_s(name):
     things = tuple(SceneObject(str(k), "x", int(c)) for k, c in enumerate(entry.instance_classes))
     first = {int(c): k for k, c in reversed(list(enumerate(entry.instance_classes)))}
     triples = tuple((a, first[i], first[j]) for a, i, j in given)
-    expected = class_log_odds(observe(machine, Scene(things, triples)))
+    given_posterior = DrawnPosterior(artifact_of(machine), Scene(things, triples))
+    expected = given_posterior.relation_log_odds()
     ours = given_score(machine)(batch)[0].clamp(min=NO_UNIT)
-    torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(ours, torch.from_numpy(expected), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", LARGER)

@@ -1,0 +1,83 @@
+"""What a model believes about the rest of a scene, given what is known of it.
+
+The questions are asked of a posterior; how its numbers come about is its own affair.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.reasoning.closed import ClosedPosterior
+from app.reasoning.drawn import DrawnPosterior
+from app.reasoning.present import Present
+from app.registry.artifact import Artifact
+from app.scene.scene import Scene
+
+Floats = NDArray[np.floating[Any]]
+Places = NDArray[np.integer[Any]]
+
+
+class Posterior(Protocol):
+    """Log-odds given a scene.
+
+    Shapes: V classes, A canonical relations, n classes present. No log-odds of a relation is below
+    `units.NO_UNIT`.
+
+    Attributes:
+        present: the classes of the scene.
+    """
+
+    present: Present
+
+    def absent_log_odds(self, absent: Places) -> Floats:
+        """Presence of absent classes (N,), each with all its relations unobserved, (N,)."""
+
+    def relation_log_odds(self) -> Floats:
+        """Every relation between the classes present, each without itself, (A, n, n)."""
+
+    def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
+        """Relations of absent classes (N,), were they there, to places (m,) in `present.classes`.
+
+        What the observed relations imply for those of a candidate is left out.
+
+        Returns:
+            (N, A, m) of the candidate to an anchor, and of the anchor to the candidate.
+        """
+
+    def placed_log_p(
+        self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
+    ) -> Floats:
+        """log p(the candidate stands so to the anchor | it is there, evidence), (N,).
+
+        Args:
+            relation: canonical; from the candidate to the anchor if `outgoing`, else back.
+            anchor: place in `present.classes`.
+        """
+
+    def log_odds_given_rest(self) -> Floats:
+        """Each present class given the scene without it and its relations, (n,)."""
+
+    def reasons(self, rows: Places) -> Floats:
+        """How the log-odds of classes given the rest change by each other class, (N, n).
+
+        With the class, minus without it and its relations; with the context at its mean field on
+        both sides. 0 for the class itself.
+
+        Args:
+            rows: (N,) places in `present.classes`.
+        """
+
+
+def posterior(artifact: Artifact, scene: Scene) -> Posterior:
+    """The posterior of a scene: in closed form where there is one.
+
+    Raises:
+        ValueError: an object outside the machine's classes, or a room type it does not have.
+    """
+    closed = artifact.closed_form
+    if closed is not None and not (scene.relations or scene.relations_complete or scene.poses):
+        return ClosedPosterior(artifact, closed, scene)
+    return DrawnPosterior(artifact, scene)

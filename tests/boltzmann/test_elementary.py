@@ -1,0 +1,64 @@
+"""The compiled elementary functions against numpy's in double precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba import njit
+
+from app.boltzmann import elementary
+
+
+def compiled(name):
+    function = getattr(elementary, name)
+
+    @njit
+    def apply(x, out):
+        for i in range(len(x)):
+            out[i] = function(x[i])
+
+    def run(x):
+        out = np.empty_like(x)
+        apply(x, out)
+        return out
+
+    return run
+
+
+def units_in_the_last_place(found, exact):
+    return np.abs(found.astype(np.float64) - exact) / np.spacing(np.abs(exact).astype(np.float32))
+
+
+@pytest.mark.parametrize("bound", [1e-3, 1.0, 20.0, 86.9])
+def test_exp(bound):
+    x = np.linspace(-bound, bound, 200_001, dtype=np.float32)
+    assert units_in_the_last_place(compiled("exp")(x), np.exp(x.astype(np.float64))).max() < 2
+
+
+def test_exp_stays_finite_and_positive():
+    x = np.array([-np.inf, -1e30, -88.0, 89.0, 1e30, np.inf], dtype=np.float32)
+    found = compiled("exp")(x)
+    assert np.isfinite(found).all()
+    assert (found > 0).all()
+    assert found[0] == found[2] < 1e-37
+    assert found[-1] == found[3] > 1e38
+
+
+def test_log():
+    x = np.concatenate(
+        [
+            np.exp(np.linspace(-86, 88, 200_001)).astype(np.float32),
+            np.linspace(0.5, 2.0, 200_001, dtype=np.float32),
+        ]
+    )
+    exact = np.log(x.astype(np.float64))
+    error = np.abs(compiled("log")(x) - exact)
+    # Near one the value vanishes: there the error is one of the argument.
+    assert (error <= 2 * np.spacing(np.abs(exact).astype(np.float32)) + 1e-8).all()
+    assert compiled("log")(np.ones(1, np.float32))[0] == 0
+
+
+def test_logistic():
+    x = np.linspace(-86, 86, 200_001, dtype=np.float32)
+    exact = 1 / (1 + np.exp(-x.astype(np.float64)))
+    assert units_in_the_last_place(compiled("logistic")(x), exact).max() < 4
