@@ -155,18 +155,27 @@ class ClosedForm:
         return _placed_log_odds(*arguments)
 
     def leave_one_out(
-        self, x: Floats, classes: Classes, confidence: Floats, rows: Classes
+        self,
+        x: Floats,
+        classes: Classes,
+        share: Floats,
+        rows: Classes,
+        common: Floats | None = None,
     ) -> tuple[Floats, Floats]:
         """What the rest of a scene does for the log-odds of each of its classes.
 
         Args:
+            share: (n, H1) what each class adds to x.
             rows: (N,) places in ``classes``.
+            common: (N, n, H1) what two classes add only together; nothing by default.
 
         Returns:
             (n,) the gain of each class given all others; (N, n) the gain of the classes in ``rows``
             where one further class is left out. Its diagonal means nothing.
         """
-        return _leave_one_out(x, self.W[classes], confidence, rows, self._group)
+        if common is None:
+            common = np.zeros((0, 0, 0), dtype=np.float32)
+        return _leave_one_out(x, self.W[classes], share, rows, common, self._group)
 
 
 def _array(tensor: Any) -> NDArray[Any]:
@@ -223,7 +232,7 @@ def _directions(machine: Triway) -> tuple[Floats, Floats]:
 
 # Sums may be taken in any order, so that the compiler can take eight terms at a time. It chooses one
 # order, once. exp and log must stay out of such functions: their cancellations are meant.
-_ANY_ORDER = {"reassoc", "contract"}
+ANY_ORDER = {"reassoc", "contract"}
 
 
 @njit(inline="always")
@@ -244,7 +253,7 @@ def _hidden_logits(bias, W, classes, confidence):
     return x
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=_ANY_ORDER)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
 def _moments(mean, w, first, last):
     """What all units of relations first to last - 1 share: R + M m, d + P·m, and C."""
     A, K, H1 = w.M.shape
@@ -266,7 +275,7 @@ def _moments(mean, w, first, last):
 
 
 @njit(inline="always", error_model="numpy")
-def _residual(w, a, i, j):
+def residual_of(w, a, i, j):
     """w' of (a, i, j), 0 where there is none."""
     row = a * len(w.S) + i
     low, high = w.start[row], w.start[row + 1]
@@ -305,7 +314,7 @@ def _log_odds_of_wide(mean, spread):
     return log(on) - log(off)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=_ANY_ORDER)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
 def _normal(moments, w, first, subjects, log_subjects, objects, log_objects, mean, spread):
     """Mean and √3 σ of the logits of all units from subjects to objects, (relations, n, m)."""
     shared, bias, C = moments
@@ -321,7 +330,7 @@ def _normal(moments, w, first, subjects, log_subjects, objects, log_objects, mea
             for j in range(len(objects)):
                 other = objects[j]
                 total = base + w.o[a, other] + w.n[a, 1] * log_objects[j]
-                total += _residual(w, a, subject, other)
+                total += residual_of(w, a, subject, other)
                 dot = np.float32(0.0)
                 O_j = w.O[other]
                 for k in range(K):
@@ -425,18 +434,18 @@ def _gain(off, rest, growth, product):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _leave_one_out(x, W, confidence, rows, group):
+def _leave_one_out(x, W, share, rows, common, group):
     n, H1 = W.shape
     on, off = np.empty(H1, np.float32), np.empty(H1, np.float32)
     for k in range(H1):
         on[k], off[k] = logistic(x[k]), logistic(-x[k])
-    # e^W of what is judged, e^-cW of what is left out.
+    # e^W of what is judged, e^-share of what is left out.
     growth, fall = np.empty((n, H1), np.float32), np.empty((n, H1), np.float32)
     for i in range(n):
-        presence, weight, up, down = confidence[i], W[i], growth[i], fall[i]
+        weight, added, up, down = W[i], share[i], growth[i], fall[i]
         for k in range(H1):
             up[k] = exp(weight[k])
-            down[k] = exp(-presence * weight[k])
+            down[k] = exp(-added[k])
     # Each lane takes a product of at most `group` factors.
     product = np.empty(max(-(-H1 // group), min(64, H1)), np.float32)
     alone, pairs = np.empty(n, np.float32), np.zeros((len(rows), n), np.float32)
@@ -456,5 +465,9 @@ def _leave_one_out(x, W, confidence, rows, group):
                 down = fall[j]
                 for k in range(H1):
                     both[k] = rest[k] * down[k]
+                if len(common):
+                    twice = common[c, j]
+                    for k in range(H1):
+                        both[k] *= exp(twice[k])
                 pairs[c, j] = _gain(off, both, growth[i], product)
     return alone, pairs

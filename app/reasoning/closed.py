@@ -57,16 +57,17 @@ class ClosedPosterior:
     def log_odds_given_rest(self) -> Floats:
         """Exact."""
         nobody = np.zeros(0, dtype=np.int64)
-        alone, _ = self._closed.leave_one_out(
-            self._x, self.present.classes, self._presence, nobody
-        )
+        alone, _ = self._leave_one_out(nobody)
         return self._b[self.present.classes] + alone
 
     def reasons(self, rows: Places) -> Floats:
         """Exact."""
-        alone, pairs = self._closed.leave_one_out(
-            self._x, self.present.classes, self._presence, rows
-        )
+        alone, pairs = self._leave_one_out(rows)
         change = alone[rows, None] - pairs
         change[np.arange(len(rows)), rows] = 0.0
         return change
+
+    def _leave_one_out(self, rows: Places) -> tuple[Floats, Floats]:
+        classes = self.present.classes
+        share = self._presence[:, None] * self._closed.W[classes]
+        return self._closed.leave_one_out(self._x, classes, share, rows)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from app.reasoning.closed import ClosedPosterior
 from app.reasoning.drawn import DrawnPosterior
 from app.reasoning.present import Present
+from app.reasoning.weighed import WeighedPosterior
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 
@@ -78,6 +79,8 @@ def posterior(artifact: Artifact, scene: Scene) -> Posterior:
         ValueError: an object outside the machine's classes, or a room type it does not have.
     """
     closed = artifact.closed_form
-    if closed is not None and not (scene.relations or scene.relations_complete or scene.poses):
-        return ClosedPosterior(artifact, closed, scene)
-    return DrawnPosterior(artifact, scene)
+    if closed is None:
+        return DrawnPosterior(artifact, scene)
+    if scene.relations or scene.relations_complete or scene.poses:
+        return WeighedPosterior(artifact, closed, scene)
+    return ClosedPosterior(artifact, closed, scene)

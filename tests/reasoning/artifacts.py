@@ -71,9 +71,9 @@ def exact_artifact(name: str, scale: float = 1.3, **changes: object) -> Artifact
     return artifact_of(_random(EXACT[name], torch.float64, scale), **changes)
 
 
-def larger_artifact(name: str, **changes: object) -> Artifact:
-    """Float32, every weight drawn from N(0, .7²)."""
-    return artifact_of(_random(LARGER[name], torch.float32, 0.7), **changes)
+def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifact:
+    """Float32, every weight drawn from N(0, scale²)."""
+    return artifact_of(_random(LARGER[name], torch.float32, scale), **changes)
 
 
 def _random(spec: MachineSpec, dtype: torch.dtype, scale: float) -> BoltzmannMachine:

@@ -110,11 +110,6 @@ def test_the_same_scene_gets_the_same_bits(classes, room):
     assert ask() == first
 
 
-def test_scenes_with_relations_are_drawn():
-    assert isinstance(posterior(ARTIFACT, scene_of([0, 1], [(0, 0, 1)])), DrawnPosterior)
-    assert isinstance(posterior(ARTIFACT, scene_of([0, 1], [], complete=True)), DrawnPosterior)
-
-
 @pytest.mark.parametrize(
     "changes",
     [
