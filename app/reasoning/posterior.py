@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from app.reasoning.closed import ClosedPosterior
 from app.reasoning.drawn import DrawnPosterior
 from app.reasoning.present import Present
-from app.reasoning.weighed import WeighedPosterior
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 
@@ -81,6 +80,4 @@ def posterior(artifact: Artifact, scene: Scene) -> Posterior:
     closed = artifact.closed_form
     if closed is None:
         return DrawnPosterior(artifact, scene)
-    if scene.relations or scene.relations_complete or scene.poses:
-        return WeighedPosterior(artifact, closed, scene)
     return ClosedPosterior(artifact, closed, scene)

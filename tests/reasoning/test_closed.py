@@ -36,9 +36,13 @@ def sigmoid(x):
 
 
 @pytest.fixture(params=range(len(SCENES)))
-def pair(request, monkeypatch):
+def scene(request):
+    return SCENES[request.param]
+
+
+@pytest.fixture
+def pair(scene, monkeypatch):
     monkeypatch.setattr("app.reasoning.evidence.DRAWS", 1 << 15)
-    scene = SCENES[request.param]
     closed = posterior(ARTIFACT, scene)
     assert isinstance(closed, ClosedPosterior)
     return closed, DrawnPosterior(ARTIFACT, scene)
@@ -58,9 +62,7 @@ def test_objects_are_exact(pair):
 def test_reasons_are_exact(pair):
     closed, drawn = pair
     for rows in (np.arange(len(closed.present.classes)), np.array([0])):
-        np.testing.assert_allclose(
-            closed.reasons(rows), drawn.reasons(rows), rtol=1e-4, atol=1e-3
-        )
+        np.testing.assert_allclose(closed.reasons(rows), drawn.reasons(rows), rtol=1e-4, atol=1e-3)
 
 
 def test_relations(pair):
@@ -69,13 +71,12 @@ def test_relations(pair):
     np.testing.assert_allclose(found, expected, atol=TOLERANCE)
 
 
-def test_placements_are_the_relations_of_a_candidate_once_it_is_there(pair):
+def test_placements_are_the_relations_of_a_candidate_once_it_is_there(pair, scene):
     closed, _ = pair
     n = len(closed.present.classes)
     candidates = np.setdiff1d(np.arange(9), closed.present.classes)
     forward, backward = closed.placement_log_odds(candidates, np.arange(n))
     for k, candidate in enumerate(candidates):
-        scene = closed.scene
         thing = SceneObject("candidate", "x", int(candidate))
         there = posterior(ARTIFACT, dataclasses.replace(scene, objects=(*scene.objects, thing)))
         expected = there.relation_log_odds()
