@@ -3,7 +3,8 @@
     missing    softmax(log-odds / T): the class that was taken away, given that exactly one was
     placed     softmax(log-odds / T + w·log p(relation to the anchor)): given where it stood as well
     outlier    the object is an intruder, where half of the scenes are clean
-    relation   an annotator would list this relation for this pair of instances
+    relation   an annotator would list this relation for this pair of instances; fitted apart for
+               scenes of which nothing is said, and for those of which half of the pairs are told
     misplaced  the relation is false, where one triple in half of the scenes was altered
 
 Temperatures minimise the negative log-likelihood; the others are logistic regressions (Platt
@@ -16,6 +17,8 @@ Weinberger, "On calibration of modern neural networks" (2017).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -25,17 +28,20 @@ from sklearn.linear_model import LogisticRegression
 
 from app.reasoning import misplaced
 from app.reasoning.posterior import posterior
-from app.registry import Artifact, Calibration, CountSlope, Slope
+from app.reasoning.units import NO_UNIT
+from app.registry import Artifact, Calibration, CountSlope, PairSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject
 from training.batches import SceneTensors
 from training.datasets import EncodedScene
 from training.evaluation.alarms import alarm_threshold, judged_scenes
 from training.evaluation.missing import ObjectScore, machine_score, removed_objects
 from training.evaluation.outliers import IntruderScores, intruder_scores
-from training.evaluation.relations import machine_score as relation_score
 from training.trainer import subset
 
+Triple: TypeAlias = tuple[int, int, int]
+
 _SCENES = 1500
+_NO_EXAMPLE = np.zeros((0, 4))
 # Cases a scene: with one of some 300 scenes, the weight moved by a third from draw to draw.
 _PLACED_CASES = 2
 _MISPLACED_SCENES = 300
@@ -72,7 +78,8 @@ def calibrate(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> Calibr
         update={
             "placed_temperature": temperature,
             "placed_relation_weight": weight,
-            "relation": fit_relations(artifact, related),
+            "relation": fit_relations(artifact, related.scenes),
+            "relation_given": fit_relations(artifact, related.scenes, np.random.default_rng(seed)),
             "misplaced": fit_misplaced(artifact, related.scenes[:_MISPLACED_SCENES], seed),
         }
     )
@@ -111,45 +118,84 @@ def fit_outlier(
     return entry, _sigmoid(alarm_threshold(logits, scores, scenes, rng))
 
 
-def fit_relations(artifact: Artifact, scenes: SceneTensors) -> tuple[CountSlope, ...]:
-    """Per canonical relation, from class-level log-odds to instance pairs."""
-    score = relation_score(artifact.machine)
-    structure = artifact.vocabulary.structure
+def fit_relations(
+    artifact: Artifact, scenes: Sequence[EncodedScene], rng: np.random.Generator | None = None
+) -> tuple[PairSlope, ...]:
+    """Per canonical relation, from class-level log-odds to instance pairs.
+
+    Args:
+        rng: says which pairs of a scene are told about, and only the others are asked; without it
+            nothing is given, and all are asked.
+    """
     rows: list[list[NDArray[np.float64]]] = [[] for _ in range(artifact.machine.spec.A)]
-    for start in range(0, len(scenes), 32):
-        index = torch.arange(start, min(start + 32, len(scenes)))
-        with torch.no_grad():
-            values = score(scenes.batch(index)).double().numpy()
-        for row, k in enumerate(index.tolist()):
-            for a, examples in enumerate(_instance_pairs(scenes.scenes[k], values[row], structure)):
-                rows[a].append(examples)
-    return tuple(_fit_relation(np.concatenate(examples)) for examples in rows)
+    for encoded in scenes:
+        asked = np.ones((len(encoded.instance_classes),) * 2, dtype=np.bool_)
+        told: list[Triple] = []
+        if rng is not None:
+            asked, told = told_pairs(encoded, artifact.vocabulary.structure, rng)
+            if not told:
+                continue
+        scene = replace(scene_of(encoded, range(len(asked)), told), room_type=None)
+        values = posterior(artifact, scene).relation_log_odds()
+        structure = artifact.vocabulary.structure
+        for a, examples in enumerate(_instance_pairs(encoded, values, structure, asked)):
+            rows[a].append(examples)
+    return tuple(_fit_relation(np.concatenate(found or [_NO_EXAMPLE])) for found in rows)
+
+
+def told_pairs(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], list[Triple]]:
+    """Half of the pairs of a scene are told about: those left to ask (N, N), and what is told.
+
+    Which ones is decided without looking at what holds between them: had half of the relations been
+    given, a pair of which nothing is said would be likelier to have none.
+    """
+    size = len(encoded.instance_classes)
+    half = np.triu(rng.random((size, size)) < 0.5, 1)
+    told = half | half.T
+    plain = ~structure[encoded.instance_classes]
+    triples = np.argwhere(encoded.instance_holds & told & plain[:, None] & plain).tolist()
+    return ~told, [(int(a), int(x), int(y)) for a, x, y in triples]
 
 
 def _instance_pairs(
-    scene: EncodedScene, values: NDArray[np.float64], structure: NDArray[np.bool_]
+    scene: EncodedScene,
+    values: NDArray[np.floating[Any]],
+    structure: NDArray[np.bool_],
+    asked: NDArray[np.bool_],
 ) -> list[NDArray[np.float64]]:
-    """Per relation, (pairs, 3): class log-odds, log n_i + log n_j, and whether it was listed."""
+    """Per relation, (pairs, 4): class log-odds, log n_i + log n_j, log of the scene's classes, and
+    whether it was listed.
+    """
     evidence = scene.evidence
     place = np.searchsorted(evidence.classes, scene.instance_classes)
     logs = np.log(evidence.counts[place])
     usable = ~structure[scene.instance_classes]
-    pair = usable[:, None] & usable[None, :] & ~np.eye(len(place), dtype=np.bool_)
-    both = logs[:, None] + logs[None, :]
-    examples = []
-    for a in range(len(values)):
-        logit = values[a][place[:, None], place[None, :]]
-        # What is not listed is off, left open by geometry or not: a listing is what is promised.
-        kept = pair & np.isfinite(logit)
-        examples.append(np.stack([logit[kept], both[kept], scene.instance_holds[a][kept]], 1))
-    return examples
+    pair = asked & usable[:, None] & usable[None, :] & ~np.eye(len(place), dtype=np.bool_)
+    both = (logs[:, None] + logs[None, :])[pair]
+    size = np.full(len(both), np.log(len(evidence.classes)))
+    # What is not listed is off, left open by geometry or not: a listing is what is promised.
+    return [
+        np.stack(
+            [
+                values[a][place[:, None], place[None, :]][pair],
+                *(both, size),
+                scene.instance_holds[a][pair],
+            ],
+            1,
+        )
+        for a in range(len(values))
+    ]
 
 
-def _fit_relation(examples: NDArray[np.float64]) -> CountSlope:
-    if len(np.unique(examples[:, 2])) < 2:
-        return CountSlope()
-    slope, count, intercept = _logistic(examples[:, :2], examples[:, 2] > 0)
-    return CountSlope(intercept=intercept, slope=slope, log_count=count)
+def _fit_relation(examples: NDArray[np.float64]) -> PairSlope:
+    # A relation that has no unit in the machine tells nothing of how log-odds are to be read.
+    examples = examples[examples[:, 0] > NO_UNIT]
+    if len(np.unique(examples[:, 3])) < 2:
+        return PairSlope()
+    slope, count, classes, intercept = _logistic(examples[:, :3], examples[:, 3] > 0)
+    return PairSlope(intercept=intercept, slope=slope, log_count=count, log_classes=classes)
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.registry.description import Calibration
+from app.registry.description import Calibration, PairSlope
 
 Floats = NDArray[np.floating[Any]]
 
@@ -23,15 +23,27 @@ def softmax(scores: Floats) -> Floats:
     return weight / weight.sum()
 
 
-def relation_probability(calibration: Calibration, log_odds: Floats, log_count: Floats) -> Floats:
+def relation_slopes(calibration: Calibration, *, given: bool) -> tuple[PairSlope, ...]:
+    """The entries for scenes of which some relations are given, or none."""
+    return (given and calibration.relation_given) or calibration.relation
+
+
+def relation_probability(
+    entries: tuple[PairSlope, ...], log_odds: Floats, log_count: Floats, classes: int
+) -> Floats:
     """Probability that a relation is listed for one pair of instances.
 
     Args:
+        entries: one a relation; see `relation_slopes`.
         log_odds: (..., A, n, m) of the class-level units.
         log_count: (n, m), log of the instance pairs of both classes.
+        classes: how many distinct ones the scene has.
     """
-    entries = calibration.relation
-    table = np.array([(e.intercept, e.slope, e.log_count) for e in entries], dtype=log_odds.dtype)
+    size = float(np.log(classes))
+    table = np.array(
+        [(e.intercept + e.log_classes * size, e.slope, e.log_count) for e in entries],
+        dtype=log_odds.dtype,
+    )
     intercept, slope, weight = table.T[:, :, None, None]
     return sigmoid(intercept + slope * log_odds + weight * log_count)
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from app.reasoning.answers import Placement
 from app.reasoning.calibration import exclusive, relation_probability
 from app.reasoning.posterior import Posterior
-from app.registry.description import Calibration
+from app.registry.description import PairSlope
 from app.scene.relations import RELATIONS, opposite
 
 PLACES = 3
@@ -19,7 +19,7 @@ def placements(
     given: Posterior,
     candidates: NDArray[np.int64],
     structure: NDArray[np.bool_],
-    calibration: Calibration,
+    entries: tuple[PairSlope, ...],
 ) -> list[tuple[Placement, ...]]:
     """The likeliest relations of each candidate to what is present, best first.
 
@@ -29,6 +29,7 @@ def placements(
     Args:
         candidates: (N,) absent classes.
         structure: (V,).
+        entries: calibration of the relations.
     """
     present = given.present
     anchors = np.flatnonzero(~structure[present.classes])
@@ -37,10 +38,11 @@ def placements(
     forward, backward = given.placement_log_odds(candidates, anchors)
     relations = forward.shape[1]
     log_counts = np.log(present.counts[anchors]).astype(forward.dtype)[None]
+    classes = len(present.classes) + 1
     both = exclusive(
         # One instance of the candidate: (N, A, 1, m).
-        relation_probability(calibration, forward[:, :, None], log_counts),
-        relation_probability(calibration, backward[:, :, None], log_counts),
+        relation_probability(entries, forward[:, :, None], log_counts, classes),
+        relation_probability(entries, backward[:, :, None], log_counts, classes),
     )
     p = np.concatenate(both, axis=1).reshape(len(candidates), -1)
     index = np.argsort(-p, axis=1, kind="stable")[:, :PLACES]

@@ -71,6 +71,11 @@ class Posterior(Protocol):
         """
 
 
+def relations_given(scene: Scene) -> bool:
+    """Whether the scene says anything of how its objects stand to each other."""
+    return bool(scene.relations or scene.relations_complete or scene.poses)
+
+
 def posterior(artifact: Artifact, scene: Scene) -> Posterior:
     """The posterior of a scene: in closed form where there is one.
 

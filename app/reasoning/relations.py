@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.reasoning.answers import RelationAnswer
-from app.reasoning.calibration import exclusive, relation_probability
-from app.reasoning.posterior import posterior
+from app.reasoning.calibration import exclusive, relation_probability, relation_slopes
+from app.reasoning.posterior import posterior, relations_given
 from app.reasoning.ranking import best
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, OPPOSITES
@@ -51,7 +51,8 @@ def relations(
         return ()
     log_odds = given.relation_log_odds()
     log_counts = np.log(given.present.counts).astype(log_odds.dtype)
-    p = relation_probability(artifact.calibration, log_odds, log_counts[:, None] + log_counts)
+    entries = relation_slopes(artifact.calibration, given=relations_given(scene))
+    p = relation_probability(entries, log_odds, log_counts[:, None] + log_counts, len(log_counts))
     p, backward = exclusive(p, p.swapaxes(1, 2))
     names = CANONICAL[: len(p)]
     if include_opposites:

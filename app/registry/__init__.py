@@ -7,6 +7,7 @@ from app.registry.description import (
     DataSource,
     Description,
     Metric,
+    PairSlope,
     Slope,
     VocabularyEntry,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "Manifest",
     "Metric",
     "ModelSet",
+    "PairSlope",
     "RegistryError",
     "Slope",
     "Store",

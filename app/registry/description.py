@@ -48,12 +48,22 @@ class Frozen(BaseModel):
 class CountSlope(Frozen):
     """A logit z of an answer, made a log-odds: intercept + slope·z + log_count·log n.
 
-    What n counts is the answer's: instance pairs for relations, objects of the scene for outliers.
+    What n counts is the answer's: classes of the scene for outliers.
     """
 
     intercept: float = 0.0
     slope: float = 1.0
     log_count: float = 0.0
+
+
+class PairSlope(CountSlope):
+    """The same for a relation between two objects, and + log_classes·log of the scene's classes.
+
+    n counts the instance pairs of both classes. In a room of many things an annotator lists fewer
+    of what each could be related to.
+    """
+
+    log_classes: float = 0.0
 
 
 class Slope(Frozen):
@@ -75,6 +85,7 @@ class Calibration(Frozen):
         outlier: presence log-odds to the log-odds of being an intruder.
         outlier_threshold: probability from which an object is called an outlier.
         relation: one entry a canonical relation.
+        relation_given: the same where some relations of the scene are given; `relation` if empty.
         misplaced: relation log-odds to the log-odds of being false.
     """
 
@@ -83,13 +94,14 @@ class Calibration(Frozen):
     placed_relation_weight: float = 1.0
     outlier: CountSlope = CountSlope()
     outlier_threshold: Annotated[float, Field(ge=0, le=1)] = 0.5
-    relation: tuple[CountSlope, ...]
+    relation: tuple[PairSlope, ...]
+    relation_given: tuple[PairSlope, ...] = ()
     misplaced: Slope = Slope()
 
     @classmethod
     def neutral(cls, relations: int) -> Self:
         """The calibration that changes nothing, for A canonical relations."""
-        return cls(relation=(CountSlope(),) * relations)
+        return cls(relation=(PairSlope(),) * relations)
 
 
 class ClassEntry(Frozen):
@@ -195,6 +207,11 @@ class Description(Frozen):
             ("V", "vocabulary objects", len(words.objects)),
             ("A", "vocabulary relations", len(words.relations)),
             ("A", "calibration relations", len(self.calibration.relation)),
+            (
+                "A",
+                "calibration relations given others",
+                len(self.calibration.relation_given or self.calibration.relation),
+            ),
         ):
             if self.spec.get(name) != length:
                 raise ValueError(f"{length} {what}, but {name} = {self.spec.get(name)} in the spec")

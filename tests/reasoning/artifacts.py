@@ -8,7 +8,7 @@ import torch
 
 from app.boltzmann import BoltzmannMachine, MachineSpec, build
 from app.registry.artifact import Artifact
-from app.registry.description import Calibration, CountSlope, Slope
+from app.registry.description import Calibration, CountSlope, PairSlope, Slope
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL
 
@@ -42,7 +42,7 @@ ROOMS = ("bedroom", "office")
 def calibration(relations: int, **changes: object) -> Calibration:
     """Changes nothing but the signs: unlikely objects are intruders, unlikely relations false."""
     neutral = {
-        "relation": (CountSlope(),) * relations,
+        "relation": (PairSlope(),) * relations,
         "outlier": CountSlope(slope=-1.0),
         "misplaced": Slope(slope=-1.0),
     }

@@ -9,7 +9,7 @@ import pytest
 
 from app.reasoning import missing, outliers, relations
 from app.reasoning.calibration import exclusive, relation_probability
-from app.registry.description import Calibration, CountSlope, Slope
+from app.registry.description import CountSlope, PairSlope, Slope
 from tests.reasoning.artifacts import larger_artifact, scene_of
 
 
@@ -18,16 +18,32 @@ def sigmoid(x: float) -> float:
 
 
 def test_relations_have_a_calibration_each():
-    entries = tuple(CountSlope(intercept=a, slope=1 + a, log_count=-a) for a in range(4))
-    calibration = Calibration(relation=entries)
+    entries = tuple(
+        PairSlope(intercept=a, slope=1 + a, log_count=-a, log_classes=0.5 * a) for a in range(4)
+    )
     log_odds = np.arange(16.0).reshape(4, 2, 2) / 8 - 1
     log_count = np.array([[0.0, 0.5], [1.0, 2.0]])
-    p = relation_probability(calibration, log_odds, log_count)
+    p = relation_probability(entries, log_odds, log_count, 7)
     for a in range(4):
         for x in range(2):
             for y in range(2):
                 z = a + (1 + a) * float(log_odds[a, x, y]) - a * float(log_count[x, y])
+                z += 0.5 * a * math.log(7)
                 assert float(p[a, x, y]) == pytest.approx(sigmoid(z), abs=1e-6)
+
+
+def test_scenes_that_state_relations_have_entries_of_their_own():
+    alone, given = (PairSlope(intercept=b, slope=0.0, log_classes=-0.5) for b in (-1.0, 1.0))
+    artifact = larger_artifact("triway-local", relation=(alone,) * 4, relation_given=(given,) * 4)
+    for stated, b in ((None, -1.0), ([(0, 0, 1)], 1.0)):
+        scene = scene_of([0, 1, 2], stated)
+        wanted = pytest.approx(sigmoid(b - 0.5 * math.log(3)) if b < 0 else 0.5, abs=1e-6)
+        assert all(answer.probability == wanted for answer in relations(artifact, scene))
+        # A missing thing would be one more class; and of a(x, y) and a(y, x) at most one holds.
+        p = min(0.5, sigmoid(b - 0.5 * math.log(4)))
+        for answer in missing(artifact, scene):
+            for place in answer.placements:
+                assert place.probability == pytest.approx(p, abs=1e-6)
 
 
 def test_exclusive_scales_only_where_it_must():
@@ -38,7 +54,7 @@ def test_exclusive_scales_only_where_it_must():
 
 def test_instances_count_in_relations():
     """Three chairs and two lamps: log 6 a pair of classes, log 9 among the chairs."""
-    entry = CountSlope(intercept=-2.0, slope=0.0, log_count=-0.5)
+    entry = PairSlope(intercept=-2.0, slope=0.0, log_count=-0.5)
     artifact = larger_artifact("triway-local", relation=(entry,) * 4)
     answers = relations(artifact, scene_of([3, 3, 3, 1, 1]), top_k=100)
     p = {(a.subject, a.object): a.probability for a in answers}
@@ -47,7 +63,7 @@ def test_instances_count_in_relations():
 
 
 def test_placements_use_the_calibration_of_relations():
-    entry = CountSlope(intercept=-1.0, slope=0.0, log_count=0.25)
+    entry = PairSlope(intercept=-1.0, slope=0.0, log_count=0.25)
     artifact = larger_artifact("triway-local", relation=(entry,) * 4)
     for answer in missing(artifact, scene_of([3, 3])):
         for place in answer.placements:

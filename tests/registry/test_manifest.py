@@ -11,7 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from app.registry import ArtifactError, Calibration, CountSlope, Description, Manifest
+from app.registry import (
+    ArtifactError,
+    Calibration,
+    CountSlope,
+    Description,
+    Manifest,
+    PairSlope,
+)
 from app.registry.description import VocabularyEntry
 from app.scene.relations import CANONICAL
 from tests.registry.small_artifacts import VOCABULARY, description, resign
@@ -38,6 +45,9 @@ json_values = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(text, inner, max_size=3),
     max_leaves=8,
 )
+pair_slopes = st.builds(
+    PairSlope, intercept=number, slope=number, log_count=number, log_classes=number
+)
 count_slopes = st.builds(CountSlope, intercept=number, slope=number, log_count=number)
 metrics = st.tuples(number, number, number).map(
     lambda v: {"value": v[0], "low": min(v[1:]), "high": max(v[1:])}
@@ -57,7 +67,8 @@ changes = st.fixed_dictionaries(
             missing_temperature=st.floats(0.01, 100),
             outlier=count_slopes,
             outlier_threshold=st.floats(0, 1),
-            relation=st.tuples(*[count_slopes] * 4),
+            relation=st.tuples(*[pair_slopes] * 4),
+            relation_given=st.just(()) | st.tuples(*[pair_slopes] * 4),
         ),
         "metrics": st.lists(
             st.builds(
@@ -243,7 +254,7 @@ def test_is_frozen() -> None:
 
 def test_neutral_calibration_changes_nothing() -> None:
     neutral = Calibration.neutral(4)
-    assert neutral.relation == (CountSlope(intercept=0, slope=1, log_count=0),) * 4
+    assert neutral.relation == (PairSlope(intercept=0, slope=1, log_count=0, log_classes=0),) * 4
     assert (neutral.missing_temperature, neutral.placed_temperature) == (1, 1)
     assert (neutral.placed_relation_weight, neutral.misplaced.slope) == (1, 1)
     assert neutral.outlier == CountSlope(intercept=0, slope=1, log_count=0)

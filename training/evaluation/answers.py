@@ -19,7 +19,7 @@ from app.reasoning import misplaced, missing, outliers, relations
 from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject, canonicalise
 from training.batches import SceneTensors
-from training.calibrate import altered_case, placed_case, scene_of
+from training.calibrate import altered_case, placed_case, scene_of, told_pairs
 from training.datasets import EncodedScene
 from training.evaluation.cases import scene_rng
 from training.evaluation.metrics import Scored
@@ -107,24 +107,15 @@ def ask_relations(
 def ask_given(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Relations between some pairs of a scene, given those between the others.
-
-    Which pairs are told about is decided without looking at what holds between them: had half of
-    the relations been given, a pair of which nothing is said would be likelier to have none.
-    """
-    size = len(encoded.instance_classes)
-    half = np.triu(rng.random((size, size)) < 0.5, 1)
-    told = half | half.T
-    plain = ~artifact.vocabulary.structure[encoded.instance_classes]
-    triples = np.argwhere(encoded.instance_holds & told & plain[:, None] & plain).tolist()
-    if not triples:
+    """Relations between some pairs of a scene, given those between the others."""
+    asked, given = told_pairs(encoded, artifact.vocabulary.structure, rng)
+    if not given:
         return None
-    given = [(int(a), int(x), int(y)) for a, x, y in triples]
-    scene = replace(scene_of(encoded, range(size), given), room_type=None)
+    scene = replace(scene_of(encoded, range(len(asked)), given), room_type=None)
     found: Answered = []
     for answer in relations(artifact, scene):
         triple = CANONICAL.index(answer.relation), answer.subject, answer.object
-        if not told[triple[1:]]:
+        if asked[triple[1:]]:
             found.append((answer.probability, bool(encoded.instance_holds[triple])))
     return found or None
 

@@ -21,6 +21,7 @@ from app.reasoning.calibration import (
     exclusive,
     false_log_odds,
     relation_probability,
+    relation_slopes,
     sigmoid,
 )
 from app.reasoning.units import NO_UNIT
@@ -130,7 +131,14 @@ def directly(artifact: Artifact) -> Asked:
 
     def relations(batch: Batch) -> Tensor:
         values = log_odds(batch).numpy()
-        p = relation_probability(calibration, values, np.zeros(values.shape[-2:], values.dtype))
+        pairs = np.zeros(values.shape[-2:], values.dtype)
+        told = (batch.observed & (batch.holds > 0)).flatten(1).any(1).tolist()
+        sizes = (batch.classes >= 0).sum(1).tolist()
+        rows = [
+            relation_probability(relation_slopes(calibration, given=given), value, pairs, size)
+            for value, given, size in zip(values, told, sizes, strict=True)
+        ]
+        p = np.stack(rows)
         return torch.from_numpy(exclusive(p, p.swapaxes(-1, -2))[0])
 
     def stated(batch: Batch) -> Tensor:
