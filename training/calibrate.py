@@ -5,6 +5,7 @@
     outlier    the object is an intruder, where half of the scenes are clean
     relation   an annotator would list this relation for this pair of instances; fitted apart for
                scenes of which nothing is said, and for those of which half of the pairs are told
+    placement  the same for a pair of which one was taken away
     misplaced  the relation is false, where one triple in half of the scenes was altered
 
 Temperatures minimise the negative log-likelihood; the others are logistic regressions (Platt
@@ -27,6 +28,7 @@ from scipy.optimize import minimize, minimize_scalar
 from sklearn.linear_model import LogisticRegression
 
 from app.reasoning import misplaced
+from app.reasoning.placements import PLACES
 from app.reasoning.posterior import posterior
 from app.reasoning.units import NO_UNIT
 from app.registry import Artifact, Calibration, CountSlope, PairSlope, Slope
@@ -41,7 +43,12 @@ from training.trainer import subset
 Triple: TypeAlias = tuple[int, int, int]
 
 _SCENES = 1500
-_NO_EXAMPLE = np.zeros((0, 4))
+# An answer lists the best 20 relations by default.
+_LISTED = 20
+_OF_THE_REST = 0.02
+_ROUNDS = 3
+# Columns of an example, the scene first.
+_RELATION, _LOGIT, _TRUTH = 1, 2, 5
 # Cases a scene: with one of some 300 scenes, the weight moved by a third from draw to draw.
 _PLACED_CASES = 2
 _MISPLACED_SCENES = 300
@@ -79,6 +86,7 @@ def calibrate(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> Calibr
             "placed_temperature": temperature,
             "placed_relation_weight": weight,
             "relation": fit_relations(artifact, related.scenes),
+            "placement": fit_placements(artifact, related.scenes, seed),
             "relation_given": fit_relations(artifact, related.scenes, np.random.default_rng(seed)),
             "misplaced": fit_misplaced(artifact, related.scenes[:_MISPLACED_SCENES], seed),
         }
@@ -127,8 +135,8 @@ def fit_relations(
         rng: says which pairs of a scene are told about, and only the others are asked; without it
             nothing is given, and all are asked.
     """
-    rows: list[list[NDArray[np.float64]]] = [[] for _ in range(artifact.machine.spec.A)]
-    for encoded in scenes:
+    blocks: list[NDArray[np.float64]] = []
+    for number, encoded in enumerate(scenes):
         asked = np.ones((len(encoded.instance_classes),) * 2, dtype=np.bool_)
         told: list[Triple] = []
         if rng is not None:
@@ -138,9 +146,92 @@ def fit_relations(
         scene = replace(scene_of(encoded, range(len(asked)), told), room_type=None)
         values = posterior(artifact, scene).relation_log_odds()
         structure = artifact.vocabulary.structure
-        for a, examples in enumerate(_instance_pairs(encoded, values, structure, asked)):
-            rows[a].append(examples)
-    return tuple(_fit_relation(np.concatenate(found or [_NO_EXAMPLE])) for found in rows)
+        blocks.append(_instance_pairs(number, encoded, values, structure, asked))
+    return _fit_listed(blocks, artifact.machine.spec.A, _LISTED)
+
+
+def fit_placements(
+    artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
+) -> tuple[PairSlope, ...]:
+    """The same for the relations of an object that was taken away to those that stayed."""
+    rng = np.random.default_rng(seed)
+    structure = artifact.vocabulary.structure
+    blocks: list[NDArray[np.float64]] = []
+    for number, encoded in enumerate([*scenes] * _PLACED_CASES):
+        taken = taken_away(encoded, structure, rng)
+        if taken is None:
+            continue
+        target, kept = taken
+        gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
+        given = posterior(artifact, replace(scene_of(encoded, kept, ()), room_type=None))
+        present = given.present
+        anchors = np.flatnonzero(~structure[present.classes])
+        both = given.placement_log_odds(np.array([target]), anchors)
+        other = np.array(kept)[present.first[anchors]]
+        holds = encoded.instance_holds
+        truths = (holds[:, gone, other], holds[:, other, gone])
+        for values, truth in zip(both, truths, strict=True):
+            a, place = (part.ravel() for part in np.indices(truth.shape))
+            size = np.full(len(a), np.log(len(present.classes) + 1))
+            count = np.log(present.counts[anchors])[place]
+            columns = (np.full(len(a), number), a, values[0].ravel(), count, size, truth.ravel())
+            blocks.append(np.stack(columns, 1).astype(np.float64))
+    return _fit_listed(blocks, artifact.machine.spec.A, PLACES)
+
+
+def taken_away(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[int, list[int]] | None:
+    """(a class drawn from those that may be missing, the instances of all others)."""
+    classes = encoded.evidence.classes
+    removable = classes[~structure[classes]]
+    if len(removable) < 2:
+        return None
+    target = int(rng.choice(removable))
+    return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
+
+
+def _fit_listed(
+    blocks: list[NDArray[np.float64]], relations: int, listed: int
+) -> tuple[PairSlope, ...]:
+    """Fits of all relations to examples of which an answer lists the best so many of each scene.
+
+    These decide: what is chosen for its high log-odds is listed by annotators less often than
+    log-odds alike among all pairs. The others count a little.
+    """
+    examples = np.concatenate(blocks or [np.zeros((0, _TRUTH + 1))])
+    # A relation that has no unit in the machine tells nothing of how log-odds are to be read.
+    examples = examples[examples[:, _LOGIT] > NO_UNIT]
+    slopes = _fit_each(examples, relations, np.ones(len(examples)))
+    for _ in range(_ROUNDS):
+        weight = np.where(_among_best(examples, slopes, listed), 1.0, _OF_THE_REST)
+        slopes = _fit_each(examples, relations, weight)
+    return slopes
+
+
+def _among_best(
+    examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
+) -> NDArray[np.bool_]:
+    """Which of the examples are among the best so many of their scene."""
+    table = np.array([(s.slope, s.log_count, s.log_classes, s.intercept) for s in slopes])
+    weights = table[examples[:, _RELATION].astype(np.int64)]
+    logits = (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1) + weights[:, 3]
+    order = np.lexsort((-logits, examples[:, 0]))
+    scene = examples[order, 0]
+    rank = np.arange(len(order)) - np.searchsorted(scene, scene)
+    found = np.zeros(len(order), dtype=np.bool_)
+    found[order] = rank < listed
+    return found
+
+
+def _fit_each(
+    examples: NDArray[np.float64], relations: int, weight: NDArray[np.float64]
+) -> tuple[PairSlope, ...]:
+    fitted = []
+    for a in range(relations):
+        own = examples[:, _RELATION] == a
+        fitted.append(_fit_relation(examples[own], weight[own]))
+    return tuple(fitted)
 
 
 def told_pairs(
@@ -160,13 +251,14 @@ def told_pairs(
 
 
 def _instance_pairs(
+    number: int,
     scene: EncodedScene,
     values: NDArray[np.floating[Any]],
     structure: NDArray[np.bool_],
     asked: NDArray[np.bool_],
-) -> list[NDArray[np.float64]]:
-    """Per relation, (pairs, 4): class log-odds, log n_i + log n_j, log of the scene's classes, and
-    whether it was listed.
+) -> NDArray[np.float64]:
+    """(examples, 6): scene, relation, class log-odds, log n_i + log n_j, log of all classes,
+    and whether it was listed.
     """
     evidence = scene.evidence
     place = np.searchsorted(evidence.classes, scene.instance_classes)
@@ -174,27 +266,22 @@ def _instance_pairs(
     usable = ~structure[scene.instance_classes]
     pair = asked & usable[:, None] & usable[None, :] & ~np.eye(len(place), dtype=np.bool_)
     both = (logs[:, None] + logs[None, :])[pair]
-    size = np.full(len(both), np.log(len(evidence.classes)))
-    # What is not listed is off, left open by geometry or not: a listing is what is promised.
-    return [
-        np.stack(
-            [
-                values[a][place[:, None], place[None, :]][pair],
-                *(both, size),
-                scene.instance_holds[a][pair],
-            ],
-            1,
-        )
-        for a in range(len(values))
-    ]
+    columns = []
+    for a in range(len(values)):
+        logit = values[a][place[:, None], place[None, :]][pair]
+        size = np.full(len(logit), np.log(len(evidence.classes)))
+        # What is not listed is off, left open by geometry or not: a listing is what is promised.
+        truth = scene.instance_holds[a][pair]
+        which = (np.full(len(logit), number), np.full(len(logit), a))
+        columns.append(np.stack([*which, logit, both, size, truth], 1))
+    return np.concatenate(columns)
 
 
-def _fit_relation(examples: NDArray[np.float64]) -> PairSlope:
-    # A relation that has no unit in the machine tells nothing of how log-odds are to be read.
-    examples = examples[examples[:, 0] > NO_UNIT]
-    if len(np.unique(examples[:, 3])) < 2:
+def _fit_relation(examples: NDArray[np.float64], weight: NDArray[np.float64]) -> PairSlope:
+    truth = examples[:, _TRUTH] > 0
+    if len(np.unique(truth)) < 2:
         return PairSlope()
-    slope, count, classes, intercept = _logistic(examples[:, :3], examples[:, 3] > 0)
+    slope, count, classes, intercept = _logistic(examples[:, _LOGIT:_TRUTH], truth, weight)
     return PairSlope(intercept=intercept, slope=slope, log_count=count, log_classes=classes)
 
 
@@ -319,9 +406,13 @@ def scene_of(
     return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
 
 
-def _logistic(features: NDArray[np.float64], truth: NDArray[np.bool_]) -> list[float]:
+def _logistic(
+    features: NDArray[np.float64],
+    truth: NDArray[np.bool_],
+    weight: NDArray[np.float64] | None = None,
+) -> list[float]:
     """Coefficients and intercept of an (almost) unpenalised logistic regression."""
-    fit = LogisticRegression(C=1e6, max_iter=1000).fit(features, truth)
+    fit = LogisticRegression(C=1e6, max_iter=1000).fit(features, truth, weight)
     return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]
 
 

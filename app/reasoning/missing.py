@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.reasoning.answers import MissingAnswer
-from app.reasoning.calibration import missing_scores, placed_scores, relation_slopes, softmax
+from app.reasoning.calibration import missing_scores, placed_scores, softmax
 from app.reasoning.placements import placements
-from app.reasoning.posterior import posterior, relations_given
+from app.reasoning.posterior import posterior
 from app.reasoning.ranking import best
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, canonicalise
@@ -60,7 +60,7 @@ def missing(
         row = int(given.present.row[anchor])
         log_p = given.placed_log_p(absent, relation, row, outgoing=outgoing)
         scores = placed_scores(calibration, log_odds, log_p)
-    entries = relation_slopes(calibration, given=relations_given(scene))
+    entries = calibration.placement or calibration.relation
     # By score: probabilities of far classes may all round to zero.
     where = best(scores, chosen, top_k)
     labels = artifact.vocabulary.labels

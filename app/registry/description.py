@@ -86,6 +86,7 @@ class Calibration(Frozen):
         outlier_threshold: probability from which an object is called an outlier.
         relation: one entry a canonical relation.
         relation_given: the same where some relations of the scene are given; `relation` if empty.
+        placement: the same for a missing object and one that is there; `relation` if empty.
         misplaced: relation log-odds to the log-odds of being false.
     """
 
@@ -96,6 +97,7 @@ class Calibration(Frozen):
     outlier_threshold: Annotated[float, Field(ge=0, le=1)] = 0.5
     relation: tuple[PairSlope, ...]
     relation_given: tuple[PairSlope, ...] = ()
+    placement: tuple[PairSlope, ...] = ()
     misplaced: Slope = Slope()
 
     @classmethod
@@ -207,10 +209,12 @@ class Description(Frozen):
             ("V", "vocabulary objects", len(words.objects)),
             ("A", "vocabulary relations", len(words.relations)),
             ("A", "calibration relations", len(self.calibration.relation)),
-            (
-                "A",
-                "calibration relations given others",
-                len(self.calibration.relation_given or self.calibration.relation),
+            *(
+                ("A", f"calibration {kind}", len(entries or self.calibration.relation))
+                for kind, entries in (
+                    ("relations given others", self.calibration.relation_given),
+                    ("placements", self.calibration.placement),
+                )
             ),
         ):
             if self.spec.get(name) != length:

@@ -39,11 +39,17 @@ def test_scenes_that_state_relations_have_entries_of_their_own():
         scene = scene_of([0, 1, 2], stated)
         wanted = pytest.approx(sigmoid(b - 0.5 * math.log(3)) if b < 0 else 0.5, abs=1e-6)
         assert all(answer.probability == wanted for answer in relations(artifact, scene))
-        # A missing thing would be one more class; and of a(x, y) and a(y, x) at most one holds.
-        p = min(0.5, sigmoid(b - 0.5 * math.log(4)))
-        for answer in missing(artifact, scene):
-            for place in answer.placements:
-                assert place.probability == pytest.approx(p, abs=1e-6)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_placements_have_entries_of_their_own(own):
+    """A missing thing would be one more class; of a(x, y) and a(y, x) at most one holds."""
+    entry = (PairSlope(intercept=-1.0, slope=0.0, log_classes=-0.5),) * 4
+    changes = {"placement": entry} if own else {"relation": entry}
+    artifact = larger_artifact("triway-local", **changes)
+    answers = missing(artifact, scene_of([0, 1, 2]))
+    p = {place.probability for answer in answers for place in answer.placements}
+    assert list(p) == [pytest.approx(sigmoid(-1 - 0.5 * math.log(4)), abs=1e-6)]
 
 
 def test_exclusive_scales_only_where_it_must():

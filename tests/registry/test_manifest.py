@@ -68,6 +68,7 @@ changes = st.fixed_dictionaries(
             outlier=count_slopes,
             outlier_threshold=st.floats(0, 1),
             relation=st.tuples(*[pair_slopes] * 4),
+            placement=st.just(()) | st.tuples(*[pair_slopes] * 4),
             relation_given=st.just(()) | st.tuples(*[pair_slopes] * 4),
         ),
         "metrics": st.lists(

@@ -19,7 +19,13 @@ from app.reasoning import misplaced, missing, outliers, relations
 from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject, canonicalise
 from training.batches import SceneTensors
-from training.calibrate import altered_case, placed_case, scene_of, told_pairs
+from training.calibrate import (
+    altered_case,
+    placed_case,
+    scene_of,
+    taken_away,
+    told_pairs,
+)
 from training.datasets import EncodedScene
 from training.evaluation.cases import scene_rng
 from training.evaluation.metrics import Scored
@@ -124,7 +130,7 @@ def ask_placements(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
     """Where an object that was taken away stood, one instance of it."""
-    taken = _taken_away(artifact, encoded, rng)
+    taken = taken_away(encoded, artifact.vocabulary.structure, rng)
     if taken is None or not encoded.instance_observed.any():
         return None
     target, kept = taken
@@ -142,7 +148,7 @@ def ask_missing(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
     """The class that was taken away."""
-    taken = _taken_away(artifact, encoded, rng)
+    taken = taken_away(encoded, artifact.vocabulary.structure, rng)
     if taken is None:
         return None
     target, kept = taken
@@ -212,15 +218,3 @@ QUESTIONS: dict[str, Callable[[Artifact, EncodedScene, np.random.Generator], Ans
 
 def _bare(encoded: EncodedScene, kept: range | list[int]) -> Scene:
     return replace(scene_of(encoded, list(kept), triples=()), room_type=None)
-
-
-def _taken_away(
-    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
-) -> tuple[int, list[int]] | None:
-    """(a class drawn from those that may be missing, the instances of all others)."""
-    classes = encoded.evidence.classes
-    removable = classes[~artifact.vocabulary.structure[classes]]
-    if len(removable) < 2:
-        return None
-    target = int(rng.choice(removable))
-    return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
