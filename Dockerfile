@@ -43,7 +43,10 @@ COPY --from=packages /opt/venv /opt/venv
 COPY app ./app
 # Owned by the service, which moves aliases; publishing adds versions beside those shipped.
 COPY --chown=10001:10001 model_store ./model_store
+# Compiled for the CPU that builds the image; on another kind the first start compiles anew.
+RUN NUMBA_CACHE_DIR=/srv/scene/compiled python -m app.compile
 ENV HOME=/tmp \
+    NUMBA_CACHE_DIR=/tmp/compiled \
     SCENE_HOST=0.0.0.0 \
     SCENE_PORT=8000 \
     SCENE_STORE=/srv/scene/model_store
@@ -52,4 +55,5 @@ EXPOSE 8000
 # http.client, unlike urlopen, never takes a proxy that the environment names.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s --retries=3 \
     CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENE_PORT']), timeout=2); c.request('GET', '/health/ready'); sys.exit(c.getresponse().status != 200)"]
-CMD ["python", "-m", "app"]
+# The compiler's cache must be writable, and /tmp alone is.
+CMD ["sh", "-c", "cp -R /srv/scene/compiled /tmp && exec python -m app"]

@@ -53,6 +53,8 @@ clean:  ## remove the environment and every cache
 $(SERVICE): requirements.lock pyproject.toml | $(BIN)/python
 	@echo "Installing the service's packages into $(VENV) ..."
 	@$(PIP) install -qq $(INDEX) -r requirements.lock
+	@echo "Compiling loops for this machine ..."
+	@$(BIN)/python -m app.compile
 	@touch $@
 
 $(EVERYTHING): requirements-dev.lock pyproject.toml | $(BIN)/python

@@ -282,11 +282,18 @@ def _array(tensor: Any) -> NDArray[Any]:
 
 def _weights(machine: Triway) -> Weights:
     A, V = machine.spec.A, machine.spec.V
-    names = ("S", "O", "R", "M", "P", "d", "s", "o", "n")
     F, Y = _directions(machine)
     keys = machine.triple_keys.numpy()
     return Weights(
-        *(_array(getattr(machine, name)) for name in names),
+        S=_array(machine.S),
+        O=_array(machine.O),
+        R=_array(machine.R),
+        M=_array(machine.M),
+        P=_array(machine.P),
+        d=_array(machine.d),
+        s=_array(machine.s),
+        o=_array(machine.o),
+        n=_array(machine.n),
         start=np.searchsorted(keys, np.arange(A * V + 1) * V),
         column=keys % V,
         residual=_array(machine.residual),

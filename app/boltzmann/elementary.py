@@ -10,12 +10,13 @@ Source: range reduction and minimax polynomials of Moshier's Cephes library (`ex
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from app.boltzmann.compiling import inlined
 
 _f = np.float32
 _i = np.int32
@@ -29,22 +30,22 @@ _MANTISSA_BITS = _i(0x007FFFFF)
 
 
 @intrinsic
-def _float_of_bits(_: Any, bits: Any) -> Any:  # noqa: ARG001 - the compiler passes it
-    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+def _float_of_bits(_, bits):  # noqa: ARG001 - the compiler passes it
+    def generate(_context, builder, _signature, args):
         return builder.bitcast(args[0], ir.FloatType())
 
     return types.float32(types.int32), generate
 
 
 @intrinsic
-def _bits_of_float(_: Any, value: Any) -> Any:  # noqa: ARG001
-    def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+def _bits_of_float(_, value):  # noqa: ARG001
+    def generate(_context, builder, _signature, args):
         return builder.bitcast(args[0], ir.IntType(32))
 
     return types.int32(types.float32), generate
 
 
-@njit(inline="always")
+@inlined
 def exp(x):
     """e^x for float32, with x held within [-87, 88]."""
     x = min(max(x, _LEAST), _LARGEST)
@@ -61,7 +62,7 @@ def exp(x):
     return p * _float_of_bits((_i(n) + _i(127)) << _i(23))
 
 
-@njit(inline="always")
+@inlined
 def log(x):
     """ln x for positive, normal float32."""
     bits = _bits_of_float(x) - _SQRT_HALF_BITS
@@ -80,7 +81,7 @@ def log(x):
     return (m + p) + exponent * _LN2_HIGH
 
 
-@njit(inline="always")
+@inlined
 def logistic(x):
     """1 / (1 + e^-x)."""
     return _f(1.0) / (_f(1.0) + exp(-x))

@@ -7,16 +7,16 @@ of their classes in the scene, value r (0 or 1) and gate g, the presence of both
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from app.boltzmann.compiling import compiled, compiled_in_any_order
 from app.boltzmann.elementary import logistic
-from app.boltzmann.relation_kernels import ANY_ORDER, means, residual, to_log_odds
+from app.boltzmann.relation_kernels import means, residual, to_log_odds
 
 _DAMPING = np.float32(0.8)
 _MOST = np.float32(3.0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
+@compiled_in_any_order
 def _units(w, classes, log_counts, a, i, j):
     """z_e = S_i * O_j, (E, K), and what of ℓ_e does not depend on h1, (E,)."""
     E, K = len(a), w.S.shape[1]
@@ -34,7 +34,7 @@ def _units(w, classes, log_counts, a, i, j):
     return z, base
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
+@compiled_in_any_order
 def _mean_logits(mean, w, a, z, base, out):
     A, K, H1 = w.M.shape
     shared, bias = np.empty((A, K), np.float32), np.empty(A, np.float32)
@@ -55,7 +55,7 @@ def _mean_logits(mean, w, a, z, base, out):
         out[e] = total
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
+@compiled_in_any_order
 def _pull(w, a, z, weight, out):
     """sum_e weight_e U_e into out (H1,)."""
     A, K, H1 = w.M.shape
@@ -79,7 +79,7 @@ def _pull(w, a, z, weight, out):
                     out[h] += value * row[h]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def fixed_point(x, w, classes, log_counts, a, i, j, r, g, sweeps):
     """The mean field given relations: logits of h1 (H1,), and the slopes (E,) at its end."""
     E = len(a)
@@ -98,7 +98,7 @@ def fixed_point(x, w, classes, log_counts, a, i, j, r, g, sweeps):
     return y, slopes
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
+@compiled_in_any_order
 def _own_row(w, b, z, out):
     """U_e into out (H1,)."""
     K, H1 = w.M.shape[1:]
@@ -111,7 +111,7 @@ def _own_row(w, b, z, out):
             out[h] += value * row[h]
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
+@compiled_in_any_order
 def _normal_logit(mean, U, base):
     total, variance = base, np.float32(0.0)
     for h in range(len(U)):
@@ -120,7 +120,7 @@ def _normal_logit(mean, U, base):
     return total, np.sqrt(np.float32(3.0) * variance)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def without_itself(y, w, classes, log_counts, a, i, j, slopes, shift):
     """Log-odds of each given unit, its own slope taken out of y, (E,); shift (A, n, n)."""
     E, H1 = len(a), len(y)
@@ -138,7 +138,7 @@ def without_itself(y, w, classes, log_counts, a, i, j, slopes, shift):
     return found
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def shares(w, classes, log_counts, a, i, j, slopes):
     """What the relations of each class add to y, (n, H1)."""
     n, E = len(classes), len(a)
@@ -151,7 +151,7 @@ def shares(w, classes, log_counts, a, i, j, slopes):
     return found
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def common_shares(w, classes, log_counts, a, i, j, slopes, rows):
     """What the relations between two classes add to y, (N, n, H1) for the classes in rows (N,)."""
     n, H1 = len(classes), w.M.shape[2]
@@ -175,7 +175,7 @@ def common_shares(w, classes, log_counts, a, i, j, slopes, rows):
     return found
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def implied(gamma, z, n, a, i, j, r):
     """What the given relations that hold imply for all others, (A, n, n); see `implications`.
 

@@ -6,12 +6,12 @@ Formulas in `closed_form`.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from app.boltzmann.compiling import compiled
 from app.boltzmann.elementary import exp, log, logistic
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def hidden_logits(bias, W, classes, confidence):
     """bias + v'W for the presence of some classes, (H1,)."""
     x = bias.copy()
@@ -22,7 +22,7 @@ def hidden_logits(bias, W, classes, confidence):
     return x
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _gain(off, rest, growth, product):
     """sum_k log of (off + rest e^W) / (off + rest), as in `scoring`."""
     lanes = len(product)
@@ -41,7 +41,7 @@ def _gain(off, rest, growth, product):
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def leave_one_out(x, W, share, rows, common, group):
     """See `ClosedForm.leave_one_out`; W (n, H1) are the rows of the classes."""
     n, H1 = W.shape

@@ -6,8 +6,8 @@ Formulas in `closed_form`. Units go from subject classes (n,) to object classes 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from app.boltzmann.compiling import compiled, compiled_in_any_order, inlined
 from app.boltzmann.elementary import exp, log, logistic
 
 NO_UNIT = np.float32(-30.0)
@@ -17,12 +17,8 @@ _ROOT_3 = np.float32(3.0**0.5)
 # Where three nodes are enough, as √3 σ.
 _NARROW = np.float32(0.75 * 3.0**0.5)
 
-# Sums may be taken in any order, so that the compiler can take eight terms at a time. It chooses
-# one order, once. exp and log must stay out of such functions: their cancellations are meant.
-ANY_ORDER = {"reassoc", "contract"}
 
-
-@njit(inline="always")
+@inlined
 def _dot(a, b):
     total = np.float32(0.0)
     for k in range(len(a)):
@@ -30,7 +26,7 @@ def _dot(a, b):
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
+@compiled_in_any_order
 def _moments(mean, w, first, last):
     """What all units of relations first to last - 1 share: R + M m, d + P·m, and C."""
     A, K, H1 = w.M.shape
@@ -51,7 +47,7 @@ def _moments(mean, w, first, last):
     return shared, bias, C
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def residual(w, a, i, j):
     """w' of (a, i, j), 0 where there is none."""
     row = a * len(w.S) + i
@@ -67,7 +63,7 @@ def residual(w, a, i, j):
     return np.float32(0.0)
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def _log_odds(mean, spread):
     """log-odds of E[sigmoid(ℓ)] for a normal ℓ, by three nodes: 0 and ±√3 σ with weights 4 : 1 : 1.
 
@@ -78,7 +74,7 @@ def _log_odds(mean, spread):
     return log(on) - log(off)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _log_odds_of_wide(mean, spread):
     """The same by the trapezoidal rule, for any σ up to 10 and more."""
     on, off = np.float32(0.0), np.float32(0.0)
@@ -91,7 +87,7 @@ def _log_odds_of_wide(mean, spread):
     return log(on) - log(off)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=ANY_ORDER)
+@compiled_in_any_order
 def _normal(moments, w, first, subjects, log_subjects, objects, log_objects, mean, spread):
     """Mean and √3 σ of the logits of all units from subjects to objects, (relations, n, m)."""
     shared, bias, C = moments
@@ -128,7 +124,7 @@ def _normal(moments, w, first, subjects, log_subjects, objects, log_objects, mea
                 spread[a - first, i, j] = np.sqrt(np.float32(3.0) * max(variance, np.float32(0.0)))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def to_log_odds(means, spreads):
     """Log-odds of E[sigmoid] in place of the means (E,) of logits, for their √3 σ."""
     # All of them without a branch, many at a time; then the few wide ones again.
@@ -142,7 +138,7 @@ def to_log_odds(means, spreads):
         means[e] = max(narrow[e], NO_UNIT)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _fill(moments, w, first, subjects, log_subjects, objects, log_objects, out):
     """Log-odds of all units from subjects to objects into out (relations, n, m)."""
     spread = np.empty(out.shape, np.float32)
@@ -150,7 +146,7 @@ def _fill(moments, w, first, subjects, log_subjects, objects, log_objects, out):
     to_log_odds(out.reshape(-1), spread.reshape(-1))
 
 
-@njit(inline="always", error_model="numpy")
+@inlined
 def means(x):
     """sigmoid(x)."""
     mean = np.empty(len(x), np.float32)
@@ -159,7 +155,7 @@ def means(x):
     return mean
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def relation_log_odds(x, w, classes, log_counts, shift):
     """Log-odds of E[sigmoid(ℓ_e + shift_e)] between the classes of a scene, (A, n, n)."""
     n = len(classes)
@@ -173,7 +169,7 @@ def relation_log_odds(x, w, classes, log_counts, shift):
     return mean
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def placement_log_odds(x, W, w, candidates, anchors, log_counts):
     """Relations of absent candidates to anchors and back, (N, A, m) both, were they there."""
     A, m = len(w.d), len(anchors)
@@ -189,7 +185,7 @@ def placement_log_odds(x, W, w, candidates, anchors, log_counts):
     return forward[:, :, 0], backward[:, :, :, 0]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def placed_log_odds(x, W, w, candidates, anchor, relation, one, log_count, outgoing):
     """One relation of absent candidates to one anchor, or back, (N,)."""
     out, unit = np.empty(len(candidates), np.float32), np.empty((1, 1, 1), np.float32)

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from app.boltzmann.compiling import compiled
 from app.boltzmann.elementary import log, logistic
 from app.boltzmann.machine import BoltzmannMachine
 
@@ -103,7 +103,7 @@ def _add_logs(row: Tensor, weights: Tensor, gain: Tensor) -> None:
     gain.copy_(torch.logaddexp(logsigmoid(-row), logsigmoid(row) + weights).sum(0))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def _gain(x, exp_w, group, out):
     """One row: x (H1,), exp_w (tiles, H1, objects of a tile), out (V,)."""
     tiles, units, width = exp_w.shape

@@ -14,13 +14,15 @@ Floats = NDArray[np.floating[Any]]
 
 def sigmoid(x: Floats) -> Floats:
     """1 / (1 + e^-x); beyond ±80 as there."""
-    return 1.0 / (1.0 + np.exp(-np.clip(x, -80.0, 80.0)))
+    p: Floats = 1.0 / (1.0 + np.exp(-np.clip(x, -80.0, 80.0)))
+    return p
 
 
 def softmax(scores: Floats) -> Floats:
     """e^s over its sum, for scores (N,)."""
     weight = np.exp(scores - scores.max())
-    return weight / weight.sum()
+    found: Floats = weight / weight.sum()
+    return found
 
 
 def relation_slopes(calibration: Calibration, *, given: bool) -> tuple[PairSlope, ...]:

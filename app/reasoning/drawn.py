@@ -22,7 +22,7 @@ from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 
 Floats = NDArray[np.floating[Any]]
-Places = NDArray[np.integer[Any]]
+Places = NDArray[np.int64]
 
 # Rows and candidates are taken in blocks of about so many relation units times draws.
 _BLOCK = 1 << 22

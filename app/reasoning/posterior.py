@@ -17,7 +17,7 @@ from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 
 Floats = NDArray[np.floating[Any]]
-Places = NDArray[np.integer[Any]]
+Places = NDArray[np.int64]
 
 
 class Posterior(Protocol):

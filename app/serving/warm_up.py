@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from app import reasoning
 from app.registry import Artifact
@@ -15,7 +16,8 @@ STEPS = 4
 
 
 def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...]]:
-    """Ask everything once; the first call of a kernel costs many times the later ones.
+    """Ask everything once, with and without given relations: the first call of a compiled loop
+    compiles it, and that of a kernel of torch costs many times the later ones.
 
     Returns:
         The model's contexts, which never change.
@@ -25,11 +27,15 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
         Exception: whatever the model raises.
     """
     scene = _scene(artifact.vocabulary)
-    relations = reasoning.relations(artifact, scene)
-    missing = reasoning.missing(artifact, scene)
+    bare = replace(scene, relations=None)
+    relations = [*reasoning.relations(artifact, scene), *reasoning.relations(artifact, bare)]
+    missing = [*reasoning.missing(artifact, scene), *reasoning.missing(artifact, bare)]
     if len(scene.objects) > 1:
-        reasoning.missing(artifact, scene, at=("on-top", 0))
+        for one in (scene, bare):
+            reasoning.missing(artifact, one, at=("on-top", 0))
+            reasoning.missing(artifact, one, at=("under", 0))
     outliers, misplaced = reasoning.outliers(artifact, scene)
+    outliers += reasoning.outliers(artifact, bare)[0]
     generated = reasoning.generate(artifact, scene, count=2, seed=0, steps=STEPS)
     numbers = [entry.probability for entry in relations]
     numbers += [number for entry in missing for number in (entry.probability, entry.log_odds)]

@@ -1,0 +1,48 @@
+"""How loops are compiled: by numba, kept on disk between processes, without the interpreter's lock.
+
+Division by zero gives what the hardware gives. A function that is compiled anew takes a second or
+so; `python -m app.compile` does all of them ahead of the first start. Where nothing can be written,
+neither beside the sources nor into NUMBA_CACHE_DIR nor into the user's cache directory, every
+process compiles for itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from numba import njit
+
+Function: TypeAlias = Callable[..., Any]
+
+# Sums may be taken in any order, so that the compiler can take eight terms at a time. It chooses
+# one order, once.
+_ANY_ORDER = {"reassoc", "contract"}
+
+
+def compiled(function: Function) -> Function:
+    """Compile a function."""
+    return _compile(function, {})
+
+
+def compiled_in_any_order(function: Function) -> Function:
+    """The same, with sums in any order; `elementary` must stay out of such functions.
+
+    The cancellations of exp and log are meant.
+    """
+    return _compile(function, {"fastmath": _ANY_ORDER})
+
+
+def inlined(function: Function) -> Function:
+    """Part of whichever compiled function calls it, and compiled as that one is."""
+    found: Function = njit(inline="always", error_model="numpy")(function)
+    return found
+
+
+def _compile(function: Function, options: dict[str, Any]) -> Function:
+    options = {"nogil": True, "error_model": "numpy", **options}
+    try:
+        found: Function = njit(cache=True, **options)(function)
+    except RuntimeError:  # no directory for the cache
+        found = njit(**options)(function)
+    return found
