@@ -20,21 +20,14 @@ class Present:
         counts: (n,) int64, instances of each.
         row: (N,) int64, for each object the place of its class in `classes`.
         first: (n,) int64, position of the first object of each class.
-        confidence: (N,) float64 of the objects.
+        presence: (n,) float64, probability that at least one instance of the class is there.
     """
 
     classes: NDArray[np.int64]
     counts: NDArray[np.int64]
     row: NDArray[np.int64]
     first: NDArray[np.int64]
-    confidence: NDArray[np.float64]
-
-    @property
-    def presence(self) -> NDArray[np.float64]:
-        """(n,) probability that at least one instance of a class is there."""
-        absent = np.ones(len(self.classes))
-        np.multiply.at(absent, self.row, 1.0 - self.confidence)
-        return 1.0 - absent
+    presence: NDArray[np.float64]
 
 
 def present(scene: Scene, spec: MachineSpec) -> Present:
@@ -52,11 +45,20 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
         indices.append(thing.class_index)
     if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
         raise ValueError(f"room_type is {scene.room_type}, must be below C = {spec.C}")
-    classes, first, row, counts = np.unique(
-        np.array(indices, dtype=np.int64),
-        return_index=True,
-        return_inverse=True,
-        return_counts=True,
+    # A scene is small: this takes a third of the time of numpy's `unique`.
+    classes = sorted(set(indices))
+    place = {index: k for k, index in enumerate(classes)}
+    row = [place[index] for index in indices]
+    counts, first, absent = [0] * len(classes), [0] * len(classes), [1.0] * len(classes)
+    for position in range(len(row) - 1, -1, -1):
+        k = row[position]
+        counts[k] += 1
+        first[k] = position
+        absent[k] *= 1.0 - scene.objects[position].confidence
+    return Present(
+        classes=np.array(classes, dtype=np.int64),
+        counts=np.array(counts, dtype=np.int64),
+        row=np.array(row, dtype=np.int64),
+        first=np.array(first, dtype=np.int64),
+        presence=1.0 - np.array(absent),
     )
-    confidence = np.array([thing.confidence for thing in scene.objects], dtype=np.float64)
-    return Present(classes, counts, row, first, confidence)

@@ -79,14 +79,21 @@ class Reading:
 
 
 class Names:
-    """How the objects of a scene may be named: by id, or by a label that only one of them has."""
+    """How the objects of a scene may be named: by id, or by a label that only one of them has.
+
+    Args:
+        ignored: (id, label) of those that were left out.
+    """
 
     def __init__(
-        self, objects: Sequence[SceneObject], ignored: Sequence[Detection], vocabulary: Vocabulary
+        self,
+        objects: Sequence[SceneObject],
+        ignored: Sequence[tuple[str, str]],
+        vocabulary: Vocabulary,
     ) -> None:
         self._vocabulary = vocabulary
-        self._ignored_ids = {detection.id for detection in ignored}
-        self._ignored_labels = {label_key(detection.label) for detection in ignored}
+        self._ignored_ids = {name for name, _ in ignored}
+        self._ignored_labels = {label_key(label) for _, label in ignored}
         self._by_id = {thing.id: place for place, thing in enumerate(objects)}
         self._by_label: dict[str, list[int]] = {}
         self._by_class: dict[int, list[int]] = {}
@@ -143,23 +150,27 @@ def read_scene(
         faults.add(Reason.INVALID, ("relations_complete",), "needs relations")
     faults.raise_any()
 
-    detections = _named(request.objects, faults)
+    ids = _ids(request.objects, faults)
     tolerant = request.unknown_labels == "ignore"
     objects: list[SceneObject] = []
-    unknown: list[Detection] = []
+    unknown: list[tuple[str, str]] = []
     optical = request.frame_id is not None and is_optical(request.frame_id)
-    for place, detection in enumerate(detections):
-        index = vocabulary.index(detection.label)
+    for place, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
+        label = entry if isinstance(entry, str) else entry.label
+        index = vocabulary.index(label)
         if index is not None:
-            objects.append(_scene_object(detection, index, optical=optical))
+            if isinstance(entry, str):
+                objects.append(SceneObject(name, label, index))
+            else:
+                objects.append(_scene_object(name, entry, index, optical=optical))
         elif tolerant:
-            unknown.append(detection)
+            unknown.append((name, label))
         else:
             location: Location = ("objects", place)
-            if not isinstance(request.objects[place], str):
+            if not isinstance(entry, str):
                 location = (*location, "label")
-            unknown_label(vocabulary, detection.label, location, faults)
-    ignored = [detection.id for detection in unknown if detection.id is not None]
+            unknown_label(vocabulary, label, location, faults)
+    ignored = [name for name, _ in unknown]
     room = _room(request, vocabulary, ignored, faults)
     faults.raise_any()
     if not objects and not may_be_empty:
@@ -192,39 +203,43 @@ def unknown_label(vocabulary: Vocabulary, label: str, location: Location, faults
     )
 
 
-def _named(entries: Sequence[str | Detection], faults: Faults) -> list[Detection]:
-    """Every object with an id: its own, or its label, numbered where the label is not enough."""
-    detections = [
-        Detection.model_construct(label=entry) if isinstance(entry, str) else entry
-        for entry in entries
-    ]
+def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
+    """The id of every object: its own, or its label, numbered where the label is not enough."""
     taken: set[str] = set()
-    for place, detection in enumerate(detections):
-        if detection.id is None:
-            continue
-        if detection.id in taken:
-            faults.add(Reason.INVALID, ("objects", place, "id"), "another object has this id")
-        taken.add(detection.id)
-    repeats = Counter(detection.label for detection in detections if detection.id is None)
+    labels = []
+    for place, entry in enumerate(entries):
+        if isinstance(entry, str):
+            labels.append(entry)
+        elif entry.id is None:
+            labels.append(entry.label)
+        else:
+            if entry.id in taken:
+                faults.add(Reason.INVALID, ("objects", place, "id"), "another object has this id")
+            taken.add(entry.id)
+    if not taken and len(set(labels)) == len(labels):
+        return labels
+    repeats = Counter(labels)
     last: Counter[str] = Counter()
-    named = []
-    for detection in detections:
-        if detection.id is None:
-            name = detection.label
-            if repeats[name] > 1 or name in taken:
-                while True:
-                    last[detection.label] += 1
-                    name = f"{detection.label}_{last[detection.label]}"
-                    if name not in taken:
-                        break
-            taken.add(name)
-            detection = detection.model_copy(update={"id": name})
-        named.append(detection)
-    return named
+    ids = []
+    for entry in entries:
+        if isinstance(entry, Detection) and entry.id is not None:
+            ids.append(entry.id)
+            continue
+        label = name = entry if isinstance(entry, str) else entry.label
+        if repeats[name] > 1 or name in taken:
+            while True:
+                last[label] += 1
+                name = f"{label}_{last[label]}"
+                if name not in taken:
+                    break
+        taken.add(name)
+        ids.append(name)
+    return ids
 
 
-def _scene_object(detection: Detection, class_index: int, *, optical: bool) -> SceneObject:
-    assert detection.id is not None  # noqa: S101 — `_named` has seen to it
+def _scene_object(
+    name: str, detection: Detection, class_index: int, *, optical: bool
+) -> SceneObject:
     position = size = None
     yaw = 0.0
     if detection.size is not None:
@@ -238,7 +253,7 @@ def _scene_object(detection: Detection, class_index: int, *, optical: bool) -> S
             optical=optical,
         )
     return SceneObject(
-        detection.id, detection.label, class_index, detection.confidence, position, size, yaw
+        name, detection.label, class_index, detection.confidence, position, size, yaw
     )
 
 
