@@ -1,0 +1,119 @@
+"""`python -m scripts.estimators`: errors of the closed form, and of 64 draws, against very many.
+
+For a shipped model that has a closed form, on scenes of its own: bare; with 20 relations drawn at
+random; with random poses, which show hundreds of relations that do and do not hold. Log-odds of
+objects in nats, relations and placements as probabilities.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from app.boltzmann.fantasies import unpack_scenes
+from app.reasoning.calibration import sigmoid
+from app.reasoning.closed import ClosedPosterior
+from app.reasoning.drawn import DrawnPosterior
+from app.reasoning.posterior import Posterior
+from app.registry import Artifact, Store, load_model_set
+from app.scene import Scene, SceneObject, derive_relations
+
+Values = NDArray[np.floating[Any]]
+
+_OBJECTS = 12
+_RELATIONS = 20
+
+
+def scenes(artifact: Artifact, count: int, kind: str) -> Iterator[Scene]:
+    """Scenes of the machine's own objects."""
+    rng = np.random.default_rng(0)
+    for v in unpack_scenes(artifact.machine.fantasies, artifact.machine.spec.V)[:count].numpy():
+        classes = np.flatnonzero(v)[:_OBJECTS].tolist()
+        n = len(classes)
+        if n < 4:
+            continue
+        labels = artifact.vocabulary.labels
+        objects = tuple(SceneObject(labels[c], labels[c], c) for c in classes)
+        if kind == "bare":
+            yield Scene(objects)
+        elif kind == "relations":
+            found: dict[tuple[int, int, int], None] = {}
+            while len(found) < min(_RELATIONS, n * (n - 1)):
+                a, i, j = (int(x) for x in rng.integers((3, n, n)))
+                if i != j and (a, j, i) not in found:
+                    found[a, i, j] = None
+            yield Scene(objects, tuple(found))
+        else:
+            places = np.c_[rng.uniform(0, 3, (n, 2)), rng.uniform(0, 1, n)]
+            poses = derive_relations(places.tolist(), [[0.5, 0.5, 0.5]] * n)
+            triples = tuple((int(a), int(i), int(j)) for a, i, j in np.argwhere(poses.holds))
+            yield Scene(objects, triples, poses=poses)
+
+
+def answers(given: Posterior, absent: NDArray[np.int64]) -> dict[str, Values]:
+    """What the questions are made of; placements of some of the absent classes."""
+    anchors, likely = np.arange(len(given.present.classes)), absent[:: len(absent) // 5]
+    return {
+        "absent objects": given.absent_log_odds(absent),
+        "present objects": given.log_odds_given_rest(),
+        "relations": sigmoid(given.relation_log_odds()),
+        "placements": sigmoid(np.stack(given.placement_log_odds(likely, anchors))),
+    }
+
+
+def errors(artifact: Artifact, count: int, draws: int) -> dict[tuple[str, str, str], list[Values]]:
+    """|estimate - reference| by kind of scene, answer and estimate."""
+    closed = artifact.closed_form
+    assert closed is not None
+    structure = artifact.vocabulary.structure
+    found: dict[tuple[str, str, str], list[Values]] = {}
+    few: Callable[[Scene], Posterior] = lambda scene: DrawnPosterior(artifact, scene)  # noqa: E731
+    for kind in ("bare", "relations", "poses"):
+        for scene in scenes(artifact, count, kind):
+            with (
+                patch("app.reasoning.evidence.DRAWS", draws),
+                patch("app.reasoning.evidence._RELATION_DRAWS", 1 << 40),
+            ):
+                exact = few(scene)
+                present = exact.present.classes
+                absent = np.setdiff1d(np.flatnonzero(~structure), present)
+                reference = answers(exact, absent)
+            for name, given in (
+                ("closed form", ClosedPosterior(artifact, closed, scene)),
+                ("64 draws", few(scene)),
+            ):
+                for answer, values in answers(given, absent).items():
+                    difference = np.abs(values - reference[answer]).ravel()
+                    found.setdefault((kind, answer, name), []).append(difference)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--store", type=Path, default=Path("model_store"))
+    parser.add_argument("--model", default="default")
+    parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--draws", type=int, default=4096)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    artifact = load_model_set(Store(asked.store)).resolve(asked.model)
+    found = errors(artifact, asked.scenes, asked.draws)
+    print("| scenes | answer | closed form, mean / max | 64 draws, mean / max |")
+    print("|---|---|---|---|")
+    for kind, answer in dict.fromkeys(key[:2] for key in found):
+        cells = []
+        for name in ("closed form", "64 draws"):
+            values = np.concatenate(found[kind, answer, name])
+            cells.append(f"{values.mean():.4f} / {values.max():.3f}")
+        print(f"| {kind} | {answer} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
