@@ -13,8 +13,7 @@ import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from contextlib import contextmanager
-from multiprocessing.queues import Queue
-from queue import Empty
+from multiprocessing.queues import SimpleQueue
 
 import torch
 
@@ -28,7 +27,7 @@ _TICK = 0.2
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _plan: Plan
-_messages: Queue[_Message]
+_messages: SimpleQueue[_Message]
 
 
 def fill(
@@ -56,7 +55,8 @@ def fill(
     # Plain bytes: torch would hand tensors over through shared memory, which containers keep small.
     material = pickle.dumps(plan)
     context = multiprocessing.get_context("spawn")
-    messages: Queue[_Message] = context.Queue()
+    # Without a thread that sends: what a row says last is there when the row is done.
+    messages: SimpleQueue[_Message] = context.SimpleQueue()
     with (
         _one_thread(),
         ProcessPoolExecutor(
@@ -95,7 +95,7 @@ def _one_thread() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _begin(material: bytes, messages: Queue[_Message]) -> None:
+def _begin(material: bytes, messages: SimpleQueue[_Message]) -> None:
     global _plan, _messages  # what a worker is given once, for all its rows
     # Ctrl-C reaches every process of the terminal; the first one decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -112,9 +112,6 @@ def _measure(entry: Entry, failures: tuple[type[Exception], ...]) -> Exception |
     return None
 
 
-def _pending(messages: Queue[_Message]) -> Iterator[_Message]:
-    while True:
-        try:
-            yield messages.get_nowait()
-        except Empty:
-            return
+def _pending(messages: SimpleQueue[_Message]) -> Iterator[_Message]:
+    while not messages.empty():
+        yield messages.get()

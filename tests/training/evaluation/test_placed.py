@@ -112,6 +112,8 @@ def test_the_score_is_the_service_s(name, outgoing):
     """Softmax of the score over absent classes is the answer of the service, uncalibrated."""
     machine = larger_machine(name)
     artifact = artifact_of(machine)
+    # Both from draws: where the service has a closed form, that is another estimate of the same.
+    vars(artifact)["closed_form"] = None
     classes, relation, anchor = [0, 2, 2, 5], 2, 2
     things = tuple(SceneObject(str(k), "x", c) for k, c in enumerate(classes))
     spoken = CANONICAL[relation] if outgoing else OPPOSITES[CANONICAL[relation]]
