@@ -44,7 +44,7 @@ COPY app ./app
 # Owned by the service, which moves aliases; publishing adds versions beside those shipped.
 COPY --chown=10001:10001 model_store ./model_store
 # Compiled for the CPU that builds the image; on another kind the first start compiles anew.
-RUN NUMBA_CACHE_DIR=/srv/scene/compiled python -m app.compile
+RUN NUMBA_CACHE_DIR=compiled python -m app.compile
 ENV HOME=/tmp \
     NUMBA_CACHE_DIR=/tmp/compiled \
     SCENE_HOST=0.0.0.0 \
@@ -56,4 +56,4 @@ EXPOSE 8000
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s --retries=3 \
     CMD ["python", "-c", "import http.client, os, sys; c = http.client.HTTPConnection('127.0.0.1', int(os.environ['SCENE_PORT']), timeout=2); c.request('GET', '/health/ready'); sys.exit(c.getresponse().status != 200)"]
 # The compiler's cache must be writable, and /tmp alone is.
-CMD ["sh", "-c", "cp -R /srv/scene/compiled /tmp && exec python -m app"]
+CMD ["sh", "-c", "mkdir -p $NUMBA_CACHE_DIR && cp -R compiled/. $NUMBA_CACHE_DIR && exec python -m app"]
