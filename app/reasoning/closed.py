@@ -30,6 +30,11 @@ class ClosedPosterior:
             _given(scene, presence, artifact.machine.spec.A),
         )
 
+    @property
+    def unit_count(self) -> int:
+        """Those that are given."""
+        return len(self._context.slopes)
+
     def absent_log_odds(self, absent: Places) -> Floats:
         """Exact where no relation is given."""
         return (self._closed.b + self._scorer.row_gain(self._context.y))[absent]

@@ -38,6 +38,11 @@ class DrawnPosterior:
         self._context: HiddenDraws | None = None
 
     @property
+    def unit_count(self) -> int:
+        """Those of the evidence; in the seed form, of all that is present."""
+        return self.observation.unit_count
+
+    @property
     def draws(self) -> HiddenDraws:
         """Of h1 given the evidence."""
         if self._context is None:

@@ -49,7 +49,7 @@ def outliers(
     intruder = intruder_log_odds(calibration, log_odds, len(log_odds))
     row = given.present.row
     order = np.argsort(-intruder[row], kind="stable")
-    explained = row[order[: _affordable(artifact, given, scene)]].tolist()
+    explained = row[order[: _affordable(given)]].tolist()
     reasons = _reasons(given, list(dict.fromkeys(explained)))
     rows, values = row.tolist(), log_odds.tolist()
     probability = sigmoid(intruder).tolist()
@@ -76,11 +76,10 @@ def misplaced(artifact: Artifact, scene: Scene) -> tuple[MisplacedAnswer, ...]:
     return _misplaced(artifact, posterior(artifact, scene), scene)
 
 
-def _affordable(artifact: Artifact, given: Posterior, scene: Scene) -> int:
+def _affordable(given: Posterior) -> int:
     """For how many objects to give reasons."""
-    classes = len(given.present.classes)
-    units = artifact.machine.spec.A * classes**2 if scene.relations or scene.poses else 1
-    return min(EXPLAINED, max(1, _REASON_UNITS // (classes * units)))
+    per_object = len(given.present.classes) * max(1, given.unit_count)
+    return min(EXPLAINED, max(1, _REASON_UNITS // per_object))
 
 
 def _reasons(given: Posterior, explained: list[int]) -> dict[int, tuple[Because, ...]]:

@@ -28,9 +28,14 @@ class Posterior(Protocol):
 
     Attributes:
         present: the classes of the scene.
+        unit_count: relation units that a judgement of one class goes through.
     """
 
     present: Present
+
+    @property
+    def unit_count(self) -> int:
+        """See above."""
 
     def absent_log_odds(self, absent: Places) -> Floats:
         """Presence of absent classes (N,), each with all its relations unobserved, (N,)."""

@@ -58,7 +58,7 @@ class Artifact:
 
     @cached_property
     def closed_form(self) -> ClosedForm | None:
-        """Prepared log-odds of scenes without given relations, for machines that have them."""
+        """Log-odds in closed form, prepared; None for machines that have none."""
         from app.boltzmann.closed_form import ClosedForm
 
         return ClosedForm(self.machine) if ClosedForm.fits(self.machine) else None

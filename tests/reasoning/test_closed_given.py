@@ -140,3 +140,12 @@ def test_the_same_scene_gets_the_same_bits(scene):
     first = ask()
     missing(ARTIFACT, SCENES["several"])
     assert ask() == first
+
+
+def test_reasons_cost_what_the_posterior_says():
+    """Complete relations count, though none is listed; so do those that the seed form sums out."""
+    bare, complete = scene_of([0, 5, 6]), SCENES["nothing holds"]
+    assert posterior(ARTIFACT, bare).unit_count == 0
+    assert posterior(ARTIFACT, complete).unit_count == 4 * 3 * 2
+    for name, scene, units in (("triway-local", complete, 36), ("triway-seed", bare, 36)):
+        assert posterior(larger_artifact(name), scene).unit_count == units
