@@ -51,6 +51,7 @@ _ROUNDS = 3
 _RELATION, _LOGIT, _TRUTH = 1, 2, 5
 # Cases a scene: with one of some 300 scenes, the weight moved by a third from draw to draw.
 _PLACED_CASES = 2
+_PLACEMENT_CASES = 4
 _MISPLACED_SCENES = 300
 
 
@@ -157,7 +158,7 @@ def fit_placements(
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     blocks: list[NDArray[np.float64]] = []
-    for number, encoded in enumerate([*scenes] * _PLACED_CASES):
+    for number, encoded in enumerate([*scenes] * _PLACEMENT_CASES):
         taken = taken_away(encoded, structure, rng)
         if taken is None:
             continue

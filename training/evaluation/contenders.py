@@ -9,15 +9,15 @@ from functools import cache, partial
 from app.boltzmann import BoltzmannMachine
 from app.registry import Artifact
 from training.batches import SceneTensors
-from training.evaluation import missing, placed, relations
+from training.evaluation import missing
 from training.evaluation.alarms import Alarm, calibrated_alarm
-from training.evaluation.completion import given_score
 from training.evaluation.density import DensitySettings, ObjectDensity, machine_density
 from training.evaluation.generation import Sampler
 from training.evaluation.missing import ObjectScore, RoomScore
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
 from training.evaluation.sampling import machine_sampler
+from training.evaluation.scores import machine_scores
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +64,16 @@ def machine_contender(
     Args:
         train: training scenes, for the density's annealing.
     """
-    objects, given = missing.machine_score(machine), given_score(machine)
+    objects, scores = missing.machine_score(machine), machine_scores(machine)
     density = None
     if machine.spec.form == "local":
         density = cache(partial(machine_density, machine, train, settings, seed))
     return Contender(
         objects=objects,
-        relations=relations.machine_score(machine),
-        completion=given,
-        placed=placed.machine_score(machine),
-        placement=given,
+        relations=scores.relations,
+        completion=scores.completion,
+        placed=scores.placed,
+        placement=scores.completion,
         sampler=machine_sampler(machine),
         density=density,
         objects_in_rooms=objects if machine.spec.C else None,
@@ -94,7 +94,7 @@ def artifact_contender(
     bare = machine_contender(machine, train, settings, seed)
     return replace(
         bare,
-        placed=placed.machine_score(machine, relation_weight=weight),
+        placed=machine_scores(machine, relation_weight=weight).placed,
         alarm=calibrated_alarm(calibration),
         artifact=artifact,
     )

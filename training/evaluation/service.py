@@ -30,14 +30,14 @@ from app.scene import CANONICAL, OPPOSITES
 from training.batches import Batch, SceneTensors
 from training.datasets import EncodedScene
 from training.evaluation.alarms import calibrated_alarm
-from training.evaluation.completion import complete_scenes, given_score
+from training.evaluation.completion import complete_scenes
 from training.evaluation.intervals import Metric
 from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.outliers import IntruderScores, draw_intruders, intruder_scores
 from training.evaluation.placed import PlacedScore, Places, leave_one_out_at
-from training.evaluation.placed import machine_score as placed_score
 from training.evaluation.placement import placement_scores
 from training.evaluation.relations import RelationScore, candidates, rank, score_scenes
+from training.evaluation.scores import machine_scores
 from training.trainer import subset
 
 # The most relations that one request returns, and its most pairs.
@@ -121,11 +121,10 @@ def directly(artifact: Artifact) -> Asked:
     if machine.spec.form != "local":
         raise ServiceError("in the seed form the service draws contexts, the scores do not")
     weight = calibration.placed_relation_weight * calibration.placed_temperature
-    objects, given = machine_score(machine), given_score(machine)
-    place = placed_score(machine, relation_weight=weight)
+    objects, scores = machine_score(machine), machine_scores(machine, relation_weight=weight)
 
     def log_odds(batch: Batch) -> Tensor:
-        values = given(replace(batch, counts=(batch.classes >= 0).long()))
+        values = scores.completion(replace(batch, counts=(batch.classes >= 0).long()))
         # What has no unit is never, to a service too.
         return values.clamp(min=NO_UNIT)
 
@@ -145,7 +144,7 @@ def directly(artifact: Artifact) -> Asked:
         return -torch.from_numpy(sigmoid(false_log_odds(calibration, log_odds(batch).numpy())))
 
     def placed(places: Places) -> Tensor:
-        return place(replace(places, counts=places.v))
+        return scores.placed(replace(places, counts=places.v))
 
     def intruders(
         scenes: SceneTensors, structure: Tensor, seed: int

@@ -10,7 +10,7 @@ import torch
 from app.boltzmann import Triway, build
 from app.boltzmann.log_odds import relation_log_odds
 from app.boltzmann.mean_field import Evidence
-from app.reasoning.drawn import DrawnPosterior
+from app.reasoning.posterior import posterior
 from app.reasoning.units import NO_UNIT
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.reasoning.artifacts import LARGER, artifact_of
@@ -27,6 +27,7 @@ from tests.training.evaluation.scenes import (
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.evaluation.completion import complete_scenes, given_score, given_units, random_half
 from training.evaluation.relations import rank, spread_units, telling
+from training.evaluation.scores import machine_scores
 
 DATA = tensors(random_scenes(20), WIDE)
 
@@ -120,21 +121,33 @@ def test_the_split_depends_on_the_scene_alone():
     assert [x.key.tolist() for x in whole] != [x.key.tolist() for x in other]
 
 
+def in_scene(instance_classes, triples=()):
+    """What a robot would post: objects, and relations between the first of each class."""
+    first = {int(c): k for k, c in reversed(list(enumerate(instance_classes)))}
+    things = tuple(SceneObject(str(k), "x", int(c)) for k, c in enumerate(instance_classes))
+    return Scene(things, tuple((a, first[i], first[j]) for a, i, j in triples))
+
+
 @pytest.mark.parametrize("name", LARGER)
-def test_the_score_is_the_service_s(name):
-    """Observed triples without themselves, the others given them."""
+def test_the_scores_are_the_service_s(name):
+    """T1a knows no relation; T1b judges observed ones without themselves, the others given them."""
     machine = larger_machine(name)
+    artifact, scores = artifact_of(machine), machine_scores(machine)
     given = [(0, 1, 2), (1, 5, 0), (3, 2, 6)]
     entry = scene([0, 1, 2, 5, 5, 6], given)
-    batch = tensors([entry], machine.spec.V).batch(torch.tensor([0]))
+    # A larger scene beside it pads its rows. The seed form draws, even where nothing is given, and
+    # draws depend on the scene beside.
+    local = machine.spec.form == "local"
+    beside = [scene([0, 1, 2, 3, 4, 5, 6, 7], [(0, 1, 2)])] if local else []
+    data = tensors([entry, *beside], machine.spec.V)
+    batch = data.batch(torch.arange(len(data)))
     batch = telling(batch, batch.holds > 0)
-    things = tuple(SceneObject(str(k), "x", int(c)) for k, c in enumerate(entry.instance_classes))
-    first = {int(c): k for k, c in reversed(list(enumerate(entry.instance_classes)))}
-    triples = tuple((a, first[i], first[j]) for a, i, j in given)
-    given_posterior = DrawnPosterior(artifact_of(machine), Scene(things, triples))
-    expected = given_posterior.relation_log_odds()
-    ours = given_score(machine)(batch)[0].clamp(min=NO_UNIT)
-    torch.testing.assert_close(ours, torch.from_numpy(expected), rtol=1e-4, atol=1e-4)
+    n = len(entry.evidence.classes)
+    for score, triples in ((scores.completion, given), (scores.relations, ()))[: 1 + local]:
+        asked = posterior(artifact, in_scene(entry.instance_classes, triples))
+        ours = score(batch)[0, :, :n, :n].clamp(min=NO_UNIT)
+        expected = torch.from_numpy(asked.relation_log_odds())
+        torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", LARGER)

@@ -18,7 +18,8 @@ from tests.training.evaluation.scenes import (
     tensors,
 )
 from tests.training.evaluation.test_completion import larger_machine
-from training.evaluation.placed import Places, leave_one_out_at, machine_score, removed_places
+from training.evaluation.placed import Places, leave_one_out_at, removed_places
+from training.evaluation.scores import machine_scores
 
 DATA = tensors(random_scenes(20), WIDE)
 
@@ -112,8 +113,6 @@ def test_the_score_is_the_service_s(name, outgoing):
     """Softmax of the score over absent classes is the answer of the service, uncalibrated."""
     machine = larger_machine(name)
     artifact = artifact_of(machine)
-    # Both from draws: where the service has a closed form, that is another estimate of the same.
-    vars(artifact)["closed_form"] = None
     classes, relation, anchor = [0, 2, 2, 5], 2, 2
     things = tuple(SceneObject(str(k), "x", c) for k, c in enumerate(classes))
     spoken = CANONICAL[relation] if outgoing else OPPOSITES[CANONICAL[relation]]
@@ -129,7 +128,7 @@ def test_the_score_is_the_service_s(name, outgoing):
     both = Places(
         *(torch.cat([getattr(x, n) for x in (places, other)]) for n in Places.__dataclass_fields__)
     )
-    values = machine_score(machine)(both)[0].double()
+    values = machine_scores(machine).placed(both)[0].double()
     labels = artifact.vocabulary.labels
     absent = [labels.index(answer.label) for answer in answers]
     expected = torch.tensor([answer.probability for answer in answers]).double()

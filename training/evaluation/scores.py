@@ -1,0 +1,106 @@
+"""A machine's scores of relations and of classes at a place, by the estimate the service uses.
+
+Machines that have a closed form (see `app.boltzmann.closed_form`) are scored by it, the others by
+draws of the context, in the module of each task.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine
+from app.boltzmann.closed_form import ClosedForm, Given
+from app.boltzmann.scoring import ContextScorer
+from training.batches import Batch
+from training.evaluation import placed, relations
+from training.evaluation.completion import given_score
+from training.evaluation.placed import PlacedScore, Places
+from training.evaluation.relations import RelationScore
+
+
+@dataclass(frozen=True, eq=False)
+class MachineScores:
+    """Scores of one machine.
+
+    Attributes:
+        relations: T1a, whatever the batch says of relations.
+        completion: T1b and T3b, given the batch's observed relations, each without itself.
+        placed: T2-at.
+    """
+
+    relations: RelationScore
+    completion: RelationScore
+    placed: PlacedScore
+
+
+def machine_scores(machine: BoltzmannMachine, *, relation_weight: float = 1.0) -> MachineScores:
+    """In closed form where there is one.
+
+    Args:
+        relation_weight: see `placed.machine_score`.
+    """
+    if not ClosedForm.fits(machine):
+        return MachineScores(
+            relations.machine_score(machine),
+            given_score(machine),
+            placed.machine_score(machine, relation_weight=relation_weight),
+        )
+    closed = ClosedForm(machine)
+    return MachineScores(
+        _relation_score(closed, given=False),
+        _relation_score(closed, given=True),
+        _placed_score(closed, ContextScorer(machine), relation_weight),
+    )
+
+
+def _relation_score(closed: ClosedForm, *, given: bool) -> RelationScore:
+    def score(batch: Batch) -> Tensor:
+        found = torch.full(batch.holds.shape, -torch.inf)
+        for row, padded in enumerate(batch.classes):
+            n = int((padded >= 0).sum())
+            told = _given(batch, row, n) if given else None
+            context = closed.context(
+                padded[:n].numpy(), np.ones(n, np.float32), _logs(batch.counts[row, :n]), None, told
+            )
+            found[row, :, :n, :n] = torch.from_numpy(closed.relation_log_odds(context))
+        return found
+
+    return score
+
+
+def _given(batch: Batch, row: int, n: int) -> Given:
+    a, i, j = batch.observed[row, :, :n, :n].numpy().nonzero()
+    holds = batch.holds[row].numpy()[a, i, j]
+    return Given(a, i, j, holds, np.ones_like(holds))
+
+
+def _placed_score(closed: ClosedForm, scorer: ContextScorer, relation_weight: float) -> PlacedScore:
+    def score(places: Places) -> Tensor:
+        found = torch.full(places.v.shape, -torch.inf)
+        for row, v in enumerate(places.v):
+            (classes,), (absent,) = v.numpy().nonzero(), (v == 0).numpy().nonzero()
+            context = closed.context(
+                classes, np.ones(len(classes), np.float32), _logs(places.counts[row, classes])
+            )
+            log_odds = closed.placed_log_odds(
+                *(context, absent, int(places.relation[row])),
+                int(np.searchsorted(classes, int(places.anchor[row]))),
+                bool(places.outgoing[row]),
+            )
+            values = (closed.b + scorer.row_gain(context.y))[absent]
+            values -= np.float32(relation_weight) * np.logaddexp(np.float32(0.0), -log_odds)
+            found[row, absent] = torch.from_numpy(values)
+        return found
+
+    return score
+
+
+def _logs(counts: Tensor) -> NDArray[np.float32]:
+    """Log of the instances; where nobody counted, that of one."""
+    logs: NDArray[np.float32] = counts.clamp(min=1).float().log().numpy()
+    return logs
