@@ -1,7 +1,7 @@
 """The last phase of training: the machine's own chains are brought to the data.
 
 Conditional likelihoods make a machine that answers well and dreams badly: scenes half as full
-again as real ones. Some hundred updates of persistent contrastive divergence with many chains, on
+again as real ones. Updates of persistent contrastive divergence with many chains, on
 the object part alone, mend that and leave the answers as they were; a term
 
     anchor · sum (θ - θ_before)²
