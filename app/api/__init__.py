@@ -35,9 +35,7 @@ def build(
     app.state.settings = settings
     app.state.runtime = runtime
     problems.install(app)
-    app.add_middleware(middleware.BodyLimit, limit=settings.max_body_bytes)
-    # Added last, so outermost: an answer of the limit above carries the id as well.
-    app.add_middleware(middleware.RequestContext, access_log=settings.access_log)
+    middleware.install(app, settings)
     for router in (
         questions.router,
         batches.router,

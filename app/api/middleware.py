@@ -11,16 +11,25 @@ import time
 import uuid
 from typing import Final
 
+from fastapi import FastAPI
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api import catalogue
 from app.api.problems import ProblemError, respond
+from app.settings import Settings
 
 REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._~:-]{1,128}")
 
 _access = logging.getLogger("app.access")
+
+
+def install(app: FastAPI, settings: Settings) -> None:
+    """Add all of it to an application."""
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    # Added last, so outermost: an answer of the limit above carries the id as well.
+    app.add_middleware(RequestContext, access_log=settings.access_log)
 
 
 class RequestContext:

@@ -1,0 +1,208 @@
+"""``python -m benchmarks.load``: the running service under load, against an echo of it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import httpx
+import matplotlib as mpl
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.load import servers
+from benchmarks.load.measure import Comparison, compare, concurrency, rate
+from benchmarks.load.questions import KINDS, ROUTES, requests
+from benchmarks.report import describe_machine
+
+_MANY = 32
+_QUANTILES = (0.5, 0.9, 0.99, 0.999)
+# At a rate that leaves the service air: half of what the echo answers at 32 connections.
+_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """What a kind of request has to reach.
+
+    Attributes:
+        rate: at least so much of the echo's rate at 32 connections.
+        p99: at most so many times the echo's p99 there; None where nothing is asked.
+        p50: at most so many seconds above the echo's p50 at one connection.
+    """
+
+    rate: float
+    p99: float | None
+    p50: float
+
+
+AIMS = {
+    "12 labels": Aim(0.7, 1.5, 1e-3),
+    "12 poses": Aim(0.4, None, 3e-3),
+    "20 relations": Aim(0.4, None, 3e-3),
+}
+
+
+def main(
+    store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
+    seconds: Annotated[float, typer.Option(min=0.1, help="of one window")] = 1.5,
+    kind: Annotated[list[str] | None, typer.Option(help="only these kinds of request")] = None,
+    json_path: Annotated[Path | None, typer.Option("--json", help="every figure")] = None,
+    plot: Annotated[Path | None, typer.Option(help="latency distributions, as an image")] = None,
+) -> None:
+    """Ask the service and its echo the same, in turns, until both are steady."""
+    console = Console(width=140)
+    for key, value in describe_machine().items():
+        console.print(f"{key}: {value}", highlight=False)
+    found: list[Comparison] = []
+    facts: dict[str, float] = {}
+    with ExitStack() as stack:
+        own = os.sched_getaffinity(0)
+        stack.callback(os.sched_setaffinity, 0, own)
+        settings = {"access_log": "false"}
+        service = stack.enter_context(servers.service(store, **settings))
+        echo = stack.enter_context(servers.echo(store=str(store.resolve()), **settings))
+        os.sched_setaffinity(0, servers.cores()[1])
+        facts["start to ready, s"] = service.seconds
+        labels = _labels(service.port)
+        for comparison in _all(service.port, echo.port, kind or KINDS, labels, seconds):
+            found.append(comparison)
+            console.print(_line(comparison), highlight=False)
+        facts["resident memory, MB"] = service.memory / 1e6
+    console.print(_table(found))
+    for name, value in facts.items():
+        console.print(f"{name}: {value:.3g}", highlight=False)
+    if json_path is not None:
+        document = {
+            "machine": describe_machine(),
+            "facts": facts,
+            "results": [_record(comparison) for comparison in found],
+        }
+        json_path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    if plot is not None:
+        _plot(found, plot)
+
+
+def _labels(port: int) -> list[str]:
+    url = f"http://127.0.0.1:{port}/models/default/vocabulary"
+    entries = httpx.get(url).raise_for_status().json()["objects"]
+    return [entry["label"] for entry in entries if not entry["structure"]]
+
+
+def _all(
+    service: int, echo: int, kinds: Sequence[str], labels: Sequence[str], seconds: float
+) -> Iterator[Comparison]:
+    ports = (service, echo)
+    for kind in kinds:
+        for route in ROUTES:
+            bodies = requests(kind, route, labels)
+            many = compare(
+                ports,
+                bodies,
+                concurrency(_MANY),
+                (kind, route, f"{_MANY} connections"),
+                seconds=seconds,
+            )
+            yield many
+            yield compare(
+                ports, bodies, concurrency(1), (kind, route, "1 connection"), seconds=seconds
+            )
+            due = round(_SHARE * many.service.rate, -2) or _SHARE * many.service.rate
+            yield compare(
+                ports, bodies, rate(due), (kind, route, f"{due:.0f} a second"), seconds=seconds
+            )
+
+
+def _line(c: Comparison) -> str:
+    steady = "" if c.steady else "  (not steady)"
+    return f"{c.kind}, {c.route}, {c.load}: {c.rate_ratio:.2f} of the echo's rate{steady}"
+
+
+def _table(found: Sequence[Comparison]) -> Table:
+    table = Table(title="The service beside its echo (service / echo; milliseconds)")
+    for column in ("request", "load", "req/s", "ratio", "p50", "p90", "p99", "p99.9", "errors"):
+        table.add_column(column, justify="left" if column in ("request", "load") else "right")
+    table.add_column("aim")
+    for c in found:
+        latencies = [
+            f"{c.service.quantile(q) * 1e3:.2f} / {c.echo.quantile(q) * 1e3:.2f}"
+            for q in _QUANTILES
+        ]
+        table.add_row(
+            f"{c.route}, {c.kind}",
+            c.load,
+            f"{c.service.rate:,.0f} / {c.echo.rate:,.0f}",
+            f"{c.rate_ratio:.2f}",
+            *latencies,
+            f"{c.service.errors} / {c.echo.errors}",
+            _verdict(c),
+        )
+    return table
+
+
+def _verdict(c: Comparison) -> str:
+    aim = AIMS.get(c.kind)
+    if aim is None:
+        return ""
+    if c.load == f"{_MANY} connections":
+        said = [_met(c.rate_ratio >= aim.rate, f"≥ {aim.rate} of the rate")]
+        if aim.p99 is not None:
+            said.append(_met(c.p99_ratio <= aim.p99, f"p99 {c.p99_ratio:.2f} ≤ {aim.p99}"))
+        return ", ".join(said)
+    if c.load == "1 connection":
+        extra = c.extra_p50 * 1e3
+        return _met(c.extra_p50 <= aim.p50, f"p50 + {extra:.2f} ≤ {aim.p50 * 1e3:.0f} ms")
+    return ""
+
+
+def _met(so: bool, what: str) -> str:
+    return f"{'met' if so else 'MISSED'}: {what}"
+
+
+def _record(c: Comparison) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "kind": c.kind,
+        "route": c.route,
+        "load": c.load,
+        "steady": c.steady,
+        "ratios": list(c.ratios),
+    }
+    for name, window in (("service", c.service), ("echo", c.echo)):
+        record[name] = {
+            "rate": window.rate,
+            "errors": window.errors,
+            **{f"p{100 * q:g}": window.quantile(q) for q in _QUANTILES},
+        }
+    return record
+
+
+def _plot(found: Sequence[Comparison], path: Path) -> None:
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    shown = [c for c in found if c.load == f"{_MANY} connections"]
+    figure, axes = plt.subplots(
+        len(shown) // len(ROUTES) or 1, len(ROUTES), figsize=(12, 9), squeeze=False, sharey=True
+    )
+    for c, axis in zip(shown, axes.flat, strict=False):
+        for name, window in (("service", c.service), ("echo", c.echo)):
+            times = sorted(window.latency * 1e3)
+            share = [(k + 1) / len(times) for k in range(len(times))]
+            axis.step(times, share, label=name)
+        axis.set_title(f"{c.route}, {c.kind}")
+        axis.set_xscale("log")
+        axis.set_xlabel("ms")
+    axes[0, 0].set_ylabel(f"share of answers, {_MANY} connections")
+    axes[0, 0].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=100)
+
+
+if __name__ == "__main__":
+    typer.run(main)

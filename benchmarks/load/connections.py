@@ -1,0 +1,95 @@
+"""HTTP/1.1 connections that cost the client next to nothing: prepared bytes out, a status in."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any
+
+_END_OF_HEAD = b"\r\n\r\n"
+_LENGTH = b"content-length:"
+
+
+def prepared(path: str, body: Any, headers: dict[str, str] | None = None) -> bytes:
+    """A POST of a JSON body as it goes over the wire."""
+    content = json.dumps(body, separators=(",", ":")).encode()
+    lines = [
+        f"POST {path} HTTP/1.1",
+        "host: 127.0.0.1",
+        "content-type: application/json",
+        f"content-length: {len(content)}",
+        *(f"{name}: {value}" for name, value in (headers or {}).items()),
+    ]
+    return "\r\n".join(lines).encode() + _END_OF_HEAD + content
+
+
+class Connection(asyncio.Protocol):
+    """One connection with at most one request under way.
+
+    Attributes:
+        on_answer: called with (this connection, status, body) once an answer is complete; status 0
+            stands for a connection that broke.
+    """
+
+    def __init__(self, on_answer: Callable[[Connection, int, bytes], None]) -> None:
+        self.on_answer = on_answer
+        self.busy = False
+        self._transport: asyncio.Transport | None = None
+        self._received = b""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+
+    def send(self, request: bytes) -> None:
+        """Send a request; the answer comes to `on_answer`."""
+        assert self._transport is not None
+        self.busy = True
+        self._transport.write(request)
+
+    def data_received(self, data: bytes) -> None:
+        self._received += data
+        head = self._received.find(_END_OF_HEAD)
+        if head < 0:
+            return
+        start = self._received.lower().find(_LENGTH, 0, head)
+        end = head + len(_END_OF_HEAD)
+        if start >= 0:
+            value = self._received[start + len(_LENGTH) : head].split(b"\r\n", 1)[0]
+            end += int(value)
+        if len(self._received) < end:
+            return
+        status, body = int(self._received[9:12]), self._received[head + len(_END_OF_HEAD) : end]
+        self._received = self._received[end:]
+        self.busy = False
+        self.on_answer(self, status, body)
+
+    def connection_lost(self, _: Exception | None) -> None:
+        if self.busy:
+            self.busy = False
+            self.on_answer(self, 0, b"")
+
+    def close(self) -> None:
+        """Close the connection; what is under way is lost."""
+        self.busy = False
+        if self._transport is not None:
+            self._transport.close()
+
+
+async def connect(
+    port: int, count: int, on_answer: Callable[[Connection, int, bytes], None]
+) -> list[Connection]:
+    """So many connections to a port of this machine.
+
+    Raises:
+        OSError: nobody listens.
+    """
+    loop = asyncio.get_running_loop()
+    made = []
+    for _ in range(count):
+        _, connection = await loop.create_connection(
+            lambda: Connection(on_answer), "127.0.0.1", port
+        )
+        made.append(connection)
+    return made

@@ -1,0 +1,150 @@
+"""``python -m benchmarks.load.echo PORT``: the service without a model.
+
+The same schemas, routes, strict bodies, middleware and server; answers of the usual size are built
+from the names of the request, and mean nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import uvicorn
+from fastapi import APIRouter, FastAPI
+
+from app.api import middleware, problems
+from app.api.body import JSONRoute
+from app.api.dependencies import RequestId
+from app.schemas import (
+    Because,
+    Health,
+    MissingAnswer,
+    MissingObject,
+    MissingRequest,
+    ModelReference,
+    Outlier,
+    OutliersAnswer,
+    OutliersRequest,
+    Placement,
+    RelationsAnswer,
+    RelationsRequest,
+    SceneRequest,
+    ScoredRelation,
+)
+from app.serving.logs import log_config
+from app.settings import Settings
+
+_MODEL = ModelReference(name="echo", version="1.0.0", variant="triway", digest="0" * 64)
+
+router = APIRouter(route_class=JSONRoute)
+
+
+def _names(request: SceneRequest) -> list[str]:
+    return [
+        entry if isinstance(entry, str) else entry.id or entry.label for entry in request.objects
+    ]
+
+
+def _envelope(request: SceneRequest, request_id: str) -> dict[str, Any]:
+    return {
+        "model": _MODEL,
+        "request_id": request_id,
+        "frame_id": request.frame_id,
+        "stamp": request.stamp,
+    }
+
+
+@router.post("/relations", response_model_exclude_none=True)
+async def relations(request: RelationsRequest, request_id: RequestId) -> RelationsAnswer:
+    names = _names(request)
+    return RelationsAnswer(
+        **_envelope(request, request_id),
+        relations=[
+            ScoredRelation(
+                subject=names[k % len(names)],
+                relation="left",
+                object=names[-1 - k % len(names)],
+                probability=0.123456789,
+            )
+            for k in range(request.top_k)
+        ],
+    )
+
+
+@router.post("/missing", response_model_exclude_none=True)
+async def missing(request: MissingRequest, request_id: RequestId) -> MissingAnswer:
+    names = _names(request)
+    return MissingAnswer(
+        **_envelope(request, request_id),
+        missing=[
+            MissingObject(
+                label=names[k % len(names)],
+                probability=0.123456789,
+                log_odds=-1.23456789,
+                placements=[
+                    Placement(
+                        relation="left", object=names[p % len(names)], probability=0.123456789
+                    )
+                    for p in range(3)
+                ],
+            )
+            for k in range(request.top_k)
+        ],
+    )
+
+
+@router.post("/outliers", response_model_exclude_none=True)
+async def outliers(request: OutliersRequest, request_id: RequestId) -> OutliersAnswer:
+    names = _names(request)
+    return OutliersAnswer(
+        **_envelope(request, request_id),
+        outliers=[
+            Outlier(
+                object=name,
+                label=name,
+                probability=0.123456789,
+                log_odds=-1.23456789,
+                is_outlier=False,
+                because=[
+                    Because(object=names[k % len(names)], log_odds_change=-0.123456789)
+                    for k in range(3)
+                ],
+            )
+            for name in names
+        ],
+        misplaced=[
+            ScoredRelation(
+                subject=relation.subject,
+                relation=relation.relation,
+                object=relation.object,
+                probability=0.123456789,
+            )
+            for relation in request.relations or ()
+        ],
+    )
+
+
+def build(settings: Settings) -> FastAPI:
+    """The echo, with the middleware of the service."""
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.settings = settings
+    problems.install(app)
+    middleware.install(app, settings)
+    app.include_router(router)
+
+    @app.get("/health/ready")
+    async def ready() -> Health:
+        return Health(status="ready")
+
+    return app
+
+
+if __name__ == "__main__":
+    settings = Settings()
+    uvicorn.run(
+        build(settings),
+        port=int(sys.argv[1]),
+        log_config=log_config(settings.log_level, settings.log_format),
+        access_log=False,
+        server_header=False,
+    )

@@ -1,0 +1,110 @@
+"""The service beside its echo, window by window, until both are steady."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, TypeAlias
+
+import uvloop
+
+from benchmarks.load.windows import Window, at_concurrency, at_rate, joined
+
+Load: TypeAlias = Callable[[int, Sequence[bytes], float], Coroutine[Any, Any, Window]]
+"""(port, requests, seconds) to a window."""
+
+_STEADY = 0.1
+_FEWEST, _MOST = 3, 10
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The same requests to both.
+
+    Attributes:
+        kind, route, load: what was asked, and how.
+        service, echo: all windows of each, joined.
+        ratios: of the rates, window by window.
+        steady: the last three windows of both were within a tenth of each other.
+    """
+
+    kind: str
+    route: str
+    load: str
+    service: Window
+    echo: Window
+    ratios: tuple[float, ...]
+    steady: bool
+
+    @property
+    def rate_ratio(self) -> float:
+        """Median over windows of the service's rate over the echo's."""
+        return median(self.ratios)
+
+    @property
+    def p99_ratio(self) -> float:
+        """The service's p99 over the echo's."""
+        return self.service.quantile(0.99) / self.echo.quantile(0.99)
+
+    @property
+    def extra_p50(self) -> float:
+        """Seconds that the service's p50 is above the echo's."""
+        return self.service.quantile(0.5) - self.echo.quantile(0.5)
+
+
+def concurrency(connections: int) -> Load:
+    """So many connections without pause."""
+
+    async def load(port: int, requests: Sequence[bytes], seconds: float) -> Window:
+        return await at_concurrency(port, requests, connections, seconds)
+
+    return load
+
+
+def rate(a_second: float) -> Load:
+    """So many requests a second, whatever becomes of them."""
+
+    async def load(port: int, requests: Sequence[bytes], seconds: float) -> Window:
+        return await at_rate(port, requests, a_second, seconds)
+
+    return load
+
+
+def compare(
+    ports: tuple[int, int],
+    requests: Sequence[bytes],
+    load: Load,
+    names: tuple[str, str, str],
+    *,
+    seconds: float,
+) -> Comparison:
+    """Take turns until both are steady, or ten times.
+
+    Args:
+        ports: of the service and of the echo.
+        names: kind, route and load.
+        seconds: of one window.
+    """
+    found: tuple[list[Window], list[Window]] = ([], [])
+    for port in ports:
+        uvloop.run(load(port, requests, seconds / 3))
+    steady = False
+    while not steady and len(found[0]) < _MOST:
+        for port, windows in zip(ports, found, strict=True):
+            windows.append(uvloop.run(load(port, requests, seconds)))
+        steady = len(found[0]) >= _FEWEST and all(map(is_steady, found))
+    service, echo = (joined(windows) for windows in found)
+    pairs = zip(*found, strict=True)
+    ratios = tuple(ours.rate / theirs.rate for ours, theirs in pairs)
+    return Comparison(*names, service, echo, ratios, steady)
+
+
+def is_steady(windows: Sequence[Window]) -> bool:
+    """Whether the rates and p50 of the last three windows are within a tenth of their mean."""
+    last = windows[-_FEWEST:]
+    for values in ([w.rate for w in last], [w.quantile(0.5) for w in last]):
+        mean = sum(values) / len(values)
+        if max(abs(value - mean) for value in values) > _STEADY * mean:
+            return False
+    return True

@@ -1,0 +1,67 @@
+"""What is asked under load: scenes of a dozen objects, all different, as bodies ready to send."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.load.connections import prepared
+
+ROUTES = ("/missing", "/relations", "/outliers")
+KINDS = ("12 labels", "12 poses", "20 relations")
+SCENES = 64
+"""More than there are connections, so that no two requests under way are alike."""
+
+_OBJECTS, _RELATIONS = 12, 20
+
+
+def bodies(kind: str, labels: Sequence[str], seed: int = 0) -> list[dict[str, Any]]:
+    """Scenes of one kind.
+
+    Raises:
+        ValueError: no such kind.
+    """
+    rng = np.random.default_rng(seed)
+    return [_body(kind, labels, rng) for _ in range(SCENES)]
+
+
+def requests(kind: str, route: str, labels: Sequence[str]) -> list[bytes]:
+    """The same as they go over the wire."""
+    return [prepared(route, body) for body in bodies(kind, labels)]
+
+
+def _body(kind: str, labels: Sequence[str], rng: np.random.Generator) -> dict[str, Any]:
+    chosen = [labels[k] for k in rng.choice(len(labels), _OBJECTS, replace=False)]
+    if kind == "12 labels":
+        return {"objects": chosen}
+    if kind == "12 poses":
+        places = np.c_[rng.uniform(0, 3, (_OBJECTS, 2)), rng.uniform(0, 1, _OBJECTS)].round(3)
+        size = {"x": 0.5, "y": 0.5, "z": 0.5}
+        return {
+            "frame_id": "base_link",
+            "objects": [
+                {"id": f"o{k}", "label": label, "position": dict(zip("xyz", place, strict=True)),
+                 "size": size}
+                for k, (label, place) in enumerate(zip(chosen, places.tolist(), strict=True))
+            ],
+        }  # fmt: skip
+    if kind == "20 relations":
+        triples: dict[tuple[int, int, int], None] = {}
+        while len(triples) < _RELATIONS:
+            a, i, j = (int(x) for x in rng.integers((3, _OBJECTS, _OBJECTS)))
+            if i != j and (a, j, i) not in triples:
+                triples[a, i, j] = None
+        return {
+            "objects": chosen,
+            "relations": [
+                {
+                    "subject": chosen[i],
+                    "relation": ("left", "front", "on-top")[a],
+                    "object": chosen[j],
+                }
+                for a, i, j in triples
+            ],
+        }
+    raise ValueError(f"{kind!r} is none of {KINDS}")

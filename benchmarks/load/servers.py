@@ -1,0 +1,113 @@
+"""The service and its echo, each a process of its own on a core of its own."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+_PATIENCE = 60.0
+_ROOT = Path(__file__).resolve().parents[2]
+
+
+class ServerError(RuntimeError):
+    """A server ended, or was not ready in time."""
+
+
+@dataclass(frozen=True)
+class Server:
+    """A server that is ready.
+
+    Attributes:
+        port: on 127.0.0.1.
+        pid: of its process.
+        seconds: from the start of the process to the first 200 of /health/ready.
+    """
+
+    port: int
+    pid: int
+    seconds: float
+
+    @property
+    def memory(self) -> int:
+        """Resident bytes."""
+        pages = Path(f"/proc/{self.pid}/statm").read_text("ascii").split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+
+def cores() -> tuple[set[int], set[int]]:
+    """For the servers, and for the client: one each where there are two, else all."""
+    every = sorted(os.sched_getaffinity(0))
+    return ({every[0]}, set(every[1:])) if len(every) > 1 else (set(every), set(every))
+
+
+@contextmanager
+def service(store: Path, **settings: str) -> Iterator[Server]:
+    """``python -m app``; settings by name, as SCENE_*."""
+    port = _free_port()
+    variables = {"SCENE_STORE": str(store.resolve()), "SCENE_PORT": str(port)}
+    variables |= {f"SCENE_{name.upper()}": value for name, value in settings.items()}
+    with _running(["-m", "app"], port, variables) as server:
+        yield server
+
+
+@contextmanager
+def echo(**settings: str) -> Iterator[Server]:
+    """``python -m benchmarks.load.echo``."""
+    port = _free_port()
+    variables = {f"SCENE_{name.upper()}": value for name, value in settings.items()}
+    with _running(["-m", "benchmarks.load.echo", str(port)], port, variables) as server:
+        yield server
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextmanager
+def _running(arguments: list[str], port: int, variables: dict[str, str]) -> Iterator[Server]:
+    # The machine's own settings must not decide what is measured.
+    environment = {name: value for name, value in os.environ.items() if name[:6] != "SCENE_"}
+    start = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, *arguments],
+        cwd=_ROOT,
+        env=environment | variables,
+        stderr=subprocess.DEVNULL,
+    )
+    os.sched_setaffinity(process.pid, cores()[0])
+    try:
+        _wait(process, port, start)
+        yield Server(port, process.pid, time.perf_counter() - start)
+    finally:
+        process.terminate()
+        try:
+            process.wait(timeout=_PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _wait(process: subprocess.Popen[bytes], port: int, start: float) -> None:
+    with httpx.Client(timeout=_PATIENCE) as client:
+        while time.perf_counter() - start < _PATIENCE:
+            if process.poll() is not None:
+                raise ServerError(f"a server ended with status {process.returncode}")
+            try:
+                if client.get(f"http://127.0.0.1:{port}/health/ready").is_success:
+                    return
+            except httpx.TransportError:
+                pass
+            time.sleep(0.005)
+    raise ServerError(f"a server was not ready within {_PATIENCE:.0f} s")
