@@ -129,7 +129,7 @@ async def at_rate(
     start = perf_counter()
     for number in range(count):
         when = start + number / rate
-        while (pause := when - perf_counter()) > 0:
+        while (pause := when - perf_counter()) > 0:  # noqa: ASYNC110 - a clock, not an event
             await asyncio.sleep(pause if pause > 0.002 else 0)
         if free:
             send(free.pop(), when)
