@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 
-import uvicorn
 from pydantic import ValidationError
 
-from app.main import create_app
-from app.serving.logs import log_config
+from app.server import server
 from app.settings import Settings
 
 
@@ -25,15 +24,9 @@ def main() -> int:
             variable = "SCENE_" + "_".join(str(part) for part in fault["loc"]).upper()
             sys.stderr.write(f"{variable}: {fault['msg'].removeprefix('Value error, ')}\n")
         return 2
-    uvicorn.run(
-        create_app(settings),
-        host=settings.host,
-        port=settings.port,
-        root_path=settings.root_path,
-        log_config=log_config(settings.log_level, settings.log_format),
-        access_log=False,
-        server_header=False,
-    )
+    # Ctrl-C has ended the server in order by the time it comes up here.
+    with suppress(KeyboardInterrupt):
+        server(settings).run()
     return 0
 
 

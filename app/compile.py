@@ -5,10 +5,11 @@ The service does so by itself where it finds nothing compiled, and starts some t
 
 from __future__ import annotations
 
+import asyncio
 import sys
 
-from app.registry import Store, load_model_set
-from app.serving.models import prepare
+from app.serving.reading import Limits
+from app.serving.runtime import Runtime
 from app.settings import Settings
 
 
@@ -18,7 +19,11 @@ def main() -> int:
     Returns:
         The exit status: 1 where one of them cannot be used.
     """
-    failures = prepare(load_model_set(Store(Settings().store))).failures
+    settings = Settings()
+    runtime = Runtime(settings.store, Limits(), settings.queue_rows)
+    asyncio.run(runtime.start())
+    runtime.stop()
+    failures = runtime.models.failures
     for failure in failures.values():
         sys.stderr.write(f"{failure.subject}: {failure.reason}: {failure.detail}\n")
     return 1 if failures else 0

@@ -34,6 +34,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     runtime = Runtime(
         settings.store,
         Limits(objects=settings.max_objects, relations=settings.max_relations),
+        settings.queue_rows,
     )
 
     @asynccontextmanager
@@ -42,6 +43,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         # service that is alive and cannot answer for want of a second's patience.
         await runtime.start()
         yield
+        runtime.stop()
 
     return api.build(
         settings,

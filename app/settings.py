@@ -50,6 +50,25 @@ class Settings(BaseSettings):
     max_relations: Annotated[
         int, Field(ge=0, le=65536, description="most relations given in one scene")
     ] = 4096
+    queue_rows: Annotated[
+        int,
+        Field(
+            ge=256,
+            le=2**20,
+            description="most requests that wait to be read, and most scenes that wait for a model",
+        ),
+    ] = 512
+    request_timeout_ms: Annotated[
+        int,
+        Field(ge=1, le=600_000, description="of requests that send no X-Request-Timeout-Ms"),
+    ] = 10_000
+    drain_seconds: Annotated[
+        float,
+        Field(ge=0, le=300, description="from SIGTERM until the listening socket is closed"),
+    ] = 1.0
+    drain_timeout: Annotated[
+        int, Field(ge=1, le=3600, description="seconds that work under way may take after that")
+    ] = 30
     retry_after: Annotated[
         int, Field(ge=1, le=3600, description="seconds named in Retry-After when not ready")
     ] = 2

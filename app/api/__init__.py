@@ -35,7 +35,7 @@ def build(
     app.state.settings = settings
     app.state.runtime = runtime
     problems.install(app)
-    middleware.install(app, settings)
+    middleware.install(app, settings, lambda: runtime.draining)
     for router in (
         questions.router,
         batches.router,

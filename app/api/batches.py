@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from app.api import catalogue, examples
 from app.api.body import JSONRoute
 from app.api.dependencies import SessionDep
-from app.api.openapi import problems
+from app.api.openapi import queued
 from app.api.problems import from_exception, report_defect, unfit
 from app.schemas import (
     Answer,
@@ -28,12 +28,13 @@ from app.schemas import (
     SceneRequest,
 )
 from app.serving import questions
+from app.serving.models import DEFAULT
 from app.serving.session import Session
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
 AnswerT = TypeVar("AnswerT", bound=Answer)
 
-_PROBLEMS: Final = problems(
+_PROBLEMS: Final = queued(
     catalogue.NOT_JSON,
     catalogue.BODY_TOO_LARGE,
     catalogue.UNSUPPORTED_MEDIA_TYPE,
@@ -51,18 +52,26 @@ async def _answer_each(
     question: Callable[[Session, RequestT], Awaitable[AnswerT]],
 ) -> BatchAnswer[AnswerT]:
     results: list[BatchEntry[AnswerT]] = []
-    for place, scene in enumerate(batch.scenes):
-        try:
-            result = await question(session, _validated(scene, place, kind))
-            results.append(BatchEntry[AnswerT](status=200, result=result))
-        except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
-            problem = from_exception(error, at=("scenes", place)).describe(session.request_id)
-            if problem.status == 500:
-                report_defect(error, session.request_id)
-            results.append(BatchEntry[AnswerT](status=problem.status, problem=problem))
-        # Others are served between two scenes, health checks first of all.
-        await asyncio.sleep(0)
+    with session.for_batch([_reference(scene) for scene in batch.scenes]) as held:
+        for place, scene in enumerate(batch.scenes):
+            try:
+                held.ticket.check()
+                result = await question(held, _validated(scene, place, kind))
+                results.append(BatchEntry[AnswerT](status=200, result=result))
+            except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
+                problem = from_exception(error, at=("scenes", place)).describe(session.request_id)
+                if problem.status == 500:
+                    report_defect(error, session.request_id)
+                results.append(BatchEntry[AnswerT](status=problem.status, problem=problem))
+            # Others are served between two scenes, health checks first of all.
+            await asyncio.sleep(0)
     return BatchAnswer[AnswerT](request_id=session.request_id, results=results)
+
+
+def _reference(scene: Any) -> str:
+    """The model that a scene names, before it has been validated."""
+    found = scene.get("model", DEFAULT) if isinstance(scene, dict) else DEFAULT
+    return found if isinstance(found, str) else DEFAULT
 
 
 def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:

@@ -40,7 +40,8 @@ BAD_REQUEST: Final = ProblemType(
     "bad-request",
     400,
     "The request could not be read",
-    "The connection broke off or the request breaks HTTP. Send it again.",
+    "The connection broke off, the request breaks HTTP, or its X-Request-Timeout-Ms is no whole "
+    "number of milliseconds from 1 to 600000.",
 )
 UNAUTHORIZED: Final = ProblemType(
     "unauthorized",
@@ -136,6 +137,27 @@ CONTRADICTORY_EVIDENCE: Final = ProblemType(
     "No scene can be like that: an object stands in a relation to itself, or a pair stands both in "
     "a relation and in its opposite (left and right, on-top and under).",
 )
+QUEUE_FULL: Final = ProblemType(
+    "queue-full",
+    429,
+    "Too much is waiting already",
+    "More requests, or scenes for this model, are waiting than the service holds "
+    "(SCENE_QUEUE_ROWS). Nothing of this one was computed. Retry-After says when to ask again.",
+)
+DEADLINE_PASSED: Final = ProblemType(
+    "deadline-passed",
+    504,
+    "The deadline passed",
+    "The time of the request, X-Request-Timeout-Ms or else SCENE_REQUEST_TIMEOUT_MS, was over "
+    "before its answer was there. Its work was dropped.",
+)
+DRAINING: Final = ProblemType(
+    "draining",
+    503,
+    "The service is ending",
+    "It finishes what it has begun and takes nothing new. Ask another instance, or this one after "
+    "Retry-After.",
+)
 NOT_READY: Final = ProblemType(
     "not-ready",
     503,
@@ -179,5 +201,8 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         INTERNAL_ERROR,
         NOT_READY,
         MODEL_UNAVAILABLE,
+        DRAINING,
+        QUEUE_FULL,
+        DEADLINE_PASSED,
     )
 }

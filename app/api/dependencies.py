@@ -7,6 +7,7 @@ from typing import Annotated, cast
 from fastapi import Depends
 from starlette.requests import Request
 
+from app.serving.queue import Ticket
 from app.serving.runtime import Runtime
 from app.serving.session import Session
 
@@ -22,7 +23,8 @@ async def _request_id(request: Request) -> str:
 
 
 async def _session(request: Request) -> Session:
-    return (await _runtime(request)).session(await _request_id(request))
+    ticket = Ticket(request.state.deadline, request.is_disconnected)
+    return (await _runtime(request)).session(await _request_id(request), ticket)
 
 
 RuntimeDep = Annotated[Runtime, Depends(_runtime)]

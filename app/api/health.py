@@ -11,7 +11,7 @@ from fastapi import APIRouter
 from app import __version__
 from app.api import catalogue
 from app.api.dependencies import RuntimeDep
-from app.api.openapi import problems
+from app.api.openapi import problems, queued
 from app.schemas import (
     Health,
     ModelMetadata,
@@ -24,8 +24,8 @@ from app.schemas import (
 router = APIRouter(tags=["health"])
 protocol = APIRouter(prefix="/v2", tags=["inference protocol"])
 
-_NOT_READY = problems(catalogue.NOT_READY)
-_NO_MODEL = problems(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
+_NOT_READY = problems(catalogue.NOT_READY, catalogue.DRAINING)
+_NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
 
 
 @router.get("/health/live", summary="Is the process alive?", responses=problems())
@@ -41,7 +41,7 @@ async def health_ready(runtime: RuntimeDep) -> Health:
     return Health(status="ready")
 
 
-@protocol.get("", summary="Server metadata", responses=problems())
+@protocol.get("", summary="Server metadata", responses=queued())
 async def server_metadata() -> ServerMetadata:
     """Name and version of the server."""
     return ServerMetadata(name="scene-boltzmann", version=__version__, extensions=[])

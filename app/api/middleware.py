@@ -9,6 +9,7 @@ import logging
 import re
 import time
 import uuid
+from collections.abc import Callable
 from typing import Final
 
 from fastapi import FastAPI
@@ -18,17 +19,29 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api import catalogue
 from app.api.problems import ProblemError, respond
+from app.api.turnstile import Turnstile
 from app.settings import Settings
 
 REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._~:-]{1,128}")
-
 _access = logging.getLogger("app.access")
 
 
-def install(app: FastAPI, settings: Settings) -> None:
-    """Add all of it to an application."""
+def install(
+    app: FastAPI, settings: Settings, is_draining: Callable[[], bool] = lambda: False
+) -> None:
+    """Add all of it to an application.
+
+    Args:
+        is_draining: whether nothing new is to be begun.
+    """
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
-    # Added last, so outermost: an answer of the limit above carries the id as well.
+    app.add_middleware(
+        Turnstile,
+        limit=settings.queue_rows,
+        timeout=settings.request_timeout_ms / 1e3,
+        is_draining=is_draining,
+    )
+    # Added last, so outermost: an answer of those above carries the id as well.
     app.add_middleware(RequestContext, access_log=settings.access_log)
 
 

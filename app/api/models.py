@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path
 
 from app.api import admin, catalogue
 from app.api.dependencies import RequestId, RuntimeDep
-from app.api.openapi import problems
+from app.api.openapi import queued
 from app.schemas import (
     AliasAnswer,
     AliasRequest,
@@ -21,10 +21,8 @@ from app.schemas import (
 )
 from app.serving import describe
 
-_PROBLEMS: Final = problems(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY)
-_USABLE: Final = problems(
-    catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE
-)
+_PROBLEMS: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY)
+_USABLE: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
 
 Reference = Annotated[
     str, Path(description="an alias, `name` (its newest version) or `name@version`")
@@ -42,7 +40,7 @@ administration = APIRouter(
 @router.get(
     "",
     summary="Models, versions and aliases",
-    responses=problems(catalogue.NOT_READY),
+    responses=queued(catalogue.NOT_READY),
     response_model_exclude_none=True,
 )
 async def list_models(runtime: RuntimeDep) -> ModelList:
@@ -82,7 +80,7 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
 @administration.post(
     "/refresh",
     summary="Take over what the store holds now",
-    responses=problems(catalogue.UNAUTHORIZED, catalogue.REFRESH_REFUSED),
+    responses=queued(catalogue.UNAUTHORIZED, catalogue.REFRESH_REFUSED),
     response_model_exclude_none=True,
 )
 async def refresh_models(runtime: RuntimeDep, request_id: RequestId) -> RefreshAnswer:
@@ -96,7 +94,7 @@ async def refresh_models(runtime: RuntimeDep, request_id: RequestId) -> RefreshA
 @administration.put(
     "/aliases/{alias}",
     summary="Promote or roll back",
-    responses=problems(
+    responses=queued(
         catalogue.NOT_JSON,
         catalogue.UNAUTHORIZED,
         catalogue.MODEL_NOT_FOUND,

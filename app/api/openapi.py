@@ -10,6 +10,7 @@ from fastapi.routing import APIRoute
 from app.api import catalogue, examples
 from app.api.catalogue import ProblemType
 from app.api.problems import MEDIA_TYPE, ProblemError
+from app.api.turnstile import MAX_TIMEOUT_MS, TIMEOUT_HEADER
 from app.schemas import FieldError, Problem
 
 Responses = dict[int | str, dict[str, Any]]
@@ -33,6 +34,14 @@ _ERRORS: Final = {
             message="contradicts an earlier relation, which says the opposite of this pair",
         )
     ],
+}
+_TIMEOUT_PARAMETER: Final = {
+    "name": TIMEOUT_HEADER,
+    "in": "header",
+    "required": False,
+    "description": "milliseconds after which nobody waits for the answer: work that has not begun "
+    "by then is dropped (504)",
+    "schema": {"type": "integer", "minimum": 1, "maximum": MAX_TIMEOUT_MS},
 }
 TAGS: Final = [
     {"name": "questions", "description": "The four questions about one scene."},
@@ -68,6 +77,17 @@ def problems(*kinds: ProblemType) -> Responses:
     return responses
 
 
+def queued(*kinds: ProblemType) -> Responses:
+    """The same of a route whose requests wait for their turn, and may have a deadline."""
+    return problems(
+        *kinds,
+        catalogue.BAD_REQUEST,
+        catalogue.QUEUE_FULL,
+        catalogue.DRAINING,
+        catalogue.DEADLINE_PASSED,
+    )
+
+
 def operation_id(route: APIRoute) -> str:
     """The name of the route's function: generated clients call the operation by it."""
     return route.name
@@ -87,6 +107,8 @@ class DocumentedAPI(FastAPI):
                 for operation in path.values():
                     ok = operation["responses"]["200"]["content"]["application/json"]
                     ok["example"] = examples.ANSWERS[operation["operationId"]]
+                    if "504" in operation["responses"]:
+                        operation.setdefault("parameters", []).append(_TIMEOUT_PARAMETER)
                     content = operation["responses"].get("422", {}).get("content", {})
                     if "application/json" in content:
                         del operation["responses"]["422"]

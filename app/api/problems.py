@@ -21,10 +21,14 @@ from app.api.pointers import pointer
 from app.schemas import Failure, FieldError, Problem
 from app.serving.errors import (
     AliasConflictError,
+    DeadlinePassedError,
+    DisconnectedError,
+    DrainingError,
     Location,
     ModelUnavailableError,
     ModelUnusableError,
     NotReadyError,
+    QueueFullError,
     Reason,
     RefreshRefusedError,
     RequestError,
@@ -135,6 +139,14 @@ def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
             return ProblemError(catalogue.MODEL_UNAVAILABLE, str(error))
         case NotReadyError():
             return ProblemError(catalogue.NOT_READY, str(error))
+        case QueueFullError():
+            return ProblemError(catalogue.QUEUE_FULL, str(error))
+        case DeadlinePassedError():
+            return ProblemError(catalogue.DEADLINE_PASSED, str(error))
+        case DrainingError():
+            return ProblemError(catalogue.DRAINING, str(error))
+        case DisconnectedError():
+            return ProblemError(catalogue.BAD_REQUEST, str(error))
         case AliasConflictError():
             return ProblemError(catalogue.ALIAS_CONFLICT, str(error))
         case ModelUnusableError():
@@ -197,7 +209,7 @@ def _request_id(request: Request) -> str:
 def respond(request: Request, problem: ProblemError) -> Response:
     """The problem as a response."""
     headers = dict(problem.headers or {})
-    if problem.status_code == 503:
+    if problem.status_code in (429, 503):
         headers["Retry-After"] = str(request.app.state.settings.retry_after)
     request_id = _request_id(request)
     return Response(

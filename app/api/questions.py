@@ -9,7 +9,7 @@ from fastapi import APIRouter
 from app.api import catalogue
 from app.api.body import JSONRoute
 from app.api.dependencies import SessionDep
-from app.api.openapi import problems
+from app.api.openapi import queued
 from app.schemas import (
     GenerateAnswer,
     GenerateRequest,
@@ -22,7 +22,7 @@ from app.schemas import (
 )
 from app.serving import questions
 
-PROBLEMS: Final = problems(
+PROBLEMS: Final = queued(
     catalogue.NOT_JSON,
     catalogue.MODEL_NOT_FOUND,
     catalogue.BODY_TOO_LARGE,

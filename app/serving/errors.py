@@ -60,6 +60,22 @@ class NotReadyError(ServingError):
     """Nothing is being served yet, or the default model is not usable."""
 
 
+class QueueFullError(ServingError):
+    """More is waiting than the service will hold."""
+
+
+class DeadlinePassedError(ServingError):
+    """The request's time was over before its answer was there."""
+
+
+class DisconnectedError(ServingError):
+    """Nobody waits for the answer any more."""
+
+
+class DrainingError(ServingError):
+    """The service is ending and takes nothing new."""
+
+
 class AliasConflictError(ServingError):
     """The alias does not lead where the request expected, or cannot have this name."""
 

@@ -8,7 +8,7 @@ in its place.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -18,6 +18,7 @@ from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreEr
 from app.scene.vocabulary import Vocabulary
 from app.schemas import Failure, ModelReference
 from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
+from app.serving.queue import WorkQueue
 from app.serving.warm_up import warm_up
 
 DEFAULT = "default"
@@ -34,10 +35,12 @@ class ServedModel:
     Attributes:
         artifact: what the reasoning works with.
         contexts: its hidden units by their strongest objects, layer by layer.
+        queue: its work.
     """
 
     artifact: Artifact
     contexts: Mapping[str, tuple[reasoning.ContextUnit, ...]]
+    queue: WorkQueue
 
     @cached_property
     def reference(self) -> ModelReference:
@@ -129,10 +132,13 @@ class ServedModels:
         return Failure(subject=alias, reason=cause.reason, detail=f"{name}@{version}")
 
 
-def prepare(store: ModelSet, previous: ServedModels | None = None) -> ServedModels:
+def prepare(
+    store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels | None = None
+) -> ServedModels:
     """Let every verified model answer one question of each kind.
 
-    A model that ``previous`` serves from the same artifact has answered already.
+    A model that ``previous`` serves from the same artifact has answered already, and keeps its
+    queue.
     """
     served: dict[Key, ServedModel] = {}
     failures: dict[Key, Failure] = {}
@@ -155,5 +161,5 @@ def prepare(store: ModelSet, previous: ServedModels | None = None) -> ServedMode
                 detail="it verified, but could not answer a question",
             )
         else:
-            served[key] = ServedModel(artifact, contexts)
+            served[key] = ServedModel(artifact, contexts, new_queue())
     return ServedModels(store, MappingProxyType(served), MappingProxyType(failures))

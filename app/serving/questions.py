@@ -40,6 +40,7 @@ async def relations(session: Session, request: RelationsRequest) -> RelationsAns
 
     Raises:
         RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
+        QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request)
     pairs = _pairs(request, reading)
@@ -62,6 +63,7 @@ async def missing(session: Session, request: MissingRequest) -> MissingAnswer:
 
     Raises:
         RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
+        QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request)
     faults = Faults()
@@ -108,6 +110,7 @@ async def outliers(session: Session, request: OutliersRequest) -> OutliersAnswer
 
     Raises:
         RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
+        QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request)
     found, misplaced = await session.ask(
@@ -138,11 +141,13 @@ async def generate(session: Session, request: GenerateRequest) -> GenerateAnswer
 
     Raises:
         RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
+        QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request, may_be_empty=True)
     _check_context(request, model)
     seed = secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed
-    drawn = await session.ask(
+    drawn = await session.draw(
+        request.count,
         model,
         reasoning.generate,
         reading.scene,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +16,7 @@ from app.registry import AliasTarget, Store, StoreError, load_model_set
 from app.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 from app.serving.errors import (
     AliasConflictError,
+    DrainingError,
     Fault,
     ModelUnavailableError,
     ModelUnusableError,
@@ -26,6 +29,7 @@ from app.serving.errors import (
     UnknownModelError,
 )
 from app.serving.models import DEFAULT, ServedModels, prepare
+from app.serving.queue import Ticket, WorkQueue
 from app.serving.reading import Limits
 from app.serving.session import Session
 
@@ -34,6 +38,10 @@ _logger = logging.getLogger("app.serving")
 # An administrator waits this long for another writer; the requests of robots never do.
 _LOCK_TIMEOUT = 5.0
 
+# Seconds after which the worker thread, where it interprets and does not compute, gives way to the
+# event loop. The interpreter's default of 5 ms is a quarter of a robot's tick.
+_SWITCH_INTERVAL = 5e-4
+
 
 class Runtime:
     """The one holder of the current snapshot.
@@ -41,13 +49,20 @@ class Runtime:
     Args:
         store: directory of published models.
         limits: what one scene may hold.
+        queue_rows: what may wait for one model.
+
+    Attributes:
+        draining: nothing new is taken.
     """
 
-    def __init__(self, store: Path, limits: Limits) -> None:
+    def __init__(self, store: Path, limits: Limits, queue_rows: int) -> None:
         self._store = Store(store, lock_timeout=_LOCK_TIMEOUT)
         self._limits = limits
+        self._queue_rows = queue_rows
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="costly work")
         self._models: ServedModels | None = None
         self._changing = asyncio.Lock()
+        self.draining = False
 
     @property
     def models(self) -> ServedModels:
@@ -60,30 +75,49 @@ class Runtime:
             raise NotReadyError("The service is starting.")
         return self._models
 
-    def session(self, request_id: str) -> Session:
+    def session(self, request_id: str, ticket: Ticket) -> Session:
         """The view of one request, which keeps the snapshot it starts with.
 
         Raises:
             NotReadyError: nothing has been loaded yet.
+            DrainingError: nothing new is taken.
         """
-        return Session(self.models, self._limits, request_id)
+        self._check_open()
+        return Session(self.models, self._limits, request_id, ticket)
 
     def check_ready(self) -> None:
         """Return if requests that name no model can be answered.
 
         Raises:
-            NotReadyError: they cannot.
+            NotReadyError, DrainingError: they cannot.
         """
+        self._check_open()
         self.models.resolve(DEFAULT)
+
+    def _check_open(self) -> None:
+        if self.draining:
+            raise DrainingError("The service finishes what it has begun, and then ends.")
+
+    def drain(self) -> None:
+        """Take nothing new from now on, and say so to those who ask whether it is ready."""
+        self.draining = True
 
     async def start(self) -> None:
         """Load, verify and warm everything in the store; `models` tells what is wrong."""
         # Serving scales by processes: threads within one would fight over the same cores.
         torch.set_num_threads(1)
-        self._models = prepare(load_model_set(self._store))
+        sys.setswitchinterval(_SWITCH_INTERVAL)
+        self._models = prepare(load_model_set(self._store), self._new_queue)
         for failure in self._models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
         _settle_memory()
+
+    def stop(self) -> None:
+        """Let go of the worker thread; what it has not begun is dropped."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+    def _new_queue(self) -> WorkQueue:
+        return WorkQueue(self._queue_rows, self._executor)
 
     async def refresh(self, request_id: str) -> RefreshAnswer:
         """Take over what the store holds now, or leave everything as it is.
@@ -119,7 +153,7 @@ class Runtime:
             return answer
 
     def _load(self, old: ServedModels) -> ServedModels:
-        return prepare(load_model_set(self._store, old.store), old)
+        return prepare(load_model_set(self._store, old.store), self._new_queue, old)
 
     async def move_alias(self, alias: str, request: AliasRequest, request_id: str) -> AliasAnswer:
         """Let an alias lead to a version that is served, here at once and in the store for good.

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from app.registry import Artifact
 from app.scene.scene import Scene
 from app.schemas import SceneRequest
+from app.serving.errors import ServingError
 from app.serving.models import ServedModel, ServedModels
+from app.serving.queue import Ticket
 from app.serving.reading import Limits, Reading, read_scene
 
 P = ParamSpec("P")
@@ -24,11 +29,15 @@ class Session:
         models: the snapshot of models.
         limits: what one scene may hold.
         request_id: goes into every answer.
+        ticket: what the request may take.
+        holding: whether rows of the models' queues are held for it already.
     """
 
     models: ServedModels
     limits: Limits
     request_id: str
+    ticket: Ticket
+    holding: bool = False
 
     def read(
         self, request: SceneRequest, *, may_be_empty: bool = False
@@ -53,10 +62,66 @@ class Session:
     ) -> T:
         """Put one question about one scene to one model.
 
-        The only place where the service computes. Inference is cheaper than a hop to a thread, so
-        it runs where it stands.
+        Raises:
+            QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
-        return question(model.artifact, scene, *args, **kwargs)
+        # Pairs of objects are what the relation part is computed for, stated relations or not.
+        size = (1 + len(scene.objects)) ** 2
+        return await self._run(
+            model, partial(question, model.artifact, scene, *args, **kwargs), question, size
+        )
+
+    async def draw(
+        self,
+        rows: int,
+        model: ServedModel,
+        question: Callable[Concatenate[Artifact, Scene, P], T],
+        scene: Scene,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """The same of a question that draws so many scenes: never where others would wait for it.
+
+        Raises:
+            QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
+        """
+        call = partial(question, model.artifact, scene, *args, **kwargs)
+        return await self._run(model, call, question, rows, rows=rows, costly=True)
+
+    async def _run(
+        self,
+        model: ServedModel,
+        call: Callable[[], T],
+        question: Callable[..., T],
+        size: float,
+        *,
+        rows: int = 1,
+        costly: bool = False,
+    ) -> T:
+        queue = model.queue
+        with queue.holding(0 if self.holding else rows):
+            return await queue.run(
+                call, self.ticket, kind=question.__name__, size=size, costly=costly
+            )
+
+    @contextmanager
+    def for_batch(self, references: Sequence[str]) -> Iterator[Session]:
+        """The view of a batch, for whose scenes there is room in all the queues at once.
+
+        Args:
+            references: the models that its scenes name; those that lead nowhere take no room.
+
+        Raises:
+            QueueFullError: there is no room.
+        """
+        with ExitStack() as held:
+            for reference, rows in Counter(references).items():
+                try:
+                    model = self.models.resolve(reference)
+                except ServingError:
+                    continue
+                held.enter_context(model.queue.holding(rows))
+            yield replace(self, holding=True)
 
     def envelope(
         self, request: SceneRequest, model: ServedModel, reading: Reading

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import math
 import shutil
 import weakref
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 import httpx
 import pytest
 
+from app.serving.queue import Ticket
 from tests.http.conftest import ADMIN_KEY, serve
 from tests.http.stores import VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
@@ -310,7 +312,7 @@ async def test_requests_are_answered_while_the_store_is_read(
 async def test_a_request_keeps_the_models_it_started_with(store: Path) -> None:
     async with serve(store) as client:
         runtime = client.app.state.runtime  # type: ignore[attr-defined]
-        session = runtime.session("x")
+        session = runtime.session("x", Ticket(math.inf))
         publish(store, "home", "2.0.0", seed=2, alias="default")
         await runtime.refresh("y")
         assert session.models.resolve("default").reference.version == "1.0.0"

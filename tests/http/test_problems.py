@@ -47,7 +47,7 @@ def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
     assert document["title"] == PROBLEM_TYPES[slug].title
     assert document["request_id"] == response.headers["x-request-id"]
     assert document["instance"] == f"/problems/{slug}#{document['request_id']}"
-    assert ("retry-after" in response.headers) == (status == 503)
+    assert ("retry-after" in response.headers) == (status in (429, 503))
     for leak in ("Traceback", ".py", "site-packages", str(Path.cwd()), MARKER):
         assert leak not in response.text
     return document

@@ -1,0 +1,184 @@
+"""The work of one model: a queue drained once per tick of the event loop, bounded in rows.
+
+What arrives within one tick is computed in the next, each job by itself, so an answer never depends
+on what it waited beside. Cheap jobs run where they stand: a hop to a thread costs as much as most
+of them. A job that is expected to take longer than `CHEAP` goes to the process's one worker thread,
+where compiled loops and tensor kernels let the event loop go on.
+
+A job whose deadline has passed, or whose client has gone, is dropped when its turn comes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import Any, Final, TypeVar
+
+from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
+
+T = TypeVar("T")
+
+CHEAP: Final = 1e-3
+"""Seconds that a job may hold up the event loop."""
+
+# So long a tick computes before others get their turn: health checks, and requests to be read.
+_TICK: Final = 2e-3
+# Share of the newest measurement in the expected cost.
+_NEWEST: Final = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Ticket:
+    """What a request may take.
+
+    Attributes:
+        deadline: by `time.monotonic`; work that has not begun by then is dropped.
+        is_gone: whether the client has left; asked before costly work.
+    """
+
+    deadline: float
+    is_gone: Callable[[], Awaitable[bool]] | None = None
+
+    def check(self) -> None:
+        """Return if there is time left.
+
+        Raises:
+            DeadlinePassedError: there is none.
+        """
+        if monotonic() >= self.deadline:
+            raise DeadlinePassedError("The deadline passed before the answer was begun.")
+
+
+@dataclass(slots=True, eq=False)
+class _Job:
+    call: Callable[[], Any]
+    ticket: Ticket
+    future: asyncio.Future[Any]
+
+
+@dataclass(slots=True)
+class _Cost:
+    """Seconds per unit of size of one kind of question, as measured so far."""
+
+    per_unit: float = 0.0
+
+    def expected(self, size: float) -> float:
+        return self.per_unit * size
+
+    def learn(self, seconds: float, size: float) -> None:
+        measured = seconds / size
+        known = self.per_unit or measured
+        self.per_unit = known + _NEWEST * (measured - known)
+
+
+@dataclass(eq=False)
+class WorkQueue:
+    """Jobs of one model.
+
+    Attributes:
+        limit: most rows (scenes, or drawn scenes) that may wait or be under way.
+        executor: the worker thread, shared by all queues of the process.
+        rows: how many there are now.
+    """
+
+    limit: int
+    executor: Executor
+    rows: int = 0
+    _waiting: deque[_Job] = field(default_factory=deque)
+    _draining: bool = False
+    _costs: dict[str, _Cost] = field(default_factory=dict)
+
+    @contextmanager
+    def holding(self, rows: int) -> Iterator[None]:
+        """Room for so many rows.
+
+        Raises:
+            QueueFullError: there is not enough.
+        """
+        if self.rows + rows > self.limit:
+            raise QueueFullError(f"{self.rows} of {self.limit} rows of this model are taken.")
+        self.rows += rows
+        try:
+            yield
+        finally:
+            self.rows -= rows
+
+    async def run(
+        self, call: Callable[[], T], ticket: Ticket, *, kind: str, size: float, costly: bool = False
+    ) -> T:
+        """The result of a job.
+
+        Args:
+            call: the work; it may run in another thread.
+            kind: jobs of one kind cost alike, in proportion to ``size``.
+            costly: always for the worker thread.
+
+        Raises:
+            DeadlinePassedError: the deadline passed first; the work is dropped, or its result.
+            DisconnectedError: nobody waits for the answer any more.
+            Exception: whatever the job raises.
+        """
+        cost = self._costs.setdefault(kind, _Cost())
+
+        def measured() -> T:
+            began = monotonic()
+            result = call()
+            cost.learn(monotonic() - began, size)
+            return result
+
+        if costly or cost.expected(size) > CHEAP:
+            return await self._in_thread(measured, ticket)
+        loop = asyncio.get_running_loop()
+        job = _Job(measured, ticket, loop.create_future())
+        self._waiting.append(job)
+        if not self._draining:
+            self._draining = True
+            loop.call_soon(self._drain)
+        found: T = await job.future
+        return found
+
+    def _drain(self) -> None:
+        end = monotonic() + _TICK
+        while self._waiting:
+            job = self._waiting.popleft()
+            if not job.future.done():
+                _settle(job)
+            if self._waiting and monotonic() > end:
+                asyncio.get_running_loop().call_soon(self._drain)
+                return
+        self._draining = False
+
+    async def _in_thread(self, call: Callable[[], T], ticket: Ticket) -> T:
+        ticket.check()
+        if ticket.is_gone is not None and await ticket.is_gone():
+            raise DisconnectedError("The client has gone.")
+        dropped = False
+
+        def unless_dropped() -> T:
+            # The thread's own queue holds what is dropped until its turn, and no longer.
+            if dropped:
+                raise DeadlinePassedError("dropped")
+            return call()
+
+        loop = asyncio.get_running_loop()
+        future = loop.run_in_executor(self.executor, unless_dropped)
+        try:
+            async with asyncio.timeout(ticket.deadline - monotonic()):
+                return await future
+        except TimeoutError:
+            raise DeadlinePassedError("The deadline passed before the answer was there.") from None
+        finally:
+            dropped = True
+
+
+def _settle(job: _Job) -> None:
+    try:
+        job.ticket.check()
+        job.future.set_result(job.call())
+    except Exception as error:  # noqa: BLE001 - it belongs to the request, which raises it
+        job.future.set_exception(error)
