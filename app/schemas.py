@@ -8,6 +8,7 @@ infinity, every text and list bounded. What needs a model's vocabulary or the wh
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
@@ -361,6 +362,16 @@ class ModelReference(Reply):
     digest: Annotated[str, Field(description="sha256 over the artifact")]
 
 
+@dataclass(slots=True)
+class ObservedRelation:
+    """A relation between two objects (by id) that their positions show."""
+
+    # No model: a scene of a dozen objects shows some fifty, and a model takes ten times as long.
+    subject: str
+    relation: RelationName
+    object: str
+
+
 class Answer(Reply):
     """What every answer carries."""
 
@@ -376,7 +387,7 @@ class Answer(Reply):
         ),
     ] = []
     observed_relations: Annotated[
-        list[Relation] | None,
+        list[ObservedRelation] | None,
         Field(description="derived from positions; absent if none were given"),
     ] = None
 

@@ -16,7 +16,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from app.boltzmann.compiling import inlined
+from app.compiling import inlined
 
 _f = np.float32
 _i = np.int32

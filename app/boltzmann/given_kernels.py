@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.boltzmann.compiling import compiled, compiled_in_any_order
+from app.compiling import compiled, compiled_in_any_order
 from app.boltzmann.elementary import logistic
 from app.boltzmann.relation_kernels import means, residual, to_log_odds
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.boltzmann.compiling import compiled
+from app.compiling import compiled
 from app.boltzmann.elementary import exp, log, logistic
 
 

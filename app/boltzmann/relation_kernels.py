@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.boltzmann.compiling import compiled, compiled_in_any_order, inlined
+from app.compiling import compiled, compiled_in_any_order, inlined
 from app.boltzmann.elementary import exp, log, logistic
 
 NO_UNIT = np.float32(-30.0)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from app.boltzmann.compiling import compiled
+from app.compiling import compiled
 from app.boltzmann.elementary import log, logistic
 from app.boltzmann.machine import BoltzmannMachine
 

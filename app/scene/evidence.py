@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from app.compiling import compiled
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
 
@@ -68,32 +69,34 @@ def pool_instances(
             raise ValueError(f"{name} has shape {array.shape}, must be {(A, size, size)}")
     if confidence.shape != (size,):
         raise ValueError(f"confidence has shape {confidence.shape}, must be {(size,)}")
-    if size == 0:
-        nothing = np.zeros((A, 0, 0), dtype=np.bool_)
-        empty = np.zeros(0, dtype=np.int64)
-        return ClassEvidence(empty, empty, np.zeros(0), nothing, nothing, room_type)
-    order = np.argsort(classes, kind="stable")
-    unique, starts, counts = np.unique(classes[order], return_index=True, return_counts=True)
-    off_diagonal = ~np.eye(size, dtype=np.bool_)
-    on = _pool(holds & off_diagonal, order, starts)
-    seen = _pool((holds | observed) & off_diagonal, order, starts)
-    absent = np.multiply.reduceat(1.0 - confidence[order], starts)
-    return ClassEvidence(
-        classes=unique.astype(np.int64),
-        counts=counts.astype(np.int64),
-        confidence=1.0 - absent,
-        holds=on,
-        observed=seen,
-        room_type=room_type,
-    )
+    labels = np.asarray(classes, dtype=np.int64, order="C")
+    sure = np.asarray(confidence, dtype=np.float64, order="C")
+    found = _pool(labels, sure, np.ascontiguousarray(holds), np.ascontiguousarray(observed))
+    return ClassEvidence(*found, room_type)
 
 
-def _pool(
-    pairs: NDArray[np.bool_], order: NDArray[np.int64], starts: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """(A, N, N) over instances to (A, n, n) over runs of equal class."""
-    rows = np.logical_or.reduceat(pairs[:, order], starts, axis=1)
-    return np.logical_or.reduceat(rows[:, :, order], starts, axis=2)
+@compiled
+def _pool(classes, confidence, holds, observed):
+    """The fields of the evidence, less the room type."""
+    size = len(classes)
+    distinct = np.unique(classes)
+    n = len(distinct)
+    row = np.searchsorted(distinct, classes)
+    counts, absent = np.zeros(n, np.int64), np.ones(n)
+    for i in range(size):
+        counts[row[i]] += 1
+        absent[row[i]] *= 1.0 - confidence[i]
+    on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
+    for a in range(A):
+        for i in range(size):
+            for j in range(size):
+                if i == j:
+                    continue
+                if holds[a, i, j]:
+                    on[a, row[i], row[j]] = seen[a, row[i], row[j]] = True
+                elif observed[a, i, j]:
+                    seen[a, row[i], row[j]] = True
+    return distinct, counts, 1.0 - absent, on, seen
 
 
 def class_evidence(scene: Scene) -> ClassEvidence:
@@ -108,8 +111,9 @@ def class_evidence(scene: Scene) -> ClassEvidence:
     classes = np.array([scene.objects[i].class_index for i in kept], dtype=np.int64)
     confidence = np.array([scene.objects[i].confidence for i in kept], dtype=np.float64)
     if scene.poses is not None:
-        holds = scene.poses.holds[:, kept][:, :, kept]
-        observed = scene.poses.observed[:, kept][:, :, kept]
+        holds, observed = scene.poses.holds, scene.poses.observed
+        if size < len(scene.objects):
+            holds, observed = holds[:, kept][:, :, kept], observed[:, kept][:, :, kept]
     else:
         place = {i: position for position, i in enumerate(kept)}
         holds = np.zeros((A, size, size), dtype=np.bool_)

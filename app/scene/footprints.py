@@ -1,4 +1,4 @@
-"""Overlap and gap of turned rectangles, for many pairs at once.
+"""Overlap and gap of turned rectangles.
 
 Exact up to rounding. Two rectangles turned by a multiple of 90 degrees against each other share
 axes, and intervals answer; the others are cut along their edges.
@@ -6,10 +6,13 @@ axes, and intervals answer; the others are cut along their edges.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from app.compiling import compiled
 
 Array = NDArray[np.float64]
 
@@ -18,7 +21,7 @@ Array = NDArray[np.float64]
 _PARALLEL: Final = 1e-6
 # In place of edges of no length, which nothing can be divided by.
 _SHORTEST: Final = 1e-150
-_SIGNS: Final = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+_QUARTER: Final = math.pi / 2
 
 
 def overlap_and_gap(
@@ -35,82 +38,123 @@ def overlap_and_gap(
         (P,) area of the intersection as a share of the smaller area, and (P,) distance between the
         rectangles, 0 where they touch.
     """
-    # In b's axes b is the box |x| <= half_b[0], |y| <= half_b[1] around the origin.
-    offset = _turn(centre_a - centre_b, -yaw_b)
-    yaw = yaw_a - yaw_b
-    half_a, half_b = size_a / 2, size_b / 2
-    quarters = np.round(yaw / (np.pi / 2))
-    parallel = np.abs(yaw - quarters * (np.pi / 2)) < _PARALLEL
-    # A quarter turn exchanges the extents.
-    swapped = np.where((quarters % 2 == 1)[:, None], half_a[:, ::-1], half_a)
-    area, gap = _parallel(offset, swapped, half_b)
-    if not parallel.all():
-        skew = np.flatnonzero(~parallel)
-        area[skew], gap[skew] = _skew(offset[skew], half_a[skew], yaw[skew], half_b[skew])
-    smaller = np.minimum(size_a.prod(axis=1), size_b.prod(axis=1))
-    # An area too small for a float is a point's, and lies wholly in what it touches.
-    share = np.divide(area, smaller, out=(gap == 0).astype(np.float64), where=smaller > 0)
+    share, gap = np.empty(len(yaw_a)), np.empty(len(yaw_a))
+    rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
+    _measure_pairs(*(np.asarray(part, np.float64, order="C") for part in rectangles), share, gap)
     return share, gap
 
 
-def _parallel(offset: Array, half_a: Array, half_b: Array) -> tuple[Array, Array]:
-    apart = np.abs(offset) - half_a - half_b
-    overlap = np.minimum(-apart, 2 * np.minimum(half_a, half_b))
-    area = np.maximum(overlap, 0).prod(axis=1)
-    return area, np.hypot(*np.maximum(apart, 0).T)
+@compiled
+def _measure_pairs(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b, share, gap):
+    for p in range(len(share)):
+        share[p], gap[p] = measure(
+            centre_a[p], size_a[p], yaw_a[p], centre_b[p], size_b[p], yaw_b[p]
+        )
 
 
-def _skew(offset: Array, half_a: Array, yaw: Array, half_b: Array) -> tuple[Array, Array]:
+@compiled
+def measure(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b):
+    """Overlap and gap of one pair; of centres and sizes the first two numbers count."""
+    # In b's axes b is the box |x| <= half_b[0], |y| <= half_b[1] around the origin.
+    offset = _turn_back(
+        (centre_a[0] - centre_b[0], centre_a[1] - centre_b[1]), math.cos(yaw_b), math.sin(yaw_b)
+    )
+    yaw = yaw_a - yaw_b
+    half_a, half_b = (size_a[0] / 2, size_a[1] / 2), (size_b[0] / 2, size_b[1] / 2)
+    quarters = np.rint(yaw / _QUARTER)
+    if not abs(yaw - quarters * _QUARTER) < _PARALLEL:
+        area, gap = _skew(offset, half_a, math.cos(yaw), math.sin(yaw), half_b)
+    elif quarters / 2 != np.rint(quarters / 2):
+        # A quarter turn exchanges the extents.
+        area, gap = _parallel(offset, (half_a[1], half_a[0]), half_b)
+    else:
+        area, gap = _parallel(offset, half_a, half_b)
+    smaller = min(size_a[0] * size_a[1], size_b[0] * size_b[1])
+    if smaller > 0.0:
+        return area / smaller, gap
+    # An area too small for a float is a point's, and lies wholly in what it touches.
+    return 1.0 if gap == 0.0 else 0.0, gap
+
+
+@compiled
+def _parallel(offset, half_a, half_b):
+    across = abs(offset[0]) - half_a[0] - half_b[0]
+    along = abs(offset[1]) - half_a[1] - half_b[1]
+    width = max(min(-across, 2 * min(half_a[0], half_b[0])), 0.0)
+    depth = max(min(-along, 2 * min(half_a[1], half_b[1])), 0.0)
+    return width * depth, math.hypot(max(across, 0.0), max(along, 0.0))
+
+
+@compiled
+def _skew(offset, half_a, cos, sin, half_b):
     """Area and gap by edges: each rectangle's corners in the axes of the other."""
-    corners_a = offset[:, None] + _turn(_corners(half_a), yaw[:, None])
-    # b's corners in a's axes.
-    corners_b = _turn(_corners(half_b) - offset[:, None], -yaw[:, None])
     # Green's theorem: the border of the intersection is made of a's edges inside b and b's edges
     # inside a; each part adds cross(p, q) / 2, taken about one common origin, the centre of b.
-    pieces_a = _inside(corners_a, half_b)
-    pieces_b = _inside(corners_b, half_a)
-    pieces_b = offset[:, None, None] + _turn(pieces_b, yaw[:, None, None])
-    area = np.maximum(_swept(pieces_a) + _swept(pieces_b), 0)
-    # Disjoint convex polygons are nearest at a corner of one of them.
-    gap = np.minimum(_distance(corners_a, half_b), _distance(corners_b, half_a))
-    return area, np.where(area > 0, 0.0, gap)
+    swept_a, swept_b, gap = 0.0, 0.0, math.inf
+    for k in range(4):
+        start, end = _corner(half_a, k), _corner(half_a, k + 1)
+        start = _moved(_turn(start, cos, sin), offset)
+        end = _moved(_turn(end, cos, sin), offset)
+        p, q = _inside(start, end, half_b)
+        swept_a += p[0] * q[1] - p[1] * q[0]
+        # Disjoint convex polygons are nearest at a corner of one of them.
+        gap = min(gap, _distance(start, half_b))
+    back = (-offset[0], -offset[1])
+    for k in range(4):
+        start, end = _corner(half_b, k), _corner(half_b, k + 1)
+        # b's corners in a's axes.
+        start = _turn_back(_moved(start, back), cos, sin)
+        end = _turn_back(_moved(end, back), cos, sin)
+        p, q = _inside(start, end, half_a)
+        p = _moved(_turn(p, cos, sin), offset)
+        q = _moved(_turn(q, cos, sin), offset)
+        swept_b += p[0] * q[1] - p[1] * q[0]
+        gap = min(gap, _distance(start, half_a))
+    area = max(swept_a / 2 + swept_b / 2, 0.0)
+    return area, 0.0 if area > 0.0 else gap
 
 
-def _corners(half: Array) -> Array:
-    """(P, 4, 2) corners of boxes around the origin, counter-clockwise."""
-    corners: Array = half[:, None] * _SIGNS
-    return corners
+@compiled
+def _corner(half, k):
+    """Corner k of a box around the origin, counter-clockwise."""
+    k = k % 4
+    return (half[0] if k in (0, 3) else -half[0], half[1] if k < 2 else -half[1])
 
 
-def _turn(points: Array, yaw: Array) -> Array:
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    x, y = points[..., 0], points[..., 1]
-    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+@compiled
+def _moved(point, offset):
+    return offset[0] + point[0], offset[1] + point[1]
 
 
-def _inside(corners: Array, half: Array) -> Array:
-    """(P, 4, 2, 2) the part of each edge inside the box (Liang & Barsky 1984); ends fall together
+@compiled
+def _turn(point, cos, sin):
+    return cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]
+
+
+@compiled
+def _turn_back(point, cos, sin):
+    return cos * point[0] + sin * point[1], cos * point[1] - sin * point[0]
+
+
+@compiled
+def _inside(start, end, half):
+    """The ends of the part of an edge inside the box (Liang & Barsky 1984); they fall together
     where no part is."""
-    start = corners
-    along = np.roll(corners, -1, axis=1) - corners
     # The edges are skew to the box, so a component of `along` is zero only where all its length was
     # lost to rounding; such an edge bounds no area wherever it is cut.
-    along = np.where(along == 0, _SHORTEST, along)
-    one = (-half[:, None] - start) / along
-    other = (half[:, None] - start) / along
-    enter = np.maximum(np.minimum(one, other).max(axis=-1), 0.0)
-    leave = np.minimum(np.maximum(one, other).min(axis=-1), 1.0)
-    leave = np.maximum(enter, leave)
-    return np.stack([start + enter[..., None] * along, start + leave[..., None] * along], axis=2)
+    x, y = end[0] - start[0] or _SHORTEST, end[1] - start[1] or _SHORTEST
+    one_x, other_x = (-half[0] - start[0]) / x, (half[0] - start[0]) / x
+    one_y, other_y = (-half[1] - start[1]) / y, (half[1] - start[1]) / y
+    enter = max(min(one_x, other_x), min(one_y, other_y), 0.0)
+    leave = min(max(one_x, other_x), max(one_y, other_y), 1.0)
+    leave = max(enter, leave)
+    return (
+        (start[0] + enter * x, start[1] + enter * y),
+        (start[0] + leave * x, start[1] + leave * y),
+    )
 
 
-def _swept(pieces: Array) -> Array:
-    p, q = pieces[:, :, 0], pieces[:, :, 1]
-    crossed = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-    return np.asarray(crossed.sum(axis=1) / 2)
-
-
-def _distance(points: Array, half: Array) -> Array:
-    """(P,) least distance of 4 points each to a box around the origin."""
-    beyond = np.maximum(np.abs(points) - half[:, None], 0)
-    return np.asarray(np.hypot(beyond[..., 0], beyond[..., 1]).min(axis=1))
+@compiled
+def _distance(point, half):
+    """From a point to a box around the origin."""
+    return math.hypot(max(abs(point[0]) - half[0], 0.0), max(abs(point[1]) - half[1], 0.0))

@@ -46,14 +46,21 @@ def body_pose(
     Raises:
         ValueError: the quaternion is not of length 1.
     """
-    x, y, z = position
-    columns = _rotation(orientation) if orientation is not None else _IDENTITY
+    if orientation is None and not optical:
+        return position, size, 0.0
+    first, second, third = _IDENTITY if orientation is None else _rotation(orientation)
     if optical:
-        position = (z, -x, -y)
-        columns = tuple((c[2], -c[0], -c[1]) for c in columns)
-    up = max(range(3), key=lambda k: (abs(columns[k][2]), k))
-    ahead, aside = (up + 1) % 3, (up + 2) % 3
-    yaw = math.atan2(columns[ahead][1], columns[ahead][0])
+        position = _from_optical(position)
+        first, second, third = map(_from_optical, (first, second, third))
+    rises = abs(first[2]), abs(second[2]), abs(third[2])
+    # Of axes that are equally near to the vertical the last one.
+    if rises[2] >= max(rises):
+        up, ahead, aside, heading = 2, 0, 1, first
+    elif rises[1] >= rises[0]:
+        up, ahead, aside, heading = 1, 2, 0, third
+    else:
+        up, ahead, aside, heading = 0, 1, 2, second
+    yaw = math.atan2(heading[1], heading[0])
     upright = None if size is None else (size[ahead], size[aside], size[up])
     return position, upright, yaw
 
@@ -61,12 +68,18 @@ def body_pose(
 _IDENTITY: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
+def _from_optical(vector: Vector) -> Vector:
+    x, y, z = vector
+    return z, -x, -y
+
+
 def _rotation(quaternion: Quaternion) -> tuple[Vector, ...]:
     """The box's axes as vectors of the frame."""
-    norm = math.sqrt(sum(part * part for part in quaternion))
+    x, y, z, w = quaternion
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
     if not abs(norm - 1.0) <= _NORM_TOLERANCE:
         raise ValueError(f"orientation must be a quaternion of length 1, not of length {norm:g}")
-    x, y, z, w = (part / norm for part in quaternion)
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
         (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),

@@ -28,7 +28,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from app.scene.footprints import overlap_and_gap
+from app.compiling import compiled
+from app.scene.footprints import measure
 from app.scene.relations import ABOVE, CANONICAL, FRONT, LEFT, ON_TOP
 
 MIN_OVERLAP: Final = 0.30  # share of the smaller footprint
@@ -37,9 +38,9 @@ NEIGHBOUR_GAP: Final = 1.0  # m between footprints
 NEIGHBOUR_DISTANCE: Final = 1.5  # m between centres, sizes unknown
 MIN_OFFSET: Final = 0.10  # m between centres
 
+_NONE: Final = -1  # in place of a relation
+
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Rows = Array | Sequence[Sequence[float]]
 
 
@@ -107,85 +108,121 @@ def derive_relations(
     n = len(points)
     extents = _array("sizes", sizes, (n, 3))
     turns = np.zeros(n) if yaws is None else _array("yaws", yaws, (n,))
-    if np.isinf(points).any() or np.isinf(extents).any() or not np.isfinite(turns).all():
+    if not _are_finite(points, extents, turns):
         raise ValueError("positions, sizes and yaws must not be infinite")
-    if (extents <= 0).any():
+    if not _are_positive(extents):
         raise ValueError("sizes must be positive")
-
-    located = np.asarray(np.isfinite(points).all(axis=1))
-    first, second = np.triu_indices(n, 1)
-    keep = located[first] & located[second]
-    first, second = first[keep], second[keep]
-    sized = np.asarray(np.isfinite(extents).all(axis=1))
-    boxed = sized[first] & sized[second]
-    neighbours, stacked = _footprints(points, extents, turns, first, second, boxed)
-
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
-    vertical = _vertical(holds, points, extents, first[stacked], second[stacked])
-    for relation in (ON_TOP, ABOVE):
-        _mark(observed[relation], first[neighbours & boxed], second[neighbours & boxed])
-    if horizontal:
-        level = neighbours.copy()
-        level[np.flatnonzero(stacked)[vertical]] = False
-        _horizontal(holds, points, first[level], second[level])
-        for relation in (LEFT, FRONT):
-            _mark(observed[relation], first[neighbours], second[neighbours])
+    _relate_all(points, extents, turns, horizontal, holds, observed)
     return PoseRelations(holds, observed)
 
 
-def _footprints(
-    points: Array, extents: Array, turns: Array, first: Index, second: Index, boxed: Mask
-) -> tuple[Mask, Mask]:
-    """(P,) which pairs are neighbours, and which of them stand over one another."""
-    distance = np.hypot(*(points[first, :2] - points[second, :2]).T)
-    neighbours = ~boxed & (distance <= NEIGHBOUR_DISTANCE)
-    stacked = np.zeros_like(neighbours)
+@compiled
+def _are_finite(points, extents, turns):
+    """Or NaN, which only a yaw must not be."""
+    for i in range(len(points)):
+        for k in range(3):
+            if math.isinf(points[i, k]) or math.isinf(extents[i, k]):
+                return False
+        if not math.isfinite(turns[i]):
+            return False
+    return True
+
+
+@compiled
+def _are_positive(extents):
+    """Or NaN."""
+    for i in range(len(extents)):
+        for k in range(3):
+            if extents[i, k] <= 0.0:
+                return False
+    return True
+
+
+@compiled
+def _relate_all(points, extents, turns, horizontal, holds, observed):
+    n = len(points)
+    located, sized = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    for i in range(n):
+        located[i], sized[i] = _is_known(points[i]), _is_known(extents[i])
+    for i in range(n):
+        for j in range(i + 1, n):
+            if not (located[i] and located[j]):
+                continue
+            distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+            boxed, stacked = sized[i] and sized[j], False
+            if boxed:
+                neighbours, stacked = _footprints(points, extents, turns, distance, i, j)
+            else:
+                neighbours = distance <= NEIGHBOUR_DISTANCE
+            if neighbours:
+                _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed)
+
+
+@compiled
+def _is_known(row):
+    return not (math.isnan(row[0]) or math.isnan(row[1]) or math.isnan(row[2]))
+
+
+@compiled
+def _footprints(points, extents, turns, distance, i, j):
+    """Whether two boxes are neighbours, and whether they stand over one another."""
     # Rectangles are measured only where the circles around them come near enough.
-    radius = np.hypot(extents[:, 0], extents[:, 1]) / 2
-    near = boxed & (distance - radius[first] - radius[second] <= NEIGHBOUR_GAP)
-    i, j = first[near], second[near]
-    share, gap = overlap_and_gap(
-        points[i, :2], extents[i, :2], turns[i], points[j, :2], extents[j, :2], turns[j]
-    )
-    neighbours[near] = gap <= NEIGHBOUR_GAP
-    stacked[near] = share >= MIN_OVERLAP
-    return neighbours, stacked
+    radius_i, radius_j = _radius(extents[i]), _radius(extents[j])
+    if not distance - radius_i - radius_j <= NEIGHBOUR_GAP:
+        return False, False
+    share, gap = measure(points[i], extents[i], turns[i], points[j], extents[j], turns[j])
+    return gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
 
 
-def _vertical(
-    holds: NDArray[np.bool_], points: Array, extents: Array, first: Index, second: Index
-) -> Mask:
-    """Enter on-top and above of pairs that stand over one another; True where one holds."""
-    bottom, top = points[:, 2] - extents[:, 2] / 2, points[:, 2] + extents[:, 2] / 2
-    decided = np.zeros(len(first), dtype=np.bool_)
-    for i, j in ((first, second), (second, first)):
-        lift = bottom[i] - top[j]
-        on = (np.abs(lift) <= CONTACT) & (points[i, 2] > points[j, 2])
-        over = lift > CONTACT
-        holds[ON_TOP, i, j] = on
-        holds[ABOVE, i, j] = over
-        decided |= on | over
-    return decided
+@compiled
+def _radius(extent):
+    return math.hypot(extent[0], extent[1]) / 2
 
 
-def _horizontal(holds: NDArray[np.bool_], points: Array, first: Index, second: Index) -> None:
-    """Enter left and front of neighbours."""
-    dx, dy, _ = (points[first] - points[second]).T
-    sideways = np.abs(dy) >= np.abs(dx)
-    for relation, lead, decisive in ((LEFT, dy, sideways), (FRONT, -dx, ~sideways)):
-        decides = decisive & (np.abs(lead) >= MIN_OFFSET)
-        holds[relation, first, second] = decides & (lead > 0)
-        holds[relation, second, first] = decides & (lead < 0)
+@compiled
+def _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed):
+    """Enter the relations of two neighbours."""
+    # Left and front come before on-top and above.
+    first, last = LEFT if horizontal else ON_TOP, ABOVE if boxed else FRONT
+    for relation in range(first, last + 1):
+        observed[relation, i, j] = observed[relation, j, i] = True
+    for subject, anchor in ((i, j), (j, i)):
+        relation = _vertical(points, extents, subject, anchor) if stacked else _NONE
+        if relation != _NONE:
+            holds[relation, subject, anchor] = True
+            return
+    if not horizontal:
+        return
+    for subject, anchor in ((i, j), (j, i)):
+        relation = _horizontal(points, subject, anchor)
+        if relation != _NONE:
+            holds[relation, subject, anchor] = True
 
 
-def _mark(table: NDArray[np.bool_], first: Index, second: Index) -> None:
-    table[first, second] = True
-    table[second, first] = True
+@compiled
+def _vertical(points, extents, i, j):
+    """The relation of i to j, the footprint of which it overlaps."""
+    lift = (points[i, 2] - extents[i, 2] / 2) - (points[j, 2] + extents[j, 2] / 2)
+    if lift > CONTACT:
+        return ABOVE
+    if abs(lift) <= CONTACT and points[i, 2] > points[j, 2]:
+        return ON_TOP
+    return _NONE
+
+
+@compiled
+def _horizontal(points, i, j):
+    """The relation of i to j, its neighbour."""
+    nearer, aside = points[j, 0] - points[i, 0], points[i, 1] - points[j, 1]
+    if abs(aside) >= abs(nearer):
+        return LEFT if aside >= MIN_OFFSET else _NONE
+    return FRONT if nearer >= MIN_OFFSET else _NONE
 
 
 def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+    array = np.asarray(values, dtype=np.float64, order="C")
     if array.size == 0 and 0 in shape:
         return array.reshape(shape)
     if array.shape != shape:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -46,7 +47,7 @@ def observe(
     yaws = np.array([thing.yaw for thing in scene.objects])
     nobody_looks = viewpoint is None and frame_id is not None and is_world_fixed(frame_id)
     poses = derive_relations(positions, sizes, yaws, horizontal=not nobody_looks)
-    triples = tuple((int(a), int(i), int(j)) for a, i, j in np.argwhere(poses.holds))
+    triples = tuple(zip(*(ends.tolist() for ends in np.nonzero(poses.holds)), strict=True))
     return replace(scene, relations=triples, poses=poses)
 
 
@@ -57,7 +58,11 @@ def _seen_from(objects: tuple[SceneObject, ...], viewpoint: Viewpoint) -> tuple[
         [thing.yaw for thing in objects],
     )
     turned = [
-        thing if thing.position is None else replace(thing, position=(x, y, z), yaw=yaw)
+        thing
+        if thing.position is None
+        else SceneObject(
+            thing.id, thing.label, thing.class_index, thing.confidence, (x, y, z), thing.size, yaw
+        )
         for thing, (x, y, z), yaw in zip(objects, positions.tolist(), yaws.tolist(), strict=True)
     ]
     return tuple(turned)
@@ -65,9 +70,10 @@ def _seen_from(objects: tuple[SceneObject, ...], viewpoint: Viewpoint) -> tuple[
 
 def _extent(
     thing: SceneObject, typical_sizes: NDArray[np.float64] | None
-) -> tuple[float, ...] | NDArray[np.float64]:
+) -> Sequence[float]:
     if thing.size is not None:
         return thing.size
     if typical_sizes is not None and thing.class_index is not None:
-        return np.asarray(typical_sizes[thing.class_index])
+        size: list[float] = typical_sizes[thing.class_index].tolist()
+        return size
     return _UNKNOWN

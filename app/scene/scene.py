@@ -60,7 +60,8 @@ class Scene:
         relations_complete: whatever is not listed in ``relations`` does not hold.
         room_type: index of the room type in the model's vocabulary; None if unknown.
         poses: relations derived from poses (see `app.scene.observe`), which also say what was seen
-            *not* to hold. They take the place of ``relations`` as evidence.
+            *not* to hold. They take the place of ``relations`` as evidence, and ``relations`` are
+            then taken to be what they hold, which needs no check.
 
     Raises:
         ValueError: two things with one id, a triple that points nowhere, joins a thing to itself or
@@ -80,7 +81,7 @@ class Scene:
         if self.relations is None:
             if self.relations_complete:
                 raise ValueError("relations_complete needs relations")
-        else:
+        elif self.poses is None:
             for triple in self.relations:
                 self._check(triple, n)
             if clash := contradiction(self.relations):
@@ -107,4 +108,6 @@ class Scene:
 
 
 def _are_finite(point: Sequence[float]) -> bool:
-    return len(point) == 3 and all(map(math.isfinite, point))
+    # Written out: a scene asks this twice for every object.
+    finite = math.isfinite
+    return len(point) == 3 and finite(point[0]) and finite(point[1]) and finite(point[2])

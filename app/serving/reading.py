@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from typing import Final
 
 from app.scene.frames import body_pose, is_optical
@@ -19,7 +20,7 @@ from app.scene.observe import observe
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
-from app.schemas import Detection, Relation, SceneRequest
+from app.schemas import Detection, ObservedRelation, SceneRequest
 from app.serving.errors import Fault, Location, Reason, RequestError
 
 MAX_SUGGESTED: Final = 32
@@ -52,6 +53,8 @@ class Faults:
         Raises:
             RequestError: something was found.
         """
+        if not self.found:
+            return
         for reason in Reason:
             if reason in self.found:
                 raise RequestError(reason, self.found[reason])
@@ -70,7 +73,7 @@ class Reading:
 
     scene: Scene
     ignored: tuple[str, ...]
-    observed: tuple[Relation, ...] | None
+    observed: list[ObservedRelation] | None
     names: Names
 
     def id(self, position: int) -> str:
@@ -92,15 +95,30 @@ class Names:
         vocabulary: Vocabulary,
     ) -> None:
         self._vocabulary = vocabulary
+        self._objects = objects
         self._ignored_ids = {name for name, _ in ignored}
         self._ignored_labels = {label_key(label) for _, label in ignored}
-        self._by_id = {thing.id: place for place, thing in enumerate(objects)}
-        self._by_label: dict[str, list[int]] = {}
-        self._by_class: dict[int, list[int]] = {}
-        for place, thing in enumerate(objects):
-            self._by_label.setdefault(thing.label, []).append(place)
+
+    # Made when first asked for: most requests name none of their objects.
+
+    @cached_property
+    def _by_id(self) -> dict[str, int]:
+        return {thing.id: place for place, thing in enumerate(self._objects)}
+
+    @cached_property
+    def _by_label(self) -> dict[str, list[int]]:
+        places: dict[str, list[int]] = {}
+        for place, thing in enumerate(self._objects):
+            places.setdefault(thing.label, []).append(place)
+        return places
+
+    @cached_property
+    def _by_class(self) -> dict[int, list[int]]:
+        places: dict[int, list[int]] = {}
+        for place, thing in enumerate(self._objects):
             if thing.class_index is not None:
-                self._by_class.setdefault(thing.class_index, []).append(place)
+                places.setdefault(thing.class_index, []).append(place)
+        return places
 
     def find(self, name: str, location: Location, faults: Faults) -> int | None:
         """The place of the one object that ``name`` names; else None, with a fault noted.
@@ -205,7 +223,7 @@ def unknown_label(vocabulary: Vocabulary, label: str, location: Location, faults
 
 def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
     """The id of every object: its own, or its label, numbered where the label is not enough."""
-    taken: set[str] = set()
+    taken: dict[str, None] = {}
     labels = []
     for place, entry in enumerate(entries):
         if isinstance(entry, str):
@@ -215,7 +233,9 @@ def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
         else:
             if entry.id in taken:
                 faults.add(Reason.INVALID, ("objects", place, "id"), "another object has this id")
-            taken.add(entry.id)
+            taken[entry.id] = None
+    if len(taken) == len(entries):
+        return list(taken)
     if not taken and len(set(labels)) == len(labels):
         return labels
     repeats = Counter(labels)
@@ -232,7 +252,7 @@ def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
                 name = f"{label}_{last[label]}"
                 if name not in taken:
                     break
-        taken.add(name)
+        taken[name] = None
         ids.append(name)
     return ids
 
@@ -311,12 +331,9 @@ def _viewpoint(request: SceneRequest) -> Viewpoint | None:
     return Viewpoint(request.viewpoint.x, request.viewpoint.y, request.viewpoint.yaw)
 
 
-def _relations(scene: Scene) -> tuple[Relation, ...]:
-    return tuple(
-        Relation(
-            subject=scene.objects[i].id,
-            relation=CANONICAL[a],  # type: ignore[arg-type]
-            object=scene.objects[j].id,
-        )
+def _relations(scene: Scene) -> list[ObservedRelation]:
+    ids = [thing.id for thing in scene.objects]
+    return [
+        ObservedRelation(ids[i], CANONICAL[a], ids[j])  # type: ignore[arg-type]
         for a, i, j in scene.relations or ()
-    )
+    ]

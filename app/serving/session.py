@@ -133,5 +133,5 @@ class Session:
             "frame_id": request.frame_id,
             "stamp": request.stamp,
             "ignored": list(reading.ignored),
-            "observed_relations": None if reading.observed is None else list(reading.observed),
+            "observed_relations": reading.observed,
         }
