@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.compiling import compiled, compiled_in_any_order
 from app.boltzmann.elementary import logistic
 from app.boltzmann.relation_kernels import means, residual, to_log_odds
+from app.compiling import compiled, compiled_in_any_order
 
 _DAMPING = np.float32(0.8)
 _MOST = np.float32(3.0)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.compiling import compiled
 from app.boltzmann.elementary import exp, log, logistic
+from app.compiling import compiled
 
 
 @compiled

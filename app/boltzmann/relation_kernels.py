@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.compiling import compiled, compiled_in_any_order, inlined
 from app.boltzmann.elementary import exp, log, logistic
+from app.compiling import compiled, compiled_in_any_order, inlined
 
 NO_UNIT = np.float32(-30.0)
 """No log-odds of a relation is below."""

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from app.compiling import compiled
 from app.boltzmann.elementary import log, logistic
 from app.boltzmann.machine import BoltzmannMachine
+from app.compiling import compiled
 
 # Of log of a product: float32 spans exp(±87).
 _LOG_RANGE = 80.0

@@ -71,8 +71,10 @@ def pool_instances(
         raise ValueError(f"confidence has shape {confidence.shape}, must be {(size,)}")
     labels = np.asarray(classes, dtype=np.int64, order="C")
     sure = np.asarray(confidence, dtype=np.float64, order="C")
-    found = _pool(labels, sure, np.ascontiguousarray(holds), np.ascontiguousarray(observed))
-    return ClassEvidence(*found, room_type)
+    distinct, counts, present, on, seen = _pool(
+        labels, sure, np.ascontiguousarray(holds), np.ascontiguousarray(observed)
+    )
+    return ClassEvidence(distinct, counts, present, on, seen, room_type)
 
 
 @compiled

@@ -80,8 +80,10 @@ def _rotation(quaternion: Quaternion) -> tuple[Vector, ...]:
     if not abs(norm - 1.0) <= _NORM_TOLERANCE:
         raise ValueError(f"orientation must be a quaternion of length 1, not of length {norm:g}")
     x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    xx, yy, zz = x * x, y * y, z * z
+    xy, xz, yz, xw, yw, zw = x * y, x * z, y * z, x * w, y * w, z * w
     return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
-        (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
-        (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
+        (1 - 2 * (yy + zz), 2 * (xy + zw), 2 * (xz - yw)),
+        (2 * (xy - zw), 1 - 2 * (xx + zz), 2 * (yz + xw)),
+        (2 * (xz + yw), 2 * (yz - xw), 1 - 2 * (xx + yy)),
     )

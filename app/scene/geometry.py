@@ -143,19 +143,26 @@ def _are_positive(extents):
 @compiled
 def _relate_all(points, extents, turns, horizontal, holds, observed):
     n = len(points)
-    located, sized = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    located, sized, radius = np.empty(n, np.bool_), np.empty(n, np.bool_), np.empty(n)
     for i in range(n):
         located[i], sized[i] = _is_known(points[i]), _is_known(extents[i])
+        radius[i] = math.hypot(extents[i, 0], extents[i, 1]) / 2
     for i in range(n):
         for j in range(i + 1, n):
             if not (located[i] and located[j]):
                 continue
             distance = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
             boxed, stacked = sized[i] and sized[j], False
-            if boxed:
-                neighbours, stacked = _footprints(points, extents, turns, distance, i, j)
-            else:
+            if not boxed:
                 neighbours = distance <= NEIGHBOUR_DISTANCE
+            # Rectangles are measured only where the circles around them come near enough.
+            elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
+                share, gap = measure(
+                    points[i], extents[i], turns[i], points[j], extents[j], turns[j]
+                )
+                neighbours, stacked = gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
+            else:
+                neighbours = False
             if neighbours:
                 _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed)
 
@@ -163,22 +170,6 @@ def _relate_all(points, extents, turns, horizontal, holds, observed):
 @compiled
 def _is_known(row):
     return not (math.isnan(row[0]) or math.isnan(row[1]) or math.isnan(row[2]))
-
-
-@compiled
-def _footprints(points, extents, turns, distance, i, j):
-    """Whether two boxes are neighbours, and whether they stand over one another."""
-    # Rectangles are measured only where the circles around them come near enough.
-    radius_i, radius_j = _radius(extents[i]), _radius(extents[j])
-    if not distance - radius_i - radius_j <= NEIGHBOUR_GAP:
-        return False, False
-    share, gap = measure(points[i], extents[i], turns[i], points[j], extents[j], turns[j])
-    return gap <= NEIGHBOUR_GAP, share >= MIN_OVERLAP
-
-
-@compiled
-def _radius(extent):
-    return math.hypot(extent[0], extent[1]) / 2
 
 
 @compiled

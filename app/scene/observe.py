@@ -68,9 +68,7 @@ def _seen_from(objects: tuple[SceneObject, ...], viewpoint: Viewpoint) -> tuple[
     return tuple(turned)
 
 
-def _extent(
-    thing: SceneObject, typical_sizes: NDArray[np.float64] | None
-) -> Sequence[float]:
+def _extent(thing: SceneObject, typical_sizes: NDArray[np.float64] | None) -> Sequence[float]:
     if thing.size is not None:
         return thing.size
     if typical_sizes is not None and thing.class_index is not None:

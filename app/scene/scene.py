@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NoReturn
 
 from app.scene.geometry import PoseRelations
 from app.scene.relations import CANONICAL, contradiction
@@ -83,7 +84,10 @@ class Scene:
                 raise ValueError("relations_complete needs relations")
         elif self.poses is None:
             for triple in self.relations:
-                self._check(triple, n)
+                relation, subject, anchor = triple
+                ends_exist = 0 <= subject < n and 0 <= anchor < n
+                if subject == anchor or not (ends_exist and 0 <= relation < len(CANONICAL)):
+                    self._refuse(triple, n)
             if clash := contradiction(self.relations):
                 (relation, i, j), _ = clash
                 first, second = self.objects[i].id, self.objects[j].id
@@ -96,15 +100,14 @@ class Scene:
                 f"poses have shape {self.poses.holds.shape}, must be {(len(CANONICAL), n, n)}"
             )
 
-    def _check(self, triple: tuple[int, int, int], n: int) -> None:
+    def _refuse(self, triple: tuple[int, int, int], n: int) -> NoReturn:
         relation, subject, anchor = triple
         if not 0 <= relation < len(CANONICAL):
             raise ValueError(f"relation index {relation} is not in 0..{len(CANONICAL) - 1}")
         for end in (subject, anchor):
             if not 0 <= end < n:
                 raise ValueError(f"object {end} of a relation is not in 0..{n - 1}")
-        if subject == anchor:
-            raise ValueError(f"{self.objects[subject].id!r} cannot be {CANONICAL[relation]} itself")
+        raise ValueError(f"{self.objects[subject].id!r} cannot be {CANONICAL[relation]} itself")
 
 
 def _are_finite(point: Sequence[float]) -> bool:
