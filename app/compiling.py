@@ -1,9 +1,9 @@
 """How loops are compiled: by numba, kept on disk between processes, without the interpreter's lock.
 
 Division by zero gives what the hardware gives. A function that is compiled anew takes a second or
-so; `python -m app.compile` does all of them ahead of the first start. Where nothing can be written,
-neither beside the sources nor into NUMBA_CACHE_DIR nor into the user's cache directory, every
-process compiles for itself.
+so; `python -m app.compile` does those of the service ahead of its first start. Where nothing can be
+written, neither beside the sources nor into NUMBA_CACHE_DIR nor into the user's cache directory,
+every process compiles for itself.
 """
 
 from __future__ import annotations

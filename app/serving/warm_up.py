@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from app import reasoning
 from app.registry import Artifact
+from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 
@@ -16,8 +17,8 @@ STEPS = 4
 
 
 def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...]]:
-    """Ask everything once, with and without given relations: the first call of a compiled loop
-    compiles it, and that of a kernel of torch costs many times the later ones.
+    """Ask everything once, with and without given relations and with poses: the first call of a
+    compiled loop compiles it, and that of a kernel of torch costs many times the later ones.
 
     Returns:
         The model's contexts, which never change.
@@ -28,7 +29,10 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     """
     scene = _scene(artifact.vocabulary)
     bare = replace(scene, relations=None)
-    relations = [*reasoning.relations(artifact, scene), *reasoning.relations(artifact, bare)]
+    seen = observe(bare, typical_sizes=artifact.vocabulary.sizes)
+    relations = [
+        entry for one in (scene, bare, seen) for entry in reasoning.relations(artifact, one)
+    ]
     missing = [*reasoning.missing(artifact, scene), *reasoning.missing(artifact, bare)]
     if len(scene.objects) > 1:
         for one in (scene, bare):
@@ -48,10 +52,10 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """Three kinds of things, or as many as there are, one of them on another."""
+    """Three kinds of things, or as many as there are, in a row; one is said to be on another."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
-        SceneObject(str(place), vocabulary.labels[index], index)
+        SceneObject(str(place), vocabulary.labels[index], index, position=(1.0, 0.5 * place, 0.5))
         for place, index in enumerate((proposable or [0])[:3])
     )
     return Scene(objects, ((2, 1, 0),) if len(objects) > 1 else None)

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene.footprints import overlap_and_gap
+from tests.scene.pose_rules import border_distance, common_area
 
 Rectangle = tuple[float, float, float, float, float]
 Polygon = list[tuple[float, float]]
@@ -34,48 +35,6 @@ def polygon(rectangle: Rectangle) -> Polygon:
     ]
 
 
-def clipped_area(subject: Polygon, clip: Polygon) -> float:
-    """Area of the intersection (Sutherland & Hodgman 1974)."""
-    for (ax, ay), (bx, by) in zip(clip, clip[1:] + clip[:1], strict=True):
-
-        def side(p: tuple[float, float], ax=ax, ay=ay, bx=bx, by=by) -> float:  # type: ignore[no-untyped-def]
-            return (bx - ax) * (p[1] - ay) - (by - ay) * (p[0] - ax)
-
-        kept: Polygon = []
-        for p, q in zip(subject, subject[1:] + subject[:1], strict=True):
-            if side(p) >= 0:
-                kept.append(p)
-            if side(p) * side(q) < 0:
-                t = side(p) / (side(p) - side(q))
-                kept.append((p[0] + t * (q[0] - p[0]), p[1] + t * (q[1] - p[1])))
-        subject = kept
-    return (
-        abs(
-            sum(
-                p[0] * q[1] - p[1] * q[0]
-                for p, q in zip(subject, subject[1:] + subject[:1], strict=True)
-            )
-        )
-        / 2
-    )
-
-
-def nearest(a: Polygon, b: Polygon) -> float:
-    """Least distance between the borders of two polygons."""
-
-    def to_edges(points: Polygon, edges: Polygon) -> float:
-        best = math.inf
-        for px, py in points:
-            for (ax, ay), (bx, by) in zip(edges, edges[1:] + edges[:1], strict=True):
-                ux, uy = bx - ax, by - ay
-                t = ((px - ax) * ux + (py - ay) * uy) / (ux * ux + uy * uy)
-                t = min(max(t, 0.0), 1.0)
-                best = min(best, math.hypot(px - ax - t * ux, py - ay - t * uy))
-        return best
-
-    return min(to_edges(a, b), to_edges(b, a))
-
-
 def measure(a: Rectangle, b: Rectangle) -> tuple[float, float]:
     share, gap = overlap_and_gap(
         *(np.array([part], dtype=float) for r in (a, b) for part in (r[:2], r[2:4], r[4]))
@@ -86,9 +45,13 @@ def measure(a: Rectangle, b: Rectangle) -> tuple[float, float]:
 @given(rectangles, rectangles)
 def test_overlap_and_gap_agree_with_polygon_clipping(a: Rectangle, b: Rectangle) -> None:
     share, gap = measure(a, b)
-    area = clipped_area(polygon(a), polygon(b))
+    area = common_area(polygon(a), polygon(b))
     assert share * min(a[2] * a[3], b[2] * b[3]) == pytest.approx(area, abs=1e-5)
-    expected = 0.0 if area > 1e-9 else nearest(polygon(a), polygon(b))
+    expected = (
+        0.0
+        if area > 1e-9
+        else min(border_distance(polygon(a), polygon(b)), border_distance(polygon(b), polygon(a)))
+    )
     assert gap == pytest.approx(expected, abs=1e-5)
 
 

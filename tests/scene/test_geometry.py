@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -8,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from app.scene import geometry
 from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
 from app.scene.relations import ABOVE, CANONICAL, FRONT, LEFT, ON_TOP
+from tests.scene.pose_rules import Box, UndecidedError, relate
 
 NAN = math.nan
 TABLE = ((2.0, 0.0, 0.4), (1.0, 1.6, 0.8))
@@ -91,6 +95,64 @@ def test_from_the_opposite_side_left_is_right(
     there = derive_relations(positions * [-1, -1, 1], sizes, yaws)
     flat = [LEFT, FRONT]
     assert (here.holds[flat] == there.holds[flat].transpose(0, 2, 1)).all()
+
+
+def compare(found: PoseRelations, boxes: list[Box], *, horizontal: bool = True) -> Counter[str]:
+    """Compare every pair with the plain rules; returns what held and how often none could tell."""
+    seen: Counter[str] = Counter()
+    for i, j in permutations(range(len(boxes)), 2):
+        try:
+            holds, observed = relate(boxes[i], boxes[j], horizontal=horizontal)
+        except UndecidedError:
+            seen["undecided"] += 1
+            continue
+        assert names(found, i, j) == (holds, observed)
+        seen.update(holds or ["none" if observed else "unobserved"])
+    return seen
+
+
+def boxes_of(positions: np.ndarray, sizes: np.ndarray, yaws: np.ndarray) -> list[Box]:
+    return [
+        Box(*(None if np.isnan(part).any() else part.tolist() for part in rows), yaw)
+        for *rows, yaw in zip(positions, sizes, yaws.tolist(), strict=True)
+    ]
+
+
+@given(rooms(), st.booleans())
+def test_every_pair_obeys_the_rules(
+    room: tuple[np.ndarray, np.ndarray, np.ndarray], horizontal: bool
+) -> None:
+    found = derive_relations(*room, horizontal=horizontal)
+    compare(found, boxes_of(*room), horizontal=horizontal)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("n", [12, 30])
+def test_every_pair_of_a_drawn_room_obeys_the_rules(n: int, turned: bool) -> None:
+    rng = np.random.default_rng(n)
+    seen: Counter[str] = Counter()
+    for _ in range(900 // n):
+        positions = rng.uniform(-2, 2, (n, 3)) * [1, 1, 0.3]
+        sizes, yaws = rng.uniform(0.05, 1.5, (n, 3)), np.zeros(n)
+        if turned:
+            yaws = rng.uniform(-7, 7, n)
+        else:  # a grid of eighths: every sum is exact, equal offsets are common
+            positions, sizes = np.round(positions * 8) / 8, np.ceil(sizes * 8) / 8
+        positions[rng.random(n) < 0.1, rng.integers(3)] = NAN
+        sizes[rng.random(n) < 0.2, rng.integers(3)] = NAN
+        seen += compare(derive_relations(positions, sizes, yaws), boxes_of(positions, sizes, yaws))
+    assert set(CANONICAL) | {"none", "unobserved"} <= set(seen)
+    # On the grid a gap of exactly one metre is common.
+    assert seen["undecided"] < (0.001 if turned else 0.05) * seen.total()
+
+
+def test_no_kind_of_array_is_compiled_for_anew() -> None:
+    rows = [[0, 0, 0], [1, 1, 0], [2, 0, 0]]
+    wide = np.arange(36.0).reshape(3, 12) + 1
+    for table in (rows, np.array(rows), np.asfortranarray(rows, dtype=float), wide[:, ::4]):
+        derive_relations(table, np.ones((3, 3)), [0, 0, 0], horizontal=False)
+        derive_relations(table, np.ones((3, 3), np.float32))
+    assert len(geometry._relate_all.signatures) == 1  # type: ignore[attr-defined]
 
 
 def test_a_quarter_turn_exchanges_left_and_front() -> None:
