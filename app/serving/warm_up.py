@@ -33,13 +33,14 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     relations = [
         entry for one in (scene, bare, seen) for entry in reasoning.relations(artifact, one)
     ]
-    missing = [*reasoning.missing(artifact, scene), *reasoning.missing(artifact, bare)]
+    missing = [entry for one in (scene, bare, seen) for entry in reasoning.missing(artifact, one)]
     if len(scene.objects) > 1:
         for one in (scene, bare):
             reasoning.missing(artifact, one, at=("on-top", 0))
             reasoning.missing(artifact, one, at=("under", 0))
     outliers, misplaced = reasoning.outliers(artifact, scene)
-    outliers += reasoning.outliers(artifact, bare)[0]
+    for one in (bare, seen):
+        outliers += reasoning.outliers(artifact, one)[0]
     generated = reasoning.generate(artifact, scene, count=2, seed=0, steps=STEPS)
     numbers = [entry.probability for entry in relations]
     numbers += [number for entry in missing for number in (entry.probability, entry.log_odds)]
