@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import sys
 
+from app.serving.metrics import Unmeasured
 from app.serving.reading import Limits
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -20,7 +21,7 @@ def main() -> int:
         The exit status: 1 where one of them cannot be used.
     """
     settings = Settings()
-    runtime = Runtime(settings.store, Limits(), settings.queue_rows)
+    runtime = Runtime(settings.store, Limits(), settings.queue_rows, Unmeasured())
     asyncio.run(runtime.start())
     runtime.stop()
     failures = runtime.models.failures

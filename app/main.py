@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from app import __version__, api
+from app.serving.metrics import Metrics, Unmeasured
 from app.serving.reading import Limits
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -35,6 +36,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         settings.store,
         Limits(objects=settings.max_objects, relations=settings.max_relations),
         settings.queue_rows,
+        Metrics() if settings.metrics else Unmeasured(),
     )
 
     @asynccontextmanager

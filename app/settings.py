@@ -72,6 +72,7 @@ class Settings(BaseSettings):
     retry_after: Annotated[
         int, Field(ge=1, le=3600, description="seconds named in Retry-After when not ready")
     ] = 2
+    metrics: Annotated[bool, Field(description="count, and answer /metrics")] = True
     docs: Annotated[bool, Field(description="serve /docs and /redoc")] = True
     root_path: Annotated[
         str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")

@@ -7,7 +7,17 @@ from typing import Any
 from fastapi import FastAPI
 from starlette.types import Lifespan
 
-from app.api import batches, health, middleware, models, openapi, pages, problems, questions
+from app.api import (
+    batches,
+    health,
+    middleware,
+    models,
+    monitoring,
+    openapi,
+    pages,
+    problems,
+    questions,
+)
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
@@ -35,7 +45,7 @@ def build(
     app.state.settings = settings
     app.state.runtime = runtime
     problems.install(app)
-    middleware.install(app, settings, lambda: runtime.draining)
+    middleware.install(app, settings, runtime.metrics, lambda: runtime.draining)
     for router in (
         questions.router,
         batches.router,
@@ -45,5 +55,7 @@ def build(
         health.protocol,
     ):
         app.include_router(router)
+    if settings.metrics:
+        app.include_router(monitoring.router)
     pages.install(app, docs=settings.docs)
     return app

@@ -29,6 +29,7 @@ from app.schemas import (
 )
 from app.serving import questions
 from app.serving.models import DEFAULT
+from app.serving.record import SUCCESS
 from app.serving.session import Session
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
@@ -51,6 +52,9 @@ async def _answer_each(
     kind: type[RequestT],
     question: Callable[[Session, RequestT], Awaitable[AnswerT]],
 ) -> BatchAnswer[AnswerT]:
+    def count(outcome: str) -> None:
+        session.metrics.entry_answered(question.__name__, outcome)
+
     results: list[BatchEntry[AnswerT]] = []
     with session.for_batch([_reference(scene) for scene in batch.scenes]) as held:
         for place, scene in enumerate(batch.scenes):
@@ -58,10 +62,13 @@ async def _answer_each(
                 held.ticket.check()
                 result = await question(held, _validated(scene, place, kind))
                 results.append(BatchEntry[AnswerT](status=200, result=result))
+                count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
-                problem = from_exception(error, at=("scenes", place)).describe(session.request_id)
+                failure = from_exception(error, at=("scenes", place))
+                problem = failure.describe(session.request_id)
                 if problem.status == 500:
                     report_defect(error, session.request_id)
+                count(failure.kind.slug)
                 results.append(BatchEntry[AnswerT](status=problem.status, problem=problem))
             # Others are served between two scenes, health checks first of all.
             await asyncio.sleep(0)

@@ -23,8 +23,9 @@ async def _request_id(request: Request) -> str:
 
 
 async def _session(request: Request) -> Session:
-    ticket = Ticket(request.state.deadline, request.is_disconnected)
-    return (await _runtime(request)).session(await _request_id(request), ticket)
+    state = request.state
+    ticket = Ticket(state.deadline, request.is_disconnected)
+    return (await _runtime(request)).session(state.request_id, ticket, state.record)
 
 
 RuntimeDep = Annotated[Runtime, Depends(_runtime)]

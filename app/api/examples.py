@@ -124,7 +124,7 @@ def _batch(result: dict[str, Any]) -> dict[str, Any]:
     return {"request_id": _ID, "results": entries}
 
 
-ANSWERS: Final[dict[str, dict[str, Any]]] = {
+ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     "relations": _RELATIONS,
     "missing": _MISSING,
     "outliers": _OUTLIERS,
@@ -216,4 +216,11 @@ ANSWERS: Final[dict[str, dict[str, Any]]] = {
         "outputs": [],
     },
     "model_ready": {"name": "home", "ready": True},
+    "show_metrics": (
+        "# HELP scene_requests_total Requests answered; outcome is success or the name of the "
+        "problem\n"
+        "# TYPE scene_requests_total counter\n"
+        'scene_requests_total{method="POST",outcome="success",route="/missing"} 1027.0\n'
+        'scene_requests_total{method="POST",outcome="unknown-labels",route="/missing"} 3.0\n'
+    ),
 }

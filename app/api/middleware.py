@@ -1,4 +1,4 @@
-"""Plain ASGI middleware: request ids and access lines, and the limit on bodies.
+"""Plain ASGI middleware: request ids, access lines and metrics, and the limit on bodies.
 
 None of it derives from `BaseHTTPMiddleware`, three of which cost three quarters of the throughput.
 """
@@ -20,14 +20,30 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from app.api import catalogue
 from app.api.problems import ProblemError, respond
 from app.api.turnstile import Turnstile
+from app.serving.metrics import Metrics
+from app.serving.record import SUCCESS, RequestRecord
 from app.settings import Settings
 
+CANCELLED: Final = "cancelled"
+"""The outcome of a request that the server gave up while it stopped."""
+OTHER: Final = "other"
+"""The outcome of a failure without a problem document, as of an asset's impossible range."""
+
 REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._~:-]{1,128}")
+
+# A client may make up a method; these are what RFC 9110 and RFC 5789 define.
+_METHODS: Final = frozenset(
+    ("GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH")
+)
+
 _access = logging.getLogger("app.access")
 
 
 def install(
-    app: FastAPI, settings: Settings, is_draining: Callable[[], bool] = lambda: False
+    app: FastAPI,
+    settings: Settings,
+    metrics: Metrics,
+    is_draining: Callable[[], bool] = lambda: False,
 ) -> None:
     """Add all of it to an application.
 
@@ -42,18 +58,19 @@ def install(
         is_draining=is_draining,
     )
     # Added last, so outermost: an answer of those above carries the id as well.
-    app.add_middleware(RequestContext, access_log=settings.access_log)
+    app.add_middleware(RequestContext, metrics=metrics, access_log=settings.access_log)
 
 
 class RequestContext:
-    """Gives every request an id, echoes it as ``X-Request-Id``, and writes one line about it.
+    """Gives every request an id, echoes it as ``X-Request-Id``, counts it and writes a line.
 
     A client's own id is kept if it is made of 1–128 unreserved URI characters or colons; any other
     is replaced, so that logs and answers hold nothing a client made up.
     """
 
-    def __init__(self, app: ASGIApp, *, access_log: bool = True) -> None:
+    def __init__(self, app: ASGIApp, *, metrics: Metrics, access_log: bool = True) -> None:
         self.app = app
+        self.metrics = metrics
         self.access_log = access_log
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -63,7 +80,10 @@ class RequestContext:
             return
         given = Headers(scope=scope).get("x-request-id", "")
         request_id = given if REQUEST_ID.fullmatch(given) else str(uuid.uuid4())
-        scope.setdefault("state", {})["request_id"] = request_id
+        record = RequestRecord()
+        state = scope.setdefault("state", {})
+        state["request_id"] = request_id
+        state["record"] = record
         status = 500
         began = time.perf_counter()
 
@@ -72,20 +92,41 @@ class RequestContext:
             if message["type"] == "http.response.start":
                 status = message["status"]
                 MutableHeaders(scope=message)["X-Request-Id"] = request_id
+                if record.answered_at is not None and status < 400:
+                    self.metrics.serialised(time.perf_counter() - record.answered_at)
             await send(message)
 
         try:
             await self.app(scope, receive, send_with_id)
+        except Exception:
+            # The problem is sent by the server's own handler, outside of all middleware.
+            status, record.outcome = 500, catalogue.INTERNAL_ERROR.slug
+            raise
+        except BaseException:
+            record.outcome = CANCELLED
+            raise
         finally:
-            if self.access_log:
-                milliseconds = (time.perf_counter() - began) * 1e3
+            seconds = time.perf_counter() - began
+            if status >= 400 and record.outcome == SUCCESS:
+                record.outcome = OTHER
+            method = scope["method"] if scope["method"] in _METHODS else "-"
+            route = _route(scope)
+            self.metrics.answered(route, method, record.outcome, seconds)
+            if self.access_log and _access.isEnabledFor(logging.INFO):
                 _access.info(
                     "%s %s %d %.2f ms",
-                    scope["method"],
-                    _route(scope),
+                    method,
+                    route,
                     status,
-                    milliseconds,
-                    extra={"request_id": request_id, "status": status},
+                    seconds * 1e3,
+                    extra={
+                        "request_id": request_id,
+                        "method": method,
+                        "route": route,
+                        "status": status,
+                        "latency_ms": round(seconds * 1e3, 3),
+                        **record.known(),
+                    },
                 )
 
 

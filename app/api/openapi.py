@@ -49,6 +49,7 @@ TAGS: Final = [
     {"name": "models", "description": "What can be asked, and what each model knows."},
     {"name": "administration", "description": "Changing what is served; needs the admin key."},
     {"name": "health", "description": "For orchestrators."},
+    {"name": "monitoring", "description": "For Prometheus."},
     {"name": "inference protocol", "description": "Open Inference Protocol spellings."},
 ]
 
@@ -105,7 +106,7 @@ class DocumentedAPI(FastAPI):
             schemas |= problem.pop("$defs") | {"Problem": problem}
             for path in document["paths"].values():
                 for operation in path.values():
-                    ok = operation["responses"]["200"]["content"]["application/json"]
+                    (ok,) = operation["responses"]["200"]["content"].values()
                     ok["example"] = examples.ANSWERS[operation["operationId"]]
                     if "504" in operation["responses"]:
                         operation.setdefault("parameters", []).append(_TIMEOUT_PARAMETER)

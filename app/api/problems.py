@@ -207,7 +207,10 @@ def _request_id(request: Request) -> str:
 
 
 def respond(request: Request, problem: ProblemError) -> Response:
-    """The problem as a response."""
+    """The problem as a response, and its name in the request's record."""
+    record = request.scope.get("state", {}).get("record")
+    if record is not None:
+        record.outcome = problem.kind.slug
     headers = dict(problem.headers or {})
     if problem.status_code in (429, 503):
         headers["Retry-After"] = str(request.app.state.settings.retry_after)

@@ -7,11 +7,22 @@ import logging
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-_EXTRAS = ("request_id", "status")
+_EXTRAS = (
+    "request_id",
+    "method",
+    "route",
+    "status",
+    "outcome",
+    "model",
+    "version",
+    "latency_ms",
+    "queue_ms",
+    "compute_ms",
+)
 
 
 class JSONFormatter(logging.Formatter):
-    """One JSON object a line: time, level, logger, message, and the request id if there is one."""
+    """One JSON object a line: time, level, logger, message, and what is known of the request."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as a line."""

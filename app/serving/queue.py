@@ -17,7 +17,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
 
@@ -54,9 +54,22 @@ class Ticket:
             raise DeadlinePassedError("The deadline passed before the answer was begun.")
 
 
+@dataclass(frozen=True, slots=True)
+class Done(Generic[T]):
+    """A job that has been done.
+
+    Attributes:
+        waited, computed: seconds before it was begun, and that it took.
+    """
+
+    result: T
+    waited: float
+    computed: float
+
+
 @dataclass(slots=True, eq=False)
 class _Job:
-    call: Callable[[], Any]
+    call: Callable[[], Done[Any]]
     ticket: Ticket
     future: asyncio.Future[Any]
 
@@ -110,8 +123,8 @@ class WorkQueue:
 
     async def run(
         self, call: Callable[[], T], ticket: Ticket, *, kind: str, size: float, costly: bool = False
-    ) -> T:
-        """The result of a job.
+    ) -> Done[T]:
+        """Let a job be done.
 
         Args:
             call: the work; it may run in another thread.
@@ -124,12 +137,14 @@ class WorkQueue:
             Exception: whatever the job raises.
         """
         cost = self._costs.setdefault(kind, _Cost())
+        came = monotonic()
 
-        def measured() -> T:
+        def measured() -> Done[T]:
             began = monotonic()
             result = call()
-            cost.learn(monotonic() - began, size)
-            return result
+            seconds = monotonic() - began
+            cost.learn(seconds, size)
+            return Done(result, began - came, seconds)
 
         if costly or cost.expected(size) > CHEAP:
             return await self._in_thread(measured, ticket)
@@ -139,7 +154,7 @@ class WorkQueue:
         if not self._draining:
             self._draining = True
             loop.call_soon(self._drain)
-        found: T = await job.future
+        found: Done[T] = await job.future
         return found
 
     def _drain(self) -> None:
@@ -153,13 +168,13 @@ class WorkQueue:
                 return
         self._draining = False
 
-    async def _in_thread(self, call: Callable[[], T], ticket: Ticket) -> T:
+    async def _in_thread(self, call: Callable[[], Done[T]], ticket: Ticket) -> Done[T]:
         ticket.check()
         if ticket.is_gone is not None and await ticket.is_gone():
             raise DisconnectedError("The client has gone.")
         dropped = False
 
-        def unless_dropped() -> T:
+        def unless_dropped() -> Done[T]:
             # The thread's own queue holds what is dropped until its turn, and no longer.
             if dropped:
                 raise DeadlinePassedError("dropped")

@@ -6,9 +6,11 @@ import asyncio
 import gc
 import logging
 import sys
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import wraps
 from pathlib import Path
-from typing import Literal
+from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 import torch
 
@@ -24,14 +26,20 @@ from app.serving.errors import (
     Reason,
     RefreshRefusedError,
     RequestError,
+    ServingError,
     StoreBusyError,
     StoreNotWritableError,
     UnknownModelError,
 )
+from app.serving.metrics import Change, Metrics
 from app.serving.models import DEFAULT, ServedModels, prepare
 from app.serving.queue import Ticket, WorkQueue
 from app.serving.reading import Limits
+from app.serving.record import RequestRecord
 from app.serving.session import Session
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _logger = logging.getLogger("app.serving")
 
@@ -43,6 +51,35 @@ _LOCK_TIMEOUT = 5.0
 _SWITCH_INTERVAL = 5e-4
 
 
+def _counted(
+    change: Change,
+) -> Callable[
+    [Callable[Concatenate[Runtime, P], Awaitable[T]]],
+    Callable[Concatenate[Runtime, P], Awaitable[T]],
+]:
+    """Count every attempt of a method to change what is served, by how it went."""
+
+    def decorate(
+        method: Callable[Concatenate[Runtime, P], Awaitable[T]],
+    ) -> Callable[Concatenate[Runtime, P], Awaitable[T]]:
+        @wraps(method)
+        async def attempt(self: Runtime, /, *args: P.args, **kwargs: P.kwargs) -> T:
+            try:
+                answer = await method(self, *args, **kwargs)
+            except ServingError:
+                self.metrics.reloaded(change, "refused")
+                raise
+            except Exception:
+                self.metrics.reloaded(change, "failed")
+                raise
+            self.metrics.reloaded(change, "success")
+            return answer
+
+        return attempt
+
+    return decorate
+
+
 class Runtime:
     """The one holder of the current snapshot.
 
@@ -50,12 +87,14 @@ class Runtime:
         store: directory of published models.
         limits: what one scene may hold.
         queue_rows: what may wait for one model.
+        metrics: what the service counts.
 
     Attributes:
         draining: nothing new is taken.
     """
 
-    def __init__(self, store: Path, limits: Limits, queue_rows: int) -> None:
+    def __init__(self, store: Path, limits: Limits, queue_rows: int, metrics: Metrics) -> None:
+        self.metrics = metrics
         self._store = Store(store, lock_timeout=_LOCK_TIMEOUT)
         self._limits = limits
         self._queue_rows = queue_rows
@@ -75,15 +114,22 @@ class Runtime:
             raise NotReadyError("The service is starting.")
         return self._models
 
-    def session(self, request_id: str, ticket: Ticket) -> Session:
+    def session(
+        self, request_id: str, ticket: Ticket, record: RequestRecord | None = None
+    ) -> Session:
         """The view of one request, which keeps the snapshot it starts with.
+
+        Args:
+            request_id: goes into every answer.
+            record: takes down what becomes known about the request.
 
         Raises:
             NotReadyError: nothing has been loaded yet.
             DrainingError: nothing new is taken.
         """
         self._check_open()
-        return Session(self.models, self._limits, request_id, ticket)
+        record = record or RequestRecord()
+        return Session(self.models, self._limits, request_id, ticket, self.metrics, record)
 
     def check_ready(self) -> None:
         """Return if requests that name no model can be answered.
@@ -107,8 +153,9 @@ class Runtime:
         # Serving scales by processes: threads within one would fight over the same cores.
         torch.set_num_threads(1)
         sys.setswitchinterval(_SWITCH_INTERVAL)
-        self._models = prepare(load_model_set(self._store), self._new_queue)
-        for failure in self._models.failures.values():
+        self.metrics.started()
+        models = self._serve(prepare(load_model_set(self._store), self._new_queue))
+        for failure in models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
         _settle_memory()
 
@@ -119,6 +166,12 @@ class Runtime:
     def _new_queue(self) -> WorkQueue:
         return WorkQueue(self._queue_rows, self._executor)
 
+    def _serve(self, models: ServedModels) -> ServedModels:
+        self._models = models
+        self.metrics.serving(models)
+        return models
+
+    @_counted("refresh")
     async def refresh(self, request_id: str) -> RefreshAnswer:
         """Take over what the store holds now, or leave everything as it is.
 
@@ -140,7 +193,7 @@ class Runtime:
             ]
             if worse:
                 raise RefreshRefusedError(worse)
-            self._models = new
+            self._serve(new)
             answer = RefreshAnswer(
                 request_id=request_id,
                 default=new.resolve(DEFAULT).reference,
@@ -155,6 +208,7 @@ class Runtime:
     def _load(self, old: ServedModels) -> ServedModels:
         return prepare(load_model_set(self._store, old.store), self._new_queue, old)
 
+    @_counted("alias")
     async def move_alias(self, alias: str, request: AliasRequest, request_id: str) -> AliasAnswer:
         """Let an alias lead to a version that is served, here at once and in the store for good.
 
@@ -174,7 +228,7 @@ class Runtime:
                 await asyncio.to_thread(self._store.set_alias, alias, target, expected=expected)
             except StoreError as error:
                 raise _refusal(error) from None
-            self._models = self.models.with_alias(alias, target)
+            self._serve(self.models.with_alias(alias, target))
             return AliasAnswer(
                 request_id=request_id,
                 alias=alias,

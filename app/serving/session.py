@@ -13,9 +13,11 @@ from app.registry import Artifact
 from app.scene.scene import Scene
 from app.schemas import SceneRequest
 from app.serving.errors import ServingError
+from app.serving.metrics import Metrics
 from app.serving.models import ServedModel, ServedModels
 from app.serving.queue import Ticket
 from app.serving.reading import Limits, Reading, read_scene
+from app.serving.record import RequestRecord
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -30,6 +32,8 @@ class Session:
         limits: what one scene may hold.
         request_id: goes into every answer.
         ticket: what the request may take.
+        metrics: what the service counts.
+        record: what is known about the request.
         holding: whether rows of the models' queues are held for it already.
     """
 
@@ -37,6 +41,8 @@ class Session:
     limits: Limits
     request_id: str
     ticket: Ticket
+    metrics: Metrics
+    record: RequestRecord
     holding: bool = False
 
     def read(
@@ -50,6 +56,7 @@ class Session:
             RequestError: the scene does not fit; see `read_scene`.
         """
         model = self.models.resolve(request.model)
+        self.record.asked(model.reference)
         return model, read_scene(request, model.vocabulary, self.limits, may_be_empty=may_be_empty)
 
     async def ask(
@@ -98,11 +105,16 @@ class Session:
         rows: int = 1,
         costly: bool = False,
     ) -> T:
-        queue = model.queue
+        queue, reference, name = model.queue, model.reference, question.__name__
         with queue.holding(0 if self.holding else rows):
-            return await queue.run(
-                call, self.ticket, kind=question.__name__, size=size, costly=costly
-            )
+            self.metrics.pending(reference, queue.rows)
+            done = await queue.run(call, self.ticket, kind=name, size=size, costly=costly)
+        self.metrics.pending(reference, queue.rows)
+        self.metrics.waited(reference, done.waited)
+        self.metrics.computed(reference, name, rows, done.computed)
+        self.record.waited(done.waited)
+        self.record.computed(done.computed)
+        return done.result
 
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Session]:

@@ -32,6 +32,7 @@ from app.schemas import (
     ScoredRelation,
 )
 from app.serving.logs import log_config
+from app.serving.metrics import Metrics, Unmeasured
 from app.settings import Settings
 
 _MODEL = ModelReference(name="echo", version="1.0.0", variant="triway", digest="0" * 64)
@@ -129,7 +130,7 @@ def build(settings: Settings) -> FastAPI:
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     app.state.settings = settings
     problems.install(app)
-    middleware.install(app, settings)
+    middleware.install(app, settings, Metrics() if settings.metrics else Unmeasured())
     app.include_router(router)
 
     @app.get("/health/ready")

@@ -164,7 +164,7 @@ async def test_every_question_has_worked_examples(
 ) -> None:
     components = document["components"]["schemas"]
     for method, path, operation in operations(document):
-        ok = operation["responses"]["200"]["content"]["application/json"]
+        (ok,) = operation["responses"]["200"]["content"].values()
         assert "example" in ok, path
         if "requestBody" not in operation:
             continue
@@ -182,7 +182,10 @@ async def test_every_question_has_worked_examples(
 
 async def test_example_answers_have_the_fields_of_real_ones(document: dict[str, Any]) -> None:
     for _, path, operation in operations(document):
-        ok = operation["responses"]["200"]["content"]["application/json"]
+        ((media_type, ok),) = operation["responses"]["200"]["content"].items()
+        if media_type == "text/plain":
+            assert path == "/metrics"  # its example is compared in test_monitoring
+            continue
         outer, _, inner = ok["schema"]["$ref"].rpartition("/")[2].partition("_")
         model = getattr(schemas, outer)
         if inner:

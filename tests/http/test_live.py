@@ -82,6 +82,7 @@ def test_every_question_is_answered(live: LiveService) -> None:
         "/redoc/redoc.standalone.js",
         "/static/icon.svg",
         "/problems",
+        "/metrics",
     ],
 )
 def test_every_address_answers(live: LiveService, path: str) -> None:
@@ -183,7 +184,18 @@ def test_the_log_is_json_with_request_ids_and_no_payload(live: LiveService) -> N
     entries = [json.loads(line) for line in text.splitlines()]
     (entry,) = [entry for entry in entries if entry.get("request_id") == "find-me"]
     assert entry["message"].startswith("POST /relations 422 ")
-    assert entry["status"] == 422
+    assert entry.pop("latency_ms") > 0
+    assert {name: entry[name] for name in entry if name not in {"time", "message"}} == {
+        "level": "info",
+        "logger": "app.access",
+        "request_id": "find-me",
+        "method": "POST",
+        "route": "/relations",
+        "status": 422,
+        "outcome": "unknown-labels",
+        "model": "home",
+        "version": "1.0.0",
+    }
 
 
 def test_a_refresh_and_a_rollback_over_the_wire(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from time import monotonic, sleep
+from typing import Any
 
 import pytest
 
@@ -38,7 +39,7 @@ async def test_jobs_run_in_order_each_with_its_result(queue: WorkQueue) -> None:
         return number * number
 
     jobs = [queue.run(lambda k=k: job(k), ENDLESS, kind="q", size=1) for k in range(20)]
-    assert await asyncio.gather(*jobs) == [k * k for k in range(20)]
+    assert [done.result for done in await asyncio.gather(*jobs)] == [k * k for k in range(20)]
     assert order == list(range(20))
 
 
@@ -58,7 +59,7 @@ async def test_one_failure_is_one_request_s(queue: WorkQueue) -> None:
     def broken() -> None:
         raise ZeroDivisionError
 
-    results = await asyncio.gather(
+    results: list[Any] = await asyncio.gather(
         queue.run(broken, ENDLESS, kind="q", size=1),
         queue.run(lambda: "fine", ENDLESS, kind="q", size=1),
         queue.run(broken, ENDLESS, kind="q", size=1, costly=True),
@@ -67,7 +68,7 @@ async def test_one_failure_is_one_request_s(queue: WorkQueue) -> None:
     )
     assert isinstance(results[0], ZeroDivisionError)
     assert isinstance(results[2], ZeroDivisionError)
-    assert results[1] == results[3] == "fine"
+    assert results[1].result == results[3].result == "fine"
 
 
 def test_rows_are_bounded_and_given_back(queue: WorkQueue) -> None:
@@ -89,7 +90,7 @@ async def test_work_whose_deadline_has_passed_is_never_begun(
             lambda: begun.append(1), Ticket(monotonic()), kind="q", size=1, costly=costly
         )
     # What comes after it is computed all the same.
-    assert await queue.run(lambda: 2, ENDLESS, kind="q", size=1, costly=costly) == 2
+    assert (await queue.run(lambda: 2, ENDLESS, kind="q", size=1, costly=costly)).result == 2
     assert not begun
 
 
@@ -112,7 +113,7 @@ async def test_nobody_waits_past_the_deadline_for_costly_work(queue: WorkQueue) 
     results = await asyncio.gather(first, second, return_exceptions=True)
     assert all(isinstance(result, DeadlinePassedError) for result in results)
     release.set()
-    assert await queue.run(lambda: 3, ENDLESS, kind="q", size=1, costly=True) == 3
+    assert (await queue.run(lambda: 3, ENDLESS, kind="q", size=1, costly=True)).result == 3
     assert not behind
 
 
@@ -122,9 +123,9 @@ async def test_the_event_loop_goes_on_beside_costly_work(queue: WorkQueue) -> No
         queue.run(lambda: release.wait(30), ENDLESS, kind="draw", size=1, costly=True)
     )
     # Cheap jobs are answered while the costly one is under way: only they can end it.
-    assert await queue.run(lambda: "answered", ENDLESS, kind="q", size=1) == "answered"
+    assert (await queue.run(lambda: "answered", ENDLESS, kind="q", size=1)).result == "answered"
     release.set()
-    assert await costly
+    assert (await costly).result
 
 
 async def test_a_kind_that_turns_out_costly_moves_to_the_thread(
@@ -181,10 +182,28 @@ async def test_costly_work_of_those_who_have_gone_is_dropped(queue: WorkQueue) -
     assert not begun
 
 
+@pytest.mark.parametrize("costly", [False, True])
+async def test_waiting_and_computing_are_told_apart(
+    queue: WorkQueue, monkeypatch: pytest.MonkeyPatch, costly: bool
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("app.serving.queue.monotonic", lambda: now)
+
+    def job() -> None:
+        nonlocal now
+        now += 2.0
+
+    # Two in one tick: the second waits while the first is computed.
+    jobs = [queue.run(job, ENDLESS, kind=str(k), size=1, costly=costly) for k in range(2)]
+    first, second = await asyncio.gather(*jobs)
+    assert (first.waited, first.computed, second.computed) == (0.0, 2.0, 2.0)
+    assert second.waited == 2.0 or costly
+
+
 async def test_a_request_that_is_cancelled_leaves_the_queue_in_order(queue: WorkQueue) -> None:
     begun: list[int] = []
     waiting = asyncio.ensure_future(queue.run(lambda: begun.append(1), ENDLESS, kind="q", size=1))
     await asyncio.sleep(0)
     waiting.cancel()
-    assert await queue.run(lambda: 2, ENDLESS, kind="q", size=1) == 2
+    assert (await queue.run(lambda: 2, ENDLESS, kind="q", size=1)).result == 2
     assert not begun

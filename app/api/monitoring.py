@@ -1,0 +1,30 @@
+"""What Prometheus reads."""
+
+from __future__ import annotations
+
+import asyncio
+
+from fastapi import APIRouter
+from fastapi.responses import PlainTextResponse
+
+from app.api.dependencies import RuntimeDep
+from app.api.openapi import problems
+from app.serving.metrics import CONTENT_TYPE
+
+router = APIRouter(tags=["monitoring"])
+
+
+@router.get(
+    "/metrics",
+    summary="Metrics for Prometheus",
+    response_class=PlainTextResponse,
+    responses=problems(),
+)
+async def show_metrics(runtime: RuntimeDep) -> PlainTextResponse:
+    """Counters, gauges and histograms in the text format, of all worker processes together.
+
+    docs/operations.md says what each of them means.
+    """
+    # Of several processes there are files to read: others are served meanwhile.
+    text = await asyncio.to_thread(runtime.metrics.exposition)
+    return PlainTextResponse(text, media_type=CONTENT_TYPE)

@@ -1,0 +1,353 @@
+"""What the service tells Prometheus: counted where it happens, written out when it is asked for.
+
+Every label has few values, whatever clients send: routes by their templates, models only while
+they are served. With several worker processes each writes into files of a shared directory, and
+any of them reports the sum; see docs/decisions/metrics.md.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable
+from typing import Final, Literal
+
+from prometheus_client import (
+    CONTENT_TYPE_PLAIN_0_0_4,
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    Metric,
+    disable_created_metrics,
+    generate_latest,
+    values,
+)
+from prometheus_client.multiprocess import MultiProcessCollector
+
+from app.schemas import ModelReference
+from app.serving.errors import ServingError
+from app.serving.models import DEFAULT, Key, ServedModels
+
+CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
+SHARED_DIRECTORY: Final = "PROMETHEUS_MULTIPROC_DIR"
+"""The library's variable: where worker processes put what they count."""
+
+Change = Literal["refresh", "alias"]
+Outcome = Literal["success", "refused", "failed"]
+Info = tuple[str, str, str, str, str]
+
+_SECONDS: Final = (
+    *(0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025),
+    *(0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0),
+)
+_ROWS: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+_MODEL: Final = ("model", "version")
+_INFO: Final = "scene_model_info"
+
+# A second series for each one that says when it began: several processes cannot have them, and
+# Prometheus itself sees when a counter restarts.
+disable_created_metrics()  # type: ignore[no-untyped-call]
+
+
+class Metrics:
+    """The metrics of one application; its methods are called on the thread of the event loop.
+
+    Attributes:
+        registry: of its own, so that a process can hold several applications.
+
+    Raises:
+        RuntimeError: `SHARED_DIRECTORY` was set after the library had been imported, which would
+            let every process report only itself.
+    """
+
+    def __init__(self) -> None:
+        self._shared = SHARED_DIRECTORY in os.environ
+        if self._shared and values.ValueClass is values.MutexValue:
+            raise RuntimeError(f"{SHARED_DIRECTORY} must be set before the service is imported")
+        self.registry = registry = CollectorRegistry()
+        self._requests = Counter(
+            "scene_requests_total",
+            "Requests answered; outcome is success or the name of the problem",
+            ("route", "method", "outcome"),
+            registry=registry,
+        )
+        self._latency = Histogram(
+            "scene_request_duration_seconds",
+            "From the request's first byte to the response's last",
+            ("route",),
+            buckets=_SECONDS,
+            registry=registry,
+        )
+        self._entries = Counter(
+            "scene_batch_entries_total",
+            "Scenes of batch requests, each of which succeeds or fails on its own",
+            ("question", "outcome"),
+            registry=registry,
+        )
+        self._queue = Histogram(
+            "scene_queue_duration_seconds",
+            "How long a scene waited before a model looked at it",
+            _MODEL,
+            buckets=_SECONDS,
+            registry=registry,
+        )
+        self._compute = Histogram(
+            "scene_compute_duration_seconds",
+            "How long a model computed for the scenes that it answered together",
+            (*_MODEL, "question"),
+            buckets=_SECONDS,
+            registry=registry,
+        )
+        self._rows = Histogram(
+            "scene_batch_rows",
+            "How many scenes a model answered together",
+            (*_MODEL, "question"),
+            buckets=_ROWS,
+            registry=registry,
+        )
+        self._serialisation = Histogram(
+            "scene_serialisation_duration_seconds",
+            "From a model's last answer to the response's first byte",
+            buckets=_SECONDS,
+            registry=registry,
+        )
+        self._pending = Gauge(
+            "scene_pending_rows",
+            "Scenes waiting for a model",
+            _MODEL,
+            multiprocess_mode="livesum",
+            registry=registry,
+        )
+        # 1 if any process serves it: processes that disagree show as two versions of one alias.
+        self._info = Gauge(
+            _INFO,
+            "1 for every model that is served, once for each alias that leads to it",
+            (*_MODEL, "variant", "digest", "alias"),
+            multiprocess_mode="livemax",
+            registry=registry,
+        )
+        self._reloads = Counter(
+            "scene_reloads_total",
+            "Changes of what is served: refreshes and moved aliases, with refused ones",
+            ("change", "outcome"),
+            registry=registry,
+        )
+        # Of each process: the latest tells of restarts, the least whether all are ready.
+        self._started = Gauge(
+            "scene_start_time_seconds",
+            "Unix time when the process began to load its models",
+            multiprocess_mode="liveall",
+            registry=registry,
+        )
+        self._ready = Gauge(
+            "scene_ready_time_seconds",
+            "Unix time when its default model had answered; 0 before",
+            multiprocess_mode="liveall",
+            registry=registry,
+        )
+        self._series: dict[Key, _ModelSeries] = {}
+        self._infos: set[Info] = set()
+        self._is_ready = False
+        # Bound once: looking a child up by its labels costs more than counting.
+        self._of_request: dict[tuple[str, str, str], Counter] = {}
+        self._of_route: dict[str, Histogram] = {}
+
+    # ------------------------------------------------------------------------- what happened
+
+    def started(self) -> None:
+        """The process begins to load its models."""
+        self._started.set(time.time())
+        for change in ("refresh", "alias"):
+            for outcome in ("success", "refused", "failed"):
+                self._reloads.labels(change, outcome)
+
+    def serving(self, models: ServedModels) -> None:
+        """These models are served from now on; series of all others go away."""
+        for key in self._series.keys() - models.served.keys():
+            self._forget(key)
+        for key in models.served.keys() - self._series.keys():
+            self._series[key] = _ModelSeries(self, key)
+        infos = set(_infos(models))
+        for info in self._infos - infos:
+            self._info.labels(*info).set(0)
+            if not self._shared:
+                self._info.remove(*info)
+        for info in infos - self._infos:
+            self._info.labels(*info).set(1)
+        self._infos = infos
+        if not self._is_ready and any(alias == DEFAULT for *_, alias in infos):
+            self._is_ready = True
+            self._ready.set(time.time())
+
+    def _forget(self, key: Key) -> None:
+        series = self._series.pop(key)
+        series.pending.set(0)
+        # The library cannot take anything back from a shared file: there it is left out on reading.
+        if not self._shared:
+            self._queue.remove(*key)
+            self._pending.remove(*key)
+            for question in series.questions:
+                self._compute.remove(*key, question)
+                self._rows.remove(*key, question)
+
+    def reloaded(self, change: Change, outcome: Outcome) -> None:
+        """Somebody tried to change what is served."""
+        self._reloads.labels(change, outcome).inc()
+
+    def answered(self, route: str, method: str, outcome: str, seconds: float) -> None:
+        """A request has been answered.
+
+        Args:
+            route: the template of the route, "-" where none answered.
+            method: the request's, "-" if HTTP defines no such method.
+            outcome: "success", or the name of the problem.
+            seconds: how long it took.
+        """
+        key = (route, method, outcome)
+        counter = self._of_request.get(key)
+        if counter is None:
+            counter = self._of_request[key] = self._requests.labels(*key)
+        counter.inc()
+        histogram = self._of_route.get(route)
+        if histogram is None:
+            histogram = self._of_route[route] = self._latency.labels(route)
+        histogram.observe(seconds)
+
+    def entry_answered(self, question: str, outcome: str) -> None:
+        """One scene of a batch has been answered, or refused by the named problem."""
+        self._entries.labels(question, outcome).inc()
+
+    def serialised(self, seconds: float) -> None:
+        """An answer has been put into names and written as JSON."""
+        self._serialisation.observe(seconds)
+
+    # What is told about a model that has been removed meanwhile is dropped: it would come back.
+
+    def waited(self, model: ModelReference, seconds: float) -> None:
+        """A scene has left the queue."""
+        series = self._series.get((model.name, model.version))
+        if series is not None:
+            series.queue.observe(seconds)
+
+    def computed(self, model: ModelReference, question: str, rows: int, seconds: float) -> None:
+        """A model has answered a question about ``rows`` scenes at once."""
+        series = self._series.get((model.name, model.version))
+        if series is not None:
+            compute, size = series.questions.get(question) or series.bind(question)
+            compute.observe(seconds)
+            size.observe(rows)
+
+    def pending(self, model: ModelReference, rows: int) -> None:
+        """So many scenes wait for a model now."""
+        series = self._series.get((model.name, model.version))
+        if series is not None:
+            series.pending.set(rows)
+
+    # ------------------------------------------------------------------------- what is told
+
+    def exposition(self) -> bytes:
+        """Everything in Prometheus' text format, of all processes where there are several."""
+        if not self._shared:
+            return generate_latest(self.registry)
+        together = CollectorRegistry()
+        together.register(_AllProcesses())
+        return generate_latest(together)
+
+
+class Unmeasured(Metrics):
+    """Counts nothing: for a service that is not to be measured."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+
+    def started(self) -> None:
+        """Nothing is counted."""
+
+    def serving(self, models: ServedModels) -> None:
+        """Nothing is counted."""
+
+    def reloaded(self, change: Change, outcome: Outcome) -> None:
+        """Nothing is counted."""
+
+    def answered(self, route: str, method: str, outcome: str, seconds: float) -> None:
+        """Nothing is counted."""
+
+    def entry_answered(self, question: str, outcome: str) -> None:
+        """Nothing is counted."""
+
+    def serialised(self, seconds: float) -> None:
+        """Nothing is counted."""
+
+    def waited(self, model: ModelReference, seconds: float) -> None:
+        """Nothing is counted."""
+
+    def computed(self, model: ModelReference, question: str, rows: int, seconds: float) -> None:
+        """Nothing is counted."""
+
+    def pending(self, model: ModelReference, rows: int) -> None:
+        """Nothing is counted."""
+
+    def exposition(self) -> bytes:
+        """Nothing."""
+        return b""
+
+
+class _ModelSeries:
+    """The bound series of one model."""
+
+    __slots__ = ("_key", "_metrics", "pending", "questions", "queue")
+
+    def __init__(self, metrics: Metrics, key: Key) -> None:
+        self._metrics = metrics
+        self._key = key
+        self.queue = metrics._queue.labels(*key)
+        self.pending = metrics._pending.labels(*key)
+        self.questions: dict[str, tuple[Histogram, Histogram]] = {}
+
+    def bind(self, question: str) -> tuple[Histogram, Histogram]:
+        bound = (
+            self._metrics._compute.labels(*self._key, question),
+            self._metrics._rows.labels(*self._key, question),
+        )
+        self.questions[question] = bound
+        return bound
+
+
+class _AllProcesses:
+    """The metrics of all processes that share a directory, without models that none serves."""
+
+    def collect(self) -> Iterable[Metric]:
+        metrics = list(MultiProcessCollector(None).collect())  # type: ignore[no-untyped-call]
+        served = {
+            (sample.labels["model"], sample.labels["version"])
+            for metric in metrics
+            if metric.name == _INFO
+            for sample in metric.samples
+            if sample.value > 0
+        }
+        for metric in metrics:
+            metric.samples = [
+                sample
+                for sample in metric.samples
+                if "model" not in sample.labels
+                or (sample.labels["model"], sample.labels["version"]) in served
+            ]
+            if metric.name == _INFO:
+                metric.samples = [sample for sample in metric.samples if sample.value > 0]
+        return metrics
+
+
+def _infos(models: ServedModels) -> Iterable[Info]:
+    """The label values of every model, once an alias; "" where no alias leads to it."""
+    aliases: dict[Key, list[str]] = {key: [] for key in models.served}
+    for alias in models.store.aliases:
+        try:
+            reference = models.resolve(alias).reference
+        except ServingError:
+            continue
+        aliases[reference.name, reference.version].append(alias)
+    for key, model in models.served.items():
+        reference = model.reference
+        for alias in aliases[key] or [""]:
+            yield (*key, reference.variant, reference.digest, alias)

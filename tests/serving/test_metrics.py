@@ -1,0 +1,302 @@
+"""Metrics of one process: what is counted, and that the number of series has an end."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from prometheus_client.multiprocess import mark_process_dead
+from prometheus_client.parser import text_string_to_metric_families
+
+from app.registry import AliasTarget, Artifact, Store, load_model_set
+from app.serving.metrics import SHARED_DIRECTORY, Metrics, Unmeasured
+from app.serving.models import ServedModel, ServedModels
+from tests.http.stores import make_store
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> ServedModels:
+    # As served, but for the warm-up: nothing is asked here.
+    return unwarmed(make_store(tmp_path_factory.mktemp("store")))
+
+
+def unwarmed(root: Path) -> ServedModels:
+    store = load_model_set(Store(root))
+    served = {
+        key: ServedModel(artifact, {})
+        for key, artifact in store.entries.items()
+        if isinstance(artifact, Artifact)
+    }
+    return ServedModels(store, served, {})
+
+
+def samples(metrics: Metrics) -> dict[tuple[str, ...], float]:
+    """(name, label values in the order of their names) → value, as Prometheus would read it."""
+    return parsed(metrics.exposition().decode())
+
+
+def parsed(text: str) -> dict[tuple[str, ...], float]:
+    return {
+        (sample.name, *(sample.labels[name] for name in sorted(sample.labels))): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def test_requests_are_counted_by_route_method_and_outcome() -> None:
+    metrics = Metrics()
+    metrics.answered("/missing", "POST", "success", 0.003)
+    metrics.answered("/missing", "POST", "success", 0.2)
+    metrics.answered("/missing", "POST", "unknown-labels", 0.0002)
+    found = samples(metrics)
+    assert found["scene_requests_total", "POST", "success", "/missing"] == 2
+    assert found["scene_requests_total", "POST", "unknown-labels", "/missing"] == 1
+    assert found["scene_request_duration_seconds_count", "/missing"] == 3
+    assert found["scene_request_duration_seconds_sum", "/missing"] == pytest.approx(0.2032)
+    bucket = "scene_request_duration_seconds_bucket"
+    buckets = {key[1]: value for key, value in found.items() if key[0] == bucket}
+    assert (buckets["0.0001"], buckets["0.00025"], buckets["0.005"]) == (0, 1, 2)
+    assert buckets["+Inf"] == 3
+
+
+def test_models_are_told_with_every_alias(models: ServedModels) -> None:
+    metrics = Metrics()
+    metrics.serving(models.with_alias("night", AliasTarget(name="home", version=None)))
+    infos = {key for key, value in samples(metrics).items() if key[0] == "scene_model_info"}
+    digests = {key: model.reference.digest for key, model in models.served.items()}
+    assert infos == {
+        ("scene_model_info", alias, digests[name, version], name, variant, version)
+        for alias, name, variant, version in (
+            ("default", "home", "triway", "1.0.0"),
+            ("candidate", "home", "triway", "1.1.0"),
+            ("night", "home", "triway", "1.1.0"),
+            ("", "plain", "rbm", "1.0.0"),
+            ("", "deep", "gbm", "0.1.0"),
+        )
+    }
+
+
+def test_a_moved_alias_leaves_no_trace(models: ServedModels) -> None:
+    metrics = Metrics()
+    metrics.serving(models)
+    metrics.serving(models.with_alias("default", AliasTarget(name="home", version="1.1.0")))
+    led = [key[5] for key in samples(metrics) if key[:2] == ("scene_model_info", "default")]
+    assert led == ["1.1.0"]
+
+
+def test_series_of_a_removed_model_go_away_and_stay_away(models: ServedModels) -> None:
+    metrics = Metrics()
+    metrics.serving(models)
+    old = models.served["plain", "1.0.0"].reference
+    kept = models.served["home", "1.0.0"].reference
+    for model in (old, kept):
+        metrics.waited(model, 0.001)
+        metrics.computed(model, "missing", 3, 0.002)
+        metrics.pending(model, 5)
+
+    def names(of: str) -> set[str]:
+        return {key[0] for key in samples(metrics) if of in key}
+
+    everything = names("home")
+    assert {"scene_pending_rows", "scene_batch_rows_sum", "scene_model_info"} <= everything
+    assert names("plain") == everything
+    rest = {key: model for key, model in models.served.items() if key[0] != "plain"}
+    metrics.serving(ServedModels(models.store, rest, {}))
+    assert names("plain") == set()
+    assert names("home") == everything
+    # A request that still holds the old snapshot reports late.
+    metrics.waited(old, 0.001)
+    metrics.computed(old, "missing", 1, 0.002)
+    metrics.pending(old, 1)
+    assert names("plain") == set()
+    metrics.serving(models)
+    metrics.computed(old, "missing", 1, 0.002)
+    assert samples(metrics)["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
+
+
+def test_what_a_model_did_is_told_by_question(models: ServedModels) -> None:
+    metrics = Metrics()
+    metrics.serving(models)
+    model = models.served["home", "1.0.0"].reference
+    metrics.waited(model, 0.001)
+    metrics.computed(model, "relations", 8, 0.25)
+    metrics.computed(model, "relations", 2, 0.05)
+    metrics.pending(model, 17)
+    metrics.serialised(0.5)
+    found = samples(metrics)
+    label = ("home", "relations", "1.0.0")
+    assert found["scene_compute_duration_seconds_sum", *label] == pytest.approx(0.3)
+    assert found["scene_batch_rows_sum", *label] == 10
+    assert found["scene_batch_rows_count", *label] == 2
+    assert found["scene_queue_duration_seconds_sum", "home", "1.0.0"] == pytest.approx(0.001)
+    assert found["scene_pending_rows", "home", "1.0.0"] == 17
+    assert found["scene_serialisation_duration_seconds_sum",] == 0.5
+
+
+def test_a_process_without_a_default_is_not_ready(models: ServedModels) -> None:
+    metrics = Metrics()
+    metrics.started()
+    metrics.serving(ServedModels(models.store, {}, {}))
+    found = samples(metrics)
+    assert found["scene_start_time_seconds",] > 1.7e9
+    assert found["scene_ready_time_seconds",] == 0
+    metrics.serving(models)
+    ready = samples(metrics)["scene_ready_time_seconds",]
+    assert ready >= found["scene_start_time_seconds",]
+    metrics.serving(models)
+    assert samples(metrics)["scene_ready_time_seconds",] == ready
+
+
+def test_applications_do_not_share_what_they_count() -> None:
+    first, second = Metrics(), Metrics()
+    first.answered("/missing", "POST", "success", 0.1)
+    assert not any(key[0] == "scene_requests_total" for key in samples(second))
+
+
+def test_nothing_counts_where_nothing_is_to_be_measured(models: ServedModels) -> None:
+    silent = Unmeasured()
+    model = models.served["home", "1.0.0"].reference
+    silent.started()
+    silent.serving(models)
+    silent.answered("/missing", "POST", "success", 0.1)
+    silent.entry_answered("missing", "success")
+    silent.waited(model, 0.1)
+    silent.computed(model, "missing", 1, 0.1)
+    silent.pending(model, 1)
+    silent.serialised(0.1)
+    silent.reloaded("refresh", "success")
+    assert silent.exposition() == b""
+    # Whatever can be told to the one can be told to the other.
+    public = {name for name in vars(Metrics) if not name.startswith("_")}
+    assert public <= set(vars(Unmeasured))
+
+
+def test_a_directory_that_comes_too_late_is_refused(tmp_path: Path) -> None:
+    code = (
+        "import os, prometheus_client; "
+        f"os.environ['{SHARED_DIRECTORY}'] = {str(tmp_path)!r}; "
+        "from app.serving.metrics import Metrics; Metrics()"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert run.returncode != 0
+    assert f"{SHARED_DIRECTORY} must be set before" in run.stderr
+
+
+# ---------------------------------------------------------------------- several processes
+
+_COUNT = """
+import sys
+from pathlib import Path
+from app.serving.metrics import Metrics
+from app.serving.models import ServedModels
+from tests.serving.test_metrics import unwarmed
+
+models = unwarmed(Path(sys.argv[1]))
+model = models.served["home", "1.0.0"].reference
+plain = models.served["plain", "1.0.0"].reference
+metrics = Metrics()
+metrics.started()
+metrics.serving(models)
+metrics.answered("/missing", "POST", "success", 0.003)
+metrics.waited(model, 0.25)
+metrics.computed(model, "missing", 2, 0.5)
+metrics.computed(plain, "missing", 1, 0.5)
+metrics.pending(model, 3)
+metrics.serialised(1.0)
+metrics.reloaded("refresh", "refused")
+"""
+_WITHOUT_PLAIN = """
+rest = {key: served for key, served in models.served.items() if key[0] != "plain"}
+metrics.serving(ServedModels(models.store, rest, {}))
+"""
+_TELL_WHEN_ASKED = """
+import os
+print(os.getpid(), flush=True)
+for line in sys.stdin:
+    print(metrics.exposition().decode() + "# end", flush=True)
+"""
+
+
+class Worker:
+    """A process that counts, and tells when it is asked."""
+
+    def __init__(self, code: str, store: Path, environment: dict[str, str]) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code + _TELL_WHEN_ASKED, str(store)],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdin
+        assert self.process.stdout
+        self.stdin, self.stdout = self.process.stdin, self.process.stdout
+        self.pid = ""
+
+    def wait(self) -> None:
+        """Until it has counted."""
+        self.pid = self.stdout.readline().strip()
+
+    def tell(self) -> dict[tuple[str, ...], float]:
+        self.stdin.write("\n")
+        self.stdin.flush()
+        text = "".join(iter(self.stdout.readline, "# end\n"))
+        return parsed(text)
+
+    def end(self) -> None:
+        self.process.communicate(timeout=30)
+
+
+@pytest.mark.system
+def test_every_process_tells_of_all(tmp_path: Path, repository: Path) -> None:
+    store = make_store(tmp_path / "store")
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    environment = {**os.environ, SHARED_DIRECTORY: str(shared), "PYTHONPATH": str(repository)}
+    # The third serves what the others do but one model.
+    workers = [
+        Worker(code, store, environment) for code in (_COUNT, _COUNT, _COUNT + _WITHOUT_PLAIN)
+    ]
+    first, second, third = workers
+    try:
+        for worker in workers:
+            worker.wait()
+        found = first.tell()
+        for worker in (second, third):
+            assert worker.tell() == found
+        assert found["scene_requests_total", "POST", "success", "/missing"] == 3
+        assert found["scene_request_duration_seconds_count", "/missing"] == 3
+        assert found["scene_request_duration_seconds_bucket", "+Inf", "/missing"] == 3
+        assert found["scene_queue_duration_seconds_sum", "home", "1.0.0"] == 0.75
+        assert found["scene_batch_rows_sum", "home", "missing", "1.0.0"] == 6
+        assert found["scene_batch_rows_sum", "plain", "missing", "1.0.0"] == 3
+        assert found["scene_pending_rows", "home", "1.0.0"] == 9
+        assert found["scene_reloads_total", "refresh", "refused"] == 3
+        infos = [value for key, value in found.items() if key[0] == "scene_model_info"]
+        assert infos == [1, 1, 1, 1]
+        for name in ("scene_start_time_seconds", "scene_ready_time_seconds"):
+            assert {key[1] for key in found if key[0] == name} == {w.pid for w in workers}
+
+        # One ends: what it counted stays, what it held does not.
+        first.end()
+        mark_process_dead(first.pid, str(shared))
+        found = second.tell()
+        assert found["scene_requests_total", "POST", "success", "/missing"] == 3
+        assert found["scene_pending_rows", "home", "1.0.0"] == 6
+        started = {key[1] for key in found if key[0] == "scene_start_time_seconds"}
+        assert started == {second.pid, third.pid}
+        assert any("plain" in key for key in found)
+
+        # A model that no living process serves is gone, whoever counted for it.
+        second.end()
+        mark_process_dead(second.pid, str(shared))
+        found = third.tell()
+        assert not any("plain" in key for key in found)
+        assert found["scene_batch_rows_sum", "home", "missing", "1.0.0"] == 6
+    finally:
+        for worker in workers:
+            if worker.process.poll() is None:
+                worker.end()
