@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +12,17 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 MAX_OBJECTS = 256
 """The contract's limit on objects in one scene; settings may lower it, never raise it."""
+
+
+_EXPORTER = ("opentelemetry.sdk.trace", "opentelemetry.exporter.otlp.proto.http")
+_ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # a package above it is missing already
+        return False
 
 
 def _lower(value: object) -> object:
@@ -73,6 +86,9 @@ class Settings(BaseSettings):
         int, Field(ge=1, le=3600, description="seconds named in Retry-After when not ready")
     ] = 2
     metrics: Annotated[bool, Field(description="count, and answer /metrics")] = True
+    opentelemetry: Annotated[
+        bool, Field(description="send traces to where OTEL_EXPORTER_OTLP_ENDPOINT says")
+    ] = False
     docs: Annotated[bool, Field(description="serve /docs and /redoc")] = True
     root_path: Annotated[
         str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")
@@ -88,6 +104,21 @@ class Settings(BaseSettings):
     def _is_directory(cls, value: Path) -> Path:
         if not value.is_dir():
             raise ValueError(f"SCENE_STORE must be an existing directory, and {value} is none")
+        return value
+
+    @field_validator("opentelemetry")
+    @classmethod
+    def _can_export(cls, value: bool) -> bool:
+        if not value:
+            return value
+        if not all(map(_is_installed, _EXPORTER)):
+            raise ValueError(
+                "SCENE_OPENTELEMETRY needs the packages of the dependency group telemetry "
+                "(pip install '.[telemetry]')"
+            )
+        # The framework would start without one and send nothing.
+        if not any(map(os.environ.get, _ENDPOINTS)):
+            raise ValueError(f"SCENE_OPENTELEMETRY needs {_ENDPOINTS[0]}, the collector's URL")
         return value
 
     @field_validator("admin_key")

@@ -62,7 +62,7 @@ def main(pip_arguments: list[str]) -> None:
     extras = project["optional-dependencies"]
     runtime = project["dependencies"]
     training = runtime + extras["training"]
-    development = training + extras["dev"]
+    development = training + extras["telemetry"] + extras["dev"]
 
     with tempfile.TemporaryDirectory() as scratch:
         pins = Path(scratch) / "constraints.txt"

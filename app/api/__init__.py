@@ -17,6 +17,7 @@ from app.api import (
     pages,
     problems,
     questions,
+    telemetry,
 )
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -40,6 +41,7 @@ def build(
         redirect_slashes=False,
         openapi_tags=list(openapi.TAGS),
         generate_unique_id_function=openapi.operation_id,
+        telemetry=telemetry.configuration(enabled=settings.opentelemetry),
         **metadata,  # type: ignore[arg-type]
     )
     app.state.settings = settings

@@ -68,6 +68,8 @@ def test_settings_come_from_the_environment(
         ("log_level", "loud"),
         ("log_format", "xml"),
         ("docs", "maybe"),
+        ("metrics", "some"),
+        ("opentelemetry", "perhaps"),
     ],
 )
 def test_nonsense_is_refused(tmp_path: Path, name: str, value: object) -> None:
