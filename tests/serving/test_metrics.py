@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -44,6 +45,23 @@ def parsed(text: str) -> dict[tuple[str, ...], float]:
         for family in text_string_to_metric_families(text)
         for sample in family.samples
     }
+
+
+def described(metrics: Metrics) -> dict[str, set[str]]:
+    """Every name a query can use → the labels of its series.
+
+    Read from the metrics themselves: most have no series before something has happened.
+    """
+    found: dict[str, set[str]] = {}
+    for collector in metrics.registry._collector_to_names:
+        labels = set(collector._labelnames)  # type: ignore[attr-defined]
+        (family,) = collector.describe()  # type: ignore[attr-defined]
+        if family.type == "histogram":
+            found[f"{family.name}_bucket"] = labels | {"le"}
+            found[f"{family.name}_sum"] = found[f"{family.name}_count"] = labels
+        else:
+            found[family.name + ("_total" if family.type == "counter" else "")] = labels
+    return found
 
 
 def test_requests_are_counted_by_route_method_and_outcome() -> None:
@@ -183,6 +201,30 @@ def test_a_directory_that_comes_too_late_is_refused(tmp_path: Path) -> None:
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert run.returncode != 0
     assert f"{SHARED_DIRECTORY} must be set before" in run.stderr
+
+
+def test_the_documentation_lists_every_metric(repository: Path) -> None:
+    text = (repository / "docs" / "operations.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(scene_\w+)` \| (\w+) \|(.*?)\| (.+?) \|$", text, re.MULTILINE)
+    listed = {
+        name: (kind, set(re.findall(r"`(\w+)`", labels)), meaning)
+        for name, kind, labels, meaning in rows
+    }
+    assert len(listed) == len(rows)
+    metrics = Metrics()
+    labels = described(metrics)
+    told = {}
+    for collector in metrics.registry._collector_to_names:
+        (family,) = collector.describe()  # type: ignore[attr-defined]
+        name = family.name + ("_total" if family.type == "counter" else "")
+        of_series = labels[f"{name}_sum" if family.type == "histogram" else name]
+        told[name] = (family.type, of_series, family.documentation)
+    assert listed == told
+    # And every label is explained.
+    explained = set(
+        re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.+?) \|", text, re.MULTILINE)))
+    )
+    assert set().union(*labels.values()) - {"le"} <= explained
 
 
 # ---------------------------------------------------------------------- several processes

@@ -29,6 +29,13 @@ def compose(repository: Path) -> dict[str, Any]:
     return yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))
 
 
+def built(compose: dict[str, Any]) -> list[dict[str, Any]]:
+    """The services that run an image of this repository."""
+    services = [service for service in compose["services"].values() if "build" in service]
+    assert len(services) == 2
+    return services
+
+
 def arguments(stage: list[Instruction], keyword: str) -> list[str]:
     return [i.argument for i in stage if i.keyword == keyword]
 
@@ -60,7 +67,7 @@ def test_final_stages_run_as_a_fixed_unprivileged_user(
 ) -> None:
     (user,) = arguments(stages[name], "USER")
     assert re.fullmatch(r"[1-9]\d{3,}:[1-9]\d{3,}", user)
-    assert {service["user"] for service in compose["services"].values()} == {user}
+    assert {service["user"] for service in built(compose)} == {user}
 
 
 def test_the_default_stage_serves_and_knows_nothing_of_training(
@@ -83,9 +90,10 @@ def test_every_variable_given_to_the_service_is_one_it_reads(
     assert in_compose <= known
 
 
-@pytest.mark.parametrize("name", ["scene", "train"])
+@pytest.mark.parametrize("name", ["scene", "train", "prometheus", "grafana"])
 def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     service = compose["services"][name]
+    assert re.fullmatch(r"[1-9]\d+:\d+", service["user"])
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
     assert "no-new-privileges:true" in service["security_opt"]
@@ -96,6 +104,9 @@ def test_nothing_is_published_beyond_this_machine_unless_asked(compose: dict[str
     (port,) = compose["services"]["scene"]["ports"]
     assert port.startswith("${PUBLISH_ADDRESS:-127.0.0.1}:")
     assert "ports" not in compose["services"]["train"]
+    for name in ("prometheus", "grafana"):
+        (port,) = compose["services"][name]["ports"]
+        assert port.startswith("127.0.0.1:")
 
 
 def test_the_store_is_one_volume_where_the_image_keeps_its_models(
@@ -103,7 +114,7 @@ def test_the_store_is_one_volume_where_the_image_keeps_its_models(
 ) -> None:
     store = compose["services"]["scene"]["environment"]["SCENE_STORE"]
     assert f"SCENE_STORE={store}" in " ".join(arguments(stages["runtime"], "ENV"))
-    for service in compose["services"].values():
+    for service in built(compose):
         assert f"models:{store}" in service["volumes"]
 
 

@@ -1,0 +1,203 @@
+"""Prometheus' configuration and the dashboard ask for nothing that the service does not tell."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from app.api import catalogue
+from app.serving.metrics import Metrics
+from tests.serving.test_metrics import described
+
+pytestmark = pytest.mark.system
+
+# What the language itself has, what Prometheus adds to every series, and its own series.
+WORDS = {"and", "bool", "by", "ignoring", "offset", "on", "or", "unless", "without"}
+GROUPINGS = r"\b(?:by|without|on|ignoring|group_left|group_right)\s*\(([^)]*)\)"
+ADDED = {"instance", "job"}
+OWN = {"up": set[str]()}
+# Reasons of a service under load, which refuses by name.
+LOAD = {"queue-full", "deadline-passed"}
+
+
+@pytest.fixture(scope="module")
+def folder(repository: Path) -> Path:
+    return repository / "deploy" / "monitoring"
+
+
+@pytest.fixture(scope="module")
+def dashboard(folder: Path) -> dict[str, Any]:
+    text = (folder / "grafana" / "dashboards" / "scene.json").read_text("utf-8")
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+@pytest.fixture(scope="module")
+def rules(folder: Path) -> list[dict[str, Any]]:
+    groups = yaml.safe_load((folder / "rules.yml").read_text("utf-8"))["groups"]
+    return [rule for group in groups for rule in group["rules"]]
+
+
+@pytest.fixture(scope="module")
+def compose(repository: Path) -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))
+    return found
+
+
+def selectors(query: str) -> Iterator[tuple[str, str]]:
+    """Every metric that a query names, with what stands in its braces."""
+    bare = re.sub(GROUPINGS, " ", query)
+    for match in re.finditer(
+        r"([a-zA-Z_:][\w:]*)\s*(\{[^}]*\})?(\s*\()?", re.sub(r"\[[^\]]*\]", " ", bare)
+    ):
+        name, braces, call = match.groups()
+        if call is None and name not in WORDS:
+            yield name, braces or ""
+
+
+def check(query: str) -> set[str]:
+    """The metrics a query names.
+
+    Raises:
+        AssertionError: one of them, or a label, or an outcome, is none of the service's.
+    """
+    known = described(Metrics()) | OWN
+    names = dict.fromkeys(name for name, _ in selectors(query))
+    labels = set(ADDED)
+    for name, braces in selectors(query):
+        assert name in known, name
+        labels |= known[name]
+        for label, value in re.findall(r'(\w+)\s*[=!]~?\s*"([^"]*)"', braces):
+            assert label in known[name] | ADDED, (name, label)
+            if label == "outcome" and name != "scene_reloads_total":
+                for outcome in value.split("|"):
+                    assert outcome in {"success", *LOAD, *catalogue.PROBLEM_TYPES}, outcome
+            elif label == "outcome":
+                assert value in {"success", "refused", "failed"}
+    assert names
+    for grouping in re.findall(GROUPINGS, query):
+        for label in grouping.split(","):
+            assert label.strip() in labels, label
+    return set(names)
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "sum(rate(scene_request_total[5m]))",
+        "scene_requests",
+        'sum(rate(scene_requests_total{path="/missing"}[5m]))',
+        'scene_requests_total{outcome="unknown-label"}',
+        "sum by (model) (rate(scene_requests_total[5m]))",
+        "scene_request_duration_seconds",
+        "up + scene_up",
+        "1 + 1",
+    ],
+)
+def test_a_query_about_nothing_is_found_out(query: str) -> None:
+    with pytest.raises(AssertionError):
+        check(query)
+
+
+def test_the_dashboard_asks_for_what_there_is(dashboard: dict[str, Any]) -> None:
+    asked: set[str] = set()
+    for panel in dashboard["panels"]:
+        assert (panel["type"] == "row") == ("targets" not in panel)
+        for target in panel.get("targets", ()):
+            asked |= check(target["expr"])
+            shown = set(re.findall(r"{{(\w+)}}", target["legendFormat"]))
+            grouped = {
+                label.strip()
+                for grouping in re.findall(GROUPINGS, target["expr"])
+                for label in grouping.split(",")
+            }
+            assert shown <= grouped, target
+    # And it shows all there is.
+    told = described(Metrics())
+    families = {re.sub(r"_(bucket|sum|count)$", "", name) for name in told}
+    assert {re.sub(r"_(bucket|sum|count)$", "", name) for name in asked} == families
+    (variable,) = dashboard["templating"]["list"]
+    (name,) = re.findall(r"label_values\((\w+), instance\)", variable["query"]["query"])
+    assert name in told
+
+
+def test_panels_have_ids_and_places_of_their_own(dashboard: dict[str, Any]) -> None:
+    ids = [panel["id"] for panel in dashboard["panels"]]
+    assert len(set(ids)) == len(ids)
+    cells = [
+        (panel["gridPos"]["x"] + dx, panel["gridPos"]["y"] + dy)
+        for panel in dashboard["panels"]
+        for dx in range(panel["gridPos"]["w"])
+        for dy in range(panel["gridPos"]["h"])
+    ]
+    assert len(set(cells)) == len(cells)
+    assert max(x for x, _ in cells) < 24
+
+
+def test_the_rules_ask_for_what_there_is(rules: list[dict[str, Any]]) -> None:
+    assert len({rule["alert"] for rule in rules}) == len(rules) > 5
+    for rule in rules:
+        check(rule["expr"])
+        assert rule["labels"]["severity"] in {"page", "ticket"}
+        shown = set(re.findall(r"\$labels\.(\w+)", rule["annotations"]["summary"]))
+        (grouped,) = re.findall(GROUPINGS, rule["expr"])[:1] or [""]
+        assert shown <= {label.strip() for label in grouped.split(",")}
+
+
+def test_the_pieces_of_the_profile_find_each_other(
+    folder: Path, compose: dict[str, Any], dashboard: dict[str, Any]
+) -> None:
+    services = compose["services"]
+    assert {name for name in services if services[name].get("profiles") == ["monitoring"]} == {
+        "prometheus",
+        "grafana",
+    }
+    config = yaml.safe_load((folder / "prometheus.yml").read_text("utf-8"))
+    (scraped,) = config["scrape_configs"]
+    assert scraped["static_configs"] == [
+        {"targets": [f"scene:{services['scene']['environment']['SCENE_PORT']}"]}
+    ]
+    provisioning = folder / "grafana" / "provisioning"
+    (source,) = yaml.safe_load((provisioning / "datasources" / "prometheus.yml").read_text())[
+        "datasources"
+    ]
+    assert source["url"] == "http://prometheus:9090"
+    used = {panel["datasource"]["uid"] for panel in dashboard["panels"] if "datasource" in panel}
+    assert used == {source["uid"]}
+    (provider,) = yaml.safe_load((provisioning / "dashboards" / "scene.yml").read_text())[
+        "providers"
+    ]
+    mounted = dict(
+        volume.removesuffix(":ro").split(":", 1)
+        for name in ("prometheus", "grafana")
+        for volume in services[name]["volumes"]
+        if volume.startswith("./")
+    )
+    assert provider["options"]["path"] in mounted.values()
+    assert set(config["rule_files"]) <= set(mounted.values())
+    for source_path in mounted:
+        assert (folder.parents[1] / source_path).exists()
+
+
+@pytest.mark.parametrize("name", ["prometheus", "grafana"])
+def test_images_are_pinned_and_configuration_is_read_only(
+    compose: dict[str, Any], name: str
+) -> None:
+    service = compose["services"][name]
+    assert re.fullmatch(r"[a-z/]+:v?\d+\.\d+\.\d+", service["image"])
+    for volume in service["volumes"]:
+        assert volume.endswith(":ro") or not volume.startswith("."), volume
+
+
+def test_nobody_can_log_into_grafana(compose: dict[str, Any]) -> None:
+    environment = compose["services"]["grafana"]["environment"]
+    # Its administrator has a password that everybody knows.
+    assert environment["GF_AUTH_BASIC_ENABLED"] == "false"
+    assert environment["GF_AUTH_DISABLE_LOGIN_FORM"] == "true"
+    assert environment["GF_AUTH_ANONYMOUS_ORG_ROLE"] == "Viewer"
