@@ -22,8 +22,6 @@ WORDS = {"and", "bool", "by", "ignoring", "offset", "on", "or", "unless", "witho
 GROUPINGS = r"\b(?:by|without|on|ignoring|group_left|group_right)\s*\(([^)]*)\)"
 ADDED = {"instance", "job"}
 OWN = {"up": set[str]()}
-# Reasons of a service under load, which refuses by name.
-LOAD = {"queue-full", "deadline-passed"}
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +75,7 @@ def check(query: str) -> set[str]:
             assert label in known[name] | ADDED, (name, label)
             if label == "outcome" and name != "scene_reloads_total":
                 for outcome in value.split("|"):
-                    assert outcome in {"success", *LOAD, *catalogue.PROBLEM_TYPES}, outcome
+                    assert outcome in {"success", *catalogue.PROBLEM_TYPES}, outcome
             elif label == "outcome":
                 assert value in {"success", "refused", "failed"}
     assert names
