@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import socket
 import sys
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
-from app.server import server
 from app.settings import Settings
+
+if TYPE_CHECKING:
+    from app.serving.peers import Peers
 
 
 def main() -> int:
@@ -24,10 +28,38 @@ def main() -> int:
             variable = "SCENE_" + "_".join(str(part) for part in fault["loc"]).upper()
             sys.stderr.write(f"{variable}: {fault['msg'].removeprefix('Value error, ')}\n")
         return 2
+    if settings.workers > 1:
+        # Imported where it is needed, as is the service below: a supervisor without torch takes a
+        # tenth of the memory.
+        from app.workers.supervisor import supervise
+
+        return supervise(settings)
+    return serve(settings)
+
+
+def serve(
+    settings: Settings,
+    *,
+    peers: Peers | None = None,
+    sockets: list[socket.socket] | None = None,
+) -> int:
+    """Serve from this process until it is stopped.
+
+    Args:
+        settings: of the service.
+        peers: the other processes that serve the same models, if there are any.
+        sockets: bound already; by default the address of the settings.
+
+    Returns:
+        The exit status: not 0 where the service did not start.
+    """
+    from app.server import build
+
+    server = build(settings, peers)
     # Ctrl-C has ended the server in order by the time it comes up here.
     with suppress(KeyboardInterrupt):
-        server(settings).run()
-    return 0
+        server.run(sockets)
+    return 0 if server.started else 3
 
 
 if __name__ == "__main__":

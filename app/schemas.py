@@ -500,7 +500,7 @@ class FieldError(Reply):
 class Failure(Reply):
     """Something in the store that cannot be used, and why."""
 
-    subject: Annotated[str, Field(description="`name@version`, an alias, or `store`")]
+    subject: Annotated[str, Field(description="`name@version`, an alias, `store` or `worker`")]
     reason: Annotated[str, Field(description="a stable code")]
     detail: str
 

@@ -10,6 +10,7 @@ import uvicorn
 
 from app.main import create_app
 from app.serving.logs import log_config
+from app.serving.peers import Peers
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
@@ -45,9 +46,13 @@ class Server(uvicorn.Server):
         return await super().on_tick(counter)
 
 
-def server(settings: Settings) -> Server:
-    """The service behind a server of its own, not started yet."""
-    app = create_app(settings)
+def build(settings: Settings, peers: Peers | None = None) -> Server:
+    """The service behind a server of its own, not started yet.
+
+    Args:
+        peers: the other processes that serve the same models, if there are any.
+    """
+    app = create_app(settings, peers)
     config = uvicorn.Config(
         app,
         host=settings.host,

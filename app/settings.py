@@ -47,6 +47,9 @@ class Settings(BaseSettings):
 
     host: Annotated[str, Field(min_length=1, description="address to listen on")] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535, description="0 = any free port")] = 8000
+    workers: Annotated[
+        int, Field(ge=1, le=64, description="processes that serve; each holds every model")
+    ] = 1
     store: Annotated[Path, Field(description="directory of published models")] = Path("model_store")
     admin_key: Annotated[
         SecretStr | None,
@@ -81,7 +84,7 @@ class Settings(BaseSettings):
     ] = 1.0
     drain_timeout: Annotated[
         int, Field(ge=1, le=3600, description="seconds that work under way may take after that")
-    ] = 30
+    ] = 25
     retry_after: Annotated[
         int, Field(ge=1, le=3600, description="seconds named in Retry-After when not ready")
     ] = 2
@@ -98,6 +101,11 @@ class Settings(BaseSettings):
     ] = "info"
     log_format: Annotated[Literal["json", "plain"], BeforeValidator(_lower)] = "json"
     access_log: Annotated[bool, Field(description="one line a request, never its payload")] = True
+
+    @property
+    def longest_drain(self) -> float:
+        """Seconds from SIGTERM until the process ends, at most."""
+        return self.drain_seconds + self.drain_timeout + 1.0
 
     @field_validator("store")
     @classmethod

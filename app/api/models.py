@@ -100,6 +100,7 @@ async def refresh_models(runtime: RuntimeDep, request_id: RequestId) -> RefreshA
         catalogue.MODEL_NOT_FOUND,
         catalogue.ALIAS_CONFLICT,
         catalogue.MODEL_UNUSABLE,
+        catalogue.REFRESH_REFUSED,
         catalogue.STORE_NOT_WRITABLE,
         catalogue.STORE_BUSY,
         catalogue.BODY_TOO_LARGE,

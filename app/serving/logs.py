@@ -22,13 +22,14 @@ _EXTRAS = (
 
 
 class JSONFormatter(logging.Formatter):
-    """One JSON object a line: time, level, logger, message, and what is known of the request."""
+    """One JSON object a line: time, level, process, logger, message, what the request was."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as a line."""
         entry: dict[str, Any] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
+            "process": record.process,
             "logger": record.name,
             "message": record.getMessage(),
         }
@@ -49,7 +50,7 @@ def log_config(level: str, style: Literal["json", "plain"]) -> dict[str, Any]:
         "disable_existing_loggers": False,
         "formatters": {
             "json": {"()": JSONFormatter},
-            "plain": {"format": "%(asctime)s %(levelname)-8s %(name)s: %(message)s"},
+            "plain": {"format": "%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s"},
         },
         "handlers": {
             "stderr": {"class": "logging.StreamHandler", "formatter": style},

@@ -31,8 +31,11 @@ from app.serving.errors import (
     StoreNotWritableError,
     UnknownModelError,
 )
-from app.serving.metrics import Change, Metrics
+from app.serving.generation import Generation, restore
+from app.serving.metrics import Change as Counted
+from app.serving.metrics import Metrics
 from app.serving.models import DEFAULT, ServedModels, prepare
+from app.serving.peers import Alone, Change, Peers
 from app.serving.queue import Ticket, WorkQueue
 from app.serving.reading import Limits
 from app.serving.record import RequestRecord
@@ -52,7 +55,7 @@ _SWITCH_INTERVAL = 5e-4
 
 
 def _counted(
-    change: Change,
+    change: Counted,
 ) -> Callable[
     [Callable[Concatenate[Runtime, P], Awaitable[T]]],
     Callable[Concatenate[Runtime, P], Awaitable[T]],
@@ -88,20 +91,29 @@ class Runtime:
         limits: what one scene may hold.
         queue_rows: what may wait for one model.
         metrics: what the service counts.
+        peers: the other processes that serve the same models; by default there are none.
 
     Attributes:
         draining: nothing new is taken.
     """
 
-    def __init__(self, store: Path, limits: Limits, queue_rows: int, metrics: Metrics) -> None:
+    def __init__(
+        self,
+        store: Path,
+        limits: Limits,
+        queue_rows: int,
+        metrics: Metrics,
+        peers: Peers | None = None,
+    ) -> None:
         self.metrics = metrics
+        self.draining = False
         self._store = Store(store, lock_timeout=_LOCK_TIMEOUT)
         self._limits = limits
         self._queue_rows = queue_rows
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="costly work")
+        self._peers = peers or Alone()
         self._models: ServedModels | None = None
-        self._changing = asyncio.Lock()
-        self.draining = False
+        self._candidate: ServedModels | None = None
 
     @property
     def models(self) -> ServedModels:
@@ -149,27 +161,22 @@ class Runtime:
         self.draining = True
 
     async def start(self) -> None:
-        """Load, verify and warm everything in the store; `models` tells what is wrong."""
+        """Load, verify and warm everything in the store; `models` tells what is wrong.
+
+        Raises:
+            ConnectionError: the peers are gone.
+        """
         # Serving scales by processes: threads within one would fight over the same cores.
         torch.set_num_threads(1)
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
-        models = self._serve(prepare(load_model_set(self._store), self._new_queue))
-        for failure in models.failures.values():
+        await self._peers.join(self)
+        for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
-        _settle_memory()
 
     def stop(self) -> None:
         """Let go of the worker thread; what it has not begun is dropped."""
         self._executor.shutdown(wait=False, cancel_futures=True)
-
-    def _new_queue(self) -> WorkQueue:
-        return WorkQueue(self._queue_rows, self._executor)
-
-    def _serve(self, models: ServedModels) -> ServedModels:
-        self._models = models
-        self.metrics.serving(models)
-        return models
 
     @_counted("refresh")
     async def refresh(self, request_id: str) -> RefreshAnswer:
@@ -182,7 +189,7 @@ class Runtime:
             RefreshRefusedError: nothing has changed.
             NotReadyError: nothing has been loaded yet.
         """
-        async with self._changing:
+        async with self._peers.change() as change:
             old = self.models
             # In a thread, so that the old snapshot goes on answering.
             new = await asyncio.to_thread(self._load, old)
@@ -193,7 +200,6 @@ class Runtime:
             ]
             if worse:
                 raise RefreshRefusedError(worse)
-            self._serve(new)
             answer = RefreshAnswer(
                 request_id=request_id,
                 default=new.resolve(DEFAULT).reference,
@@ -201,12 +207,11 @@ class Runtime:
                 removed=_names(old, but_not=new),
                 failures=list(new.failures.values()),
             )
+            # From here on only requests in flight may keep the old snapshot alive.
             del old
-            _settle_memory()
+            await self._agree(change, new)
+            await change.commit()
             return answer
-
-    def _load(self, old: ServedModels) -> ServedModels:
-        return prepare(load_model_set(self._store, old.store), self._new_queue, old)
 
     @_counted("alias")
     async def move_alias(self, alias: str, request: AliasRequest, request_id: str) -> AliasAnswer:
@@ -218,23 +223,65 @@ class Runtime:
             ModelUnusableError: the version was refused.
             AliasConflictError: the alias leads elsewhere than expected, or is a model's name.
             StoreNotWritableError, StoreBusyError: the store cannot be changed (now).
+            RefreshRefusedError: another process cannot follow.
             NotReadyError: nothing has been loaded yet.
         """
-        async with self._changing:
+        async with self._peers.change() as change:
             target = self._target(request.model)
             expected = _expected(request)
+            # Before the store is written: then nothing but writing it can fail.
+            await self._agree(change, self.models.with_alias(alias, target))
             try:
                 previous = self._store.aliases().get(alias)
                 await asyncio.to_thread(self._store.set_alias, alias, target, expected=expected)
             except StoreError as error:
                 raise _refusal(error) from None
-            self._serve(self.models.with_alias(alias, target))
+            await change.commit()
             return AliasAnswer(
                 request_id=request_id,
                 alias=alias,
                 model=str(target),
                 previous=None if previous is None else str(previous),
             )
+
+    # -- a participant of changes, whoever leads them -------------------------------------------
+
+    async def prepare(self, generation: Generation | None) -> Generation:
+        """See `Participant.prepare`."""
+        previous = self._models or self._candidate
+        if generation is None:
+            self._candidate = await asyncio.to_thread(self._load, previous)
+        else:
+            self._candidate = await asyncio.to_thread(
+                restore, generation, self._store, self._new_queue, previous
+            )
+        return Generation.of(self._candidate)
+
+    def commit(self) -> None:
+        """See `Participant.commit`."""
+        if self._candidate is None:
+            raise RuntimeError("nothing was made ready")
+        unchanged = self._models is not None and self._models.served == self._candidate.served
+        self._models, self._candidate = self._candidate, None
+        self.metrics.serving(self._models)
+        if not unchanged:
+            _settle_memory()
+
+    def abort(self) -> None:
+        """See `Participant.abort`."""
+        self._candidate = None
+
+    async def _agree(self, change: Change, models: ServedModels) -> None:
+        await change.agree(Generation.of(models))
+        # Not before: a change that was given up meanwhile must not stand in the next one's place.
+        self._candidate = models
+
+    def _load(self, previous: ServedModels | None) -> ServedModels:
+        known = None if previous is None else previous.store
+        return prepare(load_model_set(self._store, known), self._new_queue, previous)
+
+    def _new_queue(self) -> WorkQueue:
+        return WorkQueue(self._queue_rows, self._executor)
 
     def _target(self, reference: str) -> AliasTarget:
         try:
