@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from app.boltzmann import given_kernels, object_kernels, relation_kernels
 from app.boltzmann.fantasies import unpack_scenes
 from app.boltzmann.machine import BoltzmannMachine
+from app.boltzmann.matrix_kernels import ROWS
 from app.boltzmann.mean_field import SWEEPS
 from app.boltzmann.scoring import group_size
 from app.boltzmann.triway import Triway
@@ -47,32 +48,36 @@ LEAST_UNITS = 64
 # Of the variance of the logits, how much the directions F_a leave out.
 _LEFT_OUT = 1e-3
 _NOTHING = np.zeros((0, 0, 0), dtype=np.float32)
+_NONE = np.zeros((0, 0), dtype=np.bool_)
 
 
 class Weights(NamedTuple):
     """Weights of the relation part, as the compiled loops take them.
 
+    Rows are filled up with zeros to whole multiples of `ROWS`.
+
     Attributes:
-        S, O: (V, K).  R: (A, K).  M: (A, K, H1).  P: (A, H1).  d: (A,).  s, o: (A, V).  n: (A, 2).
-        start: (A·V + 1,) where the residuals of each (a, i) begin in
-        column, residual: (T,) their j and w'.
-        F: (A, r, H1) directions of U.
-        Y0: (A, r), and Y: (A, r, K): the coordinates y = Y0 + Y (S_i * O_j) in them.
+        S, O: (V, K).  s, o: (V, A).  n: (A, 2).
+        start: (B + 1,) where each bucket of pairs begins in
+        key, residual: (T,) the pairs, i V + j, and (T + 1, A) their w'; the last row is 0.
+        G: (A, K + 1, H1) the rows of M, then P: U_e = G' (S_i * O_j, 1).
+        g: (A, K + 1), R and d: what is added to G m.
+        FF: (A, r (r + 1) / 2, H1) products of directions of U, of p and each q up to p: the lower
+            half of C is FF m (1 - m).
+        Y0: (A, r), and Y: (A, r, K): the coordinates q = Y0 + Y (S_i * O_j) in the directions.
     """
 
     S: Floats
     O: Floats  # noqa: E741
-    R: Floats
-    M: Floats
-    P: Floats
-    d: Floats
     s: Floats
     o: Floats
     n: Floats
     start: Places
-    column: Places
+    key: Places
     residual: Floats
-    F: Floats
+    G: Floats
+    g: Floats
+    FF: Floats
     Y0: Floats
     Y: Floats
 
@@ -116,6 +121,24 @@ class Context:
     y: Floats
     given: Given | None
     slopes: Floats
+
+
+class WithoutEach(NamedTuple):
+    """What each class gains from the rest of a scene, and what further questions of it need.
+
+    Attributes:
+        gain: (n,) of each class given all others.
+        off: (H,) sigmoid(-y), filled up as the loops need it.
+        rest: (n, H) sigmoid(y) e^-share of each class, the share being what it adds to y.
+        fall: (n, H) e^-share.
+        growth: (n, H) e^W.
+    """
+
+    gain: Floats
+    off: Floats
+    rest: Floats
+    fall: Floats
+    growth: Floats
 
 
 class ClosedForm:
@@ -183,26 +206,37 @@ class ClosedForm:
             context.y, self._weights, context.classes, context.log_counts, shift
         )
         if context.given is not None:
-            a, i, j = _lists(context.given)
-            found[a, i, j] = given_kernels.without_itself(
-                context.y,
-                self._weights,
-                context.classes,
-                context.log_counts,
-                *(a, i, j),
-                context.slopes,
-                shift if len(shift) else np.zeros_like(found),
+            given = context.given
+            found[given.a, given.i, given.j] = self._without_itself(
+                context, *_lists(given), context.slopes, shift
             )
+        return found
+
+    def unit_log_odds(self, context: Context, a: Places, i: Places, j: Places) -> Floats:
+        """The same of some units (E,), relations a from places i to places j."""
+        given = context.given
+        if given is None:
+            slopes = np.zeros(len(a), dtype=np.float32)
+        else:
+            size = len(context.classes), len(self._weights.g)
+            slopes = given_kernels.find_slopes(*size, *_lists(given), context.slopes, a, i, j)
+        return self._without_itself(context, a, i, j, slopes, self._implied(context))
+
+    def _without_itself(
+        self, context: Context, a: Places, i: Places, j: Places, slopes: Floats, shift: Floats
+    ) -> Floats:
+        found: Floats = given_kernels.without_itself(
+            *(context.y, self._weights, context.classes, context.log_counts),
+            *(a, i, j, slopes, shift),
+        )
         return found
 
     def _implied(self, context: Context) -> Floats:
         given = context.given
         if given is None or self._gamma is None or self._B is None:
             return _NOTHING
-        mean = 1.0 / (1.0 + np.exp(-np.clip(context.x, -80.0, 80.0)))
-        z = np.concatenate([np.ones(1, dtype=np.float32), self._B @ mean])
         found: Floats = given_kernels.implied(
-            self._gamma, z, len(context.classes), *_lists(given), given.r
+            self._gamma, self._B, context.x, len(context.classes), *_lists(given), given.r
         )
         return found
 
@@ -234,42 +268,38 @@ class ClosedForm:
             outgoing: from the candidate to the anchor; otherwise back.
         """
         found: Floats = relation_kernels.placed_log_odds(
-            context.y,
-            self.W,
-            self._weights,
-            candidates,
-            context.classes[anchor : anchor + 1],
-            relation,
-            np.zeros(1, dtype=np.float32),
-            context.log_counts[anchor : anchor + 1],
-            outgoing,
+            *(context.y, self.W, self._weights, candidates),
+            *(context.classes[anchor], relation, context.log_counts[anchor], outgoing),
         )
         return found
 
-    def leave_one_out(self, context: Context, rows: Places) -> tuple[Floats, Floats]:
-        """What the rest of a scene does for the log-odds of each of its classes.
-
-        Args:
-            rows: (N,) places of classes.
-
-        Returns:
-            (n,) the gain of each class given all others; (N, n) the gain of the classes in `rows`
-            where one further class is left out. Its diagonal means nothing.
-        """
-        W = self.W[context.classes]
-        share, common = context.presence[:, None] * W, _NOTHING
-        if context.given is not None:
-            units = (
-                *(self._weights, context.classes, context.log_counts),
-                *_lists(context.given),
-                context.slopes,
+    def without_each(self, context: Context) -> WithoutEach:
+        """What the rest of a scene does for the log-odds of each of its classes."""
+        classes, share = context.classes, None
+        if context.given is None:
+            share = context.presence[:, None] * self.W[classes]
+        else:
+            share = given_kernels.shares(
+                *(self._weights, self.W, classes, context.presence, context.log_counts),
+                *(*_lists(context.given), context.slopes),
             )
-            share = share + given_kernels.shares(*units)
-            if len(rows):
-                # Relations between the two go out with either, so they must not go out twice.
-                common = given_kernels.common_shares(*units, rows)
-        alone, pairs = object_kernels.leave_one_out(context.y, W, share, rows, common, self._group)
-        return alone, pairs
+        return WithoutEach(
+            *object_kernels.without_each(context.y, self.W, classes, share, self._group)
+        )
+
+    def without_pairs(self, context: Context, each: WithoutEach, rows: Places) -> Floats:
+        """The gain of the classes in `rows` (N,) where one further class is left out, (N, n).
+
+        Its diagonal means nothing.
+        """
+        common, filled = _NOTHING, _NONE
+        if context.given is not None:
+            common, filled = given_kernels.common_growth(
+                *(self._weights, context.classes, context.log_counts),
+                *(*_lists(context.given), context.slopes, rows),
+            )
+        found: Floats = object_kernels.without_pairs(*each[1:], rows, common, filled, self._group)
+        return found
 
 
 def _lists(given: Given) -> tuple[Places, Places, Places]:
@@ -283,24 +313,38 @@ def _array(tensor: Any) -> NDArray[Any]:
 def _weights(machine: Triway) -> Weights:
     A, V = machine.spec.A, machine.spec.V
     F, Y = _directions(machine)
-    keys = machine.triple_keys.numpy()
+    r = F.shape[1]
+    p, q = np.tril_indices(r)
+    triples = machine.triple_keys.numpy()
+    pairs = np.unique(triples % (V * V))
+    buckets = 1 << (2 * len(pairs)).bit_length()
+    bucket = (pairs * relation_kernels.SPREAD >> relation_kernels.SHIFT) & (buckets - 1)
+    order = np.argsort(bucket, kind="stable")
+    row = np.empty_like(order)
+    row[order] = np.arange(len(order))
+    residual = np.zeros((len(pairs) + 1, A), dtype=np.float32)
+    place = row[np.searchsorted(pairs, triples % (V * V))]
+    residual[place, triples // (V * V)] = _array(machine.residual)
     return Weights(
         S=_array(machine.S),
         O=_array(machine.O),
-        R=_array(machine.R),
-        M=_array(machine.M),
-        P=_array(machine.P),
-        d=_array(machine.d),
-        s=_array(machine.s),
-        o=_array(machine.o),
+        s=_array(machine.s.T),
+        o=_array(machine.o.T),
         n=_array(machine.n),
-        start=np.searchsorted(keys, np.arange(A * V + 1) * V),
-        column=keys % V,
-        residual=_array(machine.residual),
-        F=F,
+        start=np.searchsorted(bucket[order], np.arange(buckets + 1)),
+        key=pairs[order],
+        residual=residual,
+        G=_filled(np.concatenate([_array(machine.M), _array(machine.P)[:, None]], 1)),
+        g=_filled(np.concatenate([_array(machine.R), _array(machine.d)[:, None]], 1)),
+        FF=_filled(F[:, p] * F[:, q]),
         Y0=np.ascontiguousarray(Y[:, :, 0]),
         Y=np.ascontiguousarray(Y[:, :, 1:]),
     )
+
+
+def _filled(rows: Floats) -> Floats:
+    """(A, R, ...) with zeros after the R rows."""
+    return np.pad(rows, [(0, 0), (0, -rows.shape[1] % ROWS)] + [(0, 0)] * (rows.ndim - 2))
 
 
 def _directions(machine: Triway) -> tuple[Floats, Floats]:

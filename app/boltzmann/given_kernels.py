@@ -8,107 +8,136 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.boltzmann.elementary import logistic
-from app.boltzmann.relation_kernels import means, residual, to_log_odds
+from app.boltzmann.elementary import exp, logistic
+from app.boltzmann.matrix_kernels import ROWS, add_products, add_rows
+from app.boltzmann.relation_kernels import means, residual_row, set_means, to_log_odds
 from app.compiling import compiled, compiled_in_any_order
 
 _DAMPING = np.float32(0.8)
 _MOST = np.float32(3.0)
+_WORD = 64
 
 
 @compiled_in_any_order
 def _units(w, classes, log_counts, a, i, j):
-    """z_e = S_i * O_j, (E, K), and what of ℓ_e does not depend on h1, (E,)."""
-    E, K = len(a), w.S.shape[1]
-    z, base = np.empty((E, K), np.float32), np.empty(E, np.float32)
-    for e in range(E):
-        b, s, o = a[e], classes[i[e]], classes[j[e]]
-        S, O, R, row = w.S[s], w.O[o], w.R[b], z[e]  # noqa: E741
-        total = w.d[b] + w.s[b, s] + w.n[b, 0] * log_counts[i[e]]
-        total += w.o[b, o] + w.n[b, 1] * log_counts[j[e]] + residual(w, b, s, o)
+    """z_e = (S_i * O_j, 1), (E, K + 1), and what of ℓ_e does not depend on h1, (E,)."""
+    # By name: to take an array from the tuple again and again is to count references to it.
+    S, O, s, o, n, g = w.S, w.O, w.s, w.o, w.n, w.g  # noqa: E741
+    start, keys, residual, V, K = w.start, w.key, w.residual, len(w.S), w.S.shape[1]
+    z, base = np.zeros((len(a), g.shape[1]), np.float32), np.empty(len(a), np.float32)
+    for e in range(len(a)):
+        b, one, other = a[e], classes[i[e]], classes[j[e]]
+        S_i, O_j, row, constant = S[one], O[other], z[e], g[b]
+        total = s[one, b] + n[b, 0] * log_counts[i[e]]
+        total += o[other, b] + n[b, 1] * log_counts[j[e]]
+        total += residual[residual_row(start, keys, one * V + other), b]
         for k in range(K):
-            row[k] = S[k] * O[k]
-        for k in range(K):
-            total += row[k] * R[k]
+            row[k] = S_i[k] * O_j[k]
+        row[K] = np.float32(1.0)
+        for k in range(K + 1):
+            total += row[k] * constant[k]
         base[e] = total
     return z, base
 
 
 @compiled_in_any_order
-def _mean_logits(mean, w, a, z, base, out):
-    A, K, H1 = w.M.shape
-    shared, bias = np.empty((A, K), np.float32), np.empty(A, np.float32)
-    for b in range(A):
-        M, P, total = w.M[b], w.P[b], np.float32(0.0)
-        for h in range(H1):
-            total += P[h] * mean[h]
-        bias[b] = total
-        for k in range(K):
-            row, total = M[k], np.float32(0.0)
-            for h in range(H1):
-                total += row[h] * mean[h]
-            shared[b, k] = total
+def _by_relation(z, a, relations):
+    """z with the units of one relation together, each from a whole multiple of `ROWS` on.
+
+    Returns:
+        The rows, (A + 1,) where each relation begins, and (E,) where each unit is.
+    """
+    start, place = np.zeros(relations + 1, np.int64), np.empty(len(a), np.int64)
     for e in range(len(a)):
-        row, through, total = z[e], shared[a[e]], base[e] + bias[a[e]]
-        for k in range(K):
-            total += row[k] * through[k]
-        out[e] = total
+        start[a[e] + 1] += 1
+    for b in range(relations):
+        start[b + 1] = start[b] + -(-start[b + 1] // ROWS) * ROWS
+    filled = start[:-1].copy()
+    rows = np.zeros((start[-1], z.shape[1]), np.float32)
+    for e in range(len(a)):
+        place[e] = filled[a[e]]
+        rows[place[e]] = z[e]
+        filled[a[e]] += 1
+    return rows, start, place
 
 
 @compiled_in_any_order
-def _pull(w, a, z, weight, out):
-    """sum_e weight_e U_e into out (H1,)."""
-    A, K, H1 = w.M.shape
-    factors, count = np.zeros((A, K), np.float32), np.zeros(A, np.float32)
+def _add_logits(mean, G, rows, start, out):
+    """out (1, units) += U m through what the units of a relation share, G m."""
+    shared = np.zeros((1, G.shape[1]), np.float32)
+    for b in range(len(G)):
+        some = rows[start[b] : start[b + 1]]
+        if len(some):
+            shared[:] = np.float32(0.0)
+            add_products(G[b], mean.reshape(1, -1), shared)
+            add_products(some, shared, out[:, start[b] : start[b + 1]])
+
+
+@compiled_in_any_order
+def _add_pull(weight, G, rows, start, out):
+    """out (H1,) += sum_e weight_e U_e the same way."""
+    factors = np.empty(G.shape[1], np.float32)
+    for b in range(len(G)):
+        some = rows[start[b] : start[b + 1]]
+        if len(some):
+            factors[:] = np.float32(0.0)
+            add_rows(weight[start[b] : start[b + 1]], some, factors)
+            add_rows(factors, G[b], out)
+
+
+@compiled_in_any_order
+def _gather(target, a, z, weight, factors, some):
+    """weight_e z_e of each unit into factors (n, A, K + 1) of its target; none where it is -1."""
     for e in range(len(a)):
-        row, into, value = z[e], factors[a[e]], weight[e]
-        if value != 0.0:
-            count[a[e]] += value
-            for k in range(K):
+        c, b, value = target[e], a[e], weight[e]
+        if c >= 0 and value != 0.0:
+            some[c, b], into, row = True, factors[c, b], z[e]
+            for k in range(len(row)):
                 into[k] += value * row[k]
-    for h in range(H1):
-        out[h] = np.float32(0.0)
-    for b in range(A):
-        if count[b] != 0.0 or np.any(factors[b]):
-            M, P, into, value = w.M[b], w.P[b], factors[b], count[b]
-            for h in range(H1):
-                out[h] += value * P[h]
-            for k in range(K):
-                row, value = M[k], into[k]
-                for h in range(H1):
-                    out[h] += value * row[h]
+
+
+@compiled_in_any_order
+def _add_expanded(G, factors, some, out):
+    for b in range(len(factors)):
+        if some[b]:
+            add_rows(factors[b], G[b], out)
 
 
 @compiled
 def fixed_point(x, w, classes, log_counts, a, i, j, r, g, sweeps):
     """The mean field given relations: logits of h1 (H1,), and the slopes (E,) at its end."""
-    E = len(a)
+    E, G = len(a), w.G
     z, base = _units(w, classes, log_counts, a, i, j)
-    y, pull = x.copy(), np.empty(len(x), np.float32)
-    logits, slopes = np.empty(E, np.float32), np.zeros(E, np.float32)
-    for sweep in range(sweeps):
-        _mean_logits(means(y), w, a, z, base, logits)
-        kept = _DAMPING if sweep else np.float32(0.0)
+    rows, start, place = _by_relation(z, a, len(G))
+    # U itself where its rows are fewer than those that the units share.
+    shared = G.shape[0] * G.shape[1]
+    few = 2 * len(rows) <= shared
+    U = np.zeros((len(rows) if few else 0, len(x)), np.float32)
+    if few:
         for e in range(E):
-            slope = g[e] * (r[e] - logistic(logits[e]))
-            slopes[e] = kept * slopes[e] + (np.float32(1.0) - kept) * slope
-        _pull(w, a, z, slopes, pull)
-        for h in range(len(x)):
-            y[h] = x[h] + pull[h]
-    return y, slopes
-
-
-@compiled_in_any_order
-def _own_row(w, b, z, out):
-    """U_e into out (H1,)."""
-    K, H1 = w.M.shape[1:]
-    P, M = w.P[b], w.M[b]
-    for h in range(H1):
-        out[h] = P[h]
-    for k in range(K):
-        row, value = M[k], z[k]
-        for h in range(H1):
-            out[h] += value * row[h]
+            add_rows(z[e], G[a[e]], U[place[e]])
+    # All in the order of the rows, so that nothing is gathered in the sweeps.
+    constant, value = np.zeros(len(rows), np.float32), np.zeros(len(rows), np.float32)
+    gate, slopes = np.zeros(len(rows), np.float32), np.zeros(len(rows), np.float32)
+    for e in range(E):
+        constant[place[e]], value[place[e]], gate[place[e]] = base[e], r[e], g[e]
+    y, logits, on = x.copy(), np.empty((1, len(rows)), np.float32), np.empty(len(rows), np.float32)
+    for sweep in range(sweeps):
+        logits[0] = constant
+        if few:
+            add_products(U, means(y).reshape(1, -1), logits)
+        else:
+            _add_logits(means(y), G, rows, start, logits)
+        set_means(logits[0], on)
+        kept = _DAMPING if sweep else np.float32(0.0)
+        for e in range(len(rows)):
+            slopes[e] = kept * slopes[e] + (np.float32(1.0) - kept) * gate[e] * (value[e] - on[e])
+        y[:] = x
+        if few:
+            add_rows(slopes, U, y)
+        else:
+            _add_pull(slopes, G, rows, start, y)
+    return y, slopes[place]
 
 
 @compiled_in_any_order
@@ -122,109 +151,199 @@ def _normal_logit(mean, U, base):
 
 @compiled
 def without_itself(y, w, classes, log_counts, a, i, j, slopes, shift):
-    """Log-odds of each given unit, its own slope taken out of y, (E,); shift (A, n, n)."""
-    E, H1 = len(a), len(y)
+    """Log-odds of each given unit, its own slope taken out of y, (E,); shift (A, n, n) or none."""
+    E, H1, G = len(a), len(y), w.G
     z, base = _units(w, classes, log_counts, a, i, j)
     U, rest = np.empty(H1, np.float32), np.empty(H1, np.float32)
     found, spreads = np.empty(E, np.float32), np.empty(E, np.float32)
     for e in range(E):
-        _own_row(w, a[e], z[e], U)
+        U[:] = np.float32(0.0)
+        add_rows(z[e], G[a[e]], U)
         slope = slopes[e]
         for h in range(H1):
-            rest[h] = y[h] - slope * U[h]
-        mean, spreads[e] = _normal_logit(means(rest), U, base[e])
-        found[e] = mean + shift[a[e], i[e], j[e]]
+            rest[h] = logistic(y[h] - slope * U[h])
+        found[e], spreads[e] = _normal_logit(rest, U, base[e])
+        if len(shift):
+            found[e] += shift[a[e], i[e], j[e]]
     to_log_odds(found, spreads)
     return found
 
 
 @compiled
-def shares(w, classes, log_counts, a, i, j, slopes):
-    """What the relations of each class add to y, (n, H1)."""
-    n, E = len(classes), len(a)
-    z, _ = _units(w, classes, log_counts, a, i, j)
-    found, weight = np.empty((n, w.M.shape[2]), np.float32), np.empty(E, np.float32)
-    for c in range(n):
-        for e in range(E):
-            weight[e] = slopes[e] if i[e] == c or j[e] == c else np.float32(0.0)
-        _pull(w, a, z, weight, found[c])
-    return found
-
-
-@compiled
-def common_shares(w, classes, log_counts, a, i, j, slopes, rows):
-    """What the relations between two classes add to y, (N, n, H1) for the classes in rows (N,)."""
-    n, H1 = len(classes), w.M.shape[2]
-    z, _ = _units(w, classes, log_counts, a, i, j)
-    found, U = np.zeros((len(rows), n, H1), np.float32), np.empty(H1, np.float32)
-    place = np.full(n, -1)
-    for c in range(len(rows)):
-        place[rows[c]] = c
+def find_slopes(n, relations, a, i, j, slopes, units_a, units_i, units_j):
+    """The slopes of some units, (M,); what is not given has none."""
+    found, grid = np.empty(len(units_a), np.float32), np.zeros((relations, n, n), np.float32)
     for e in range(len(a)):
-        one, other, slope = i[e], j[e], slopes[e]
-        if one != other and (place[one] >= 0 or place[other] >= 0):
-            _own_row(w, a[e], z[e], U)
-            if place[one] >= 0:
-                into = found[place[one], other]
-                for h in range(H1):
-                    into[h] += slope * U[h]
-            if place[other] >= 0:
-                into = found[place[other], one]
-                for h in range(H1):
-                    into[h] += slope * U[h]
+        grid[a[e], i[e], j[e]] = slopes[e]
+    for m in range(len(found)):
+        found[m] = grid[units_a[m], units_i[m], units_j[m]]
     return found
 
 
 @compiled
-def implied(gamma, z, n, a, i, j, r):
+def shares(w, W, classes, presence, log_counts, a, i, j, slopes):
+    """What each class and its relations add to y, (n, H1)."""
+    n, H1, G = len(classes), W.shape[1], w.G
+    found = np.empty((n, H1), np.float32)
+    for c in range(n):
+        row, into = W[classes[c]], found[c]
+        for h in range(H1):
+            into[h] = presence[c] * row[h]
+    z, _ = _units(w, classes, log_counts, a, i, j)
+    factors, some = np.zeros((n, *w.g.shape), np.float32), np.zeros((n, len(G)), np.bool_)
+    _gather(i, a, z, slopes, factors, some)
+    _gather(np.where(i == j, -1, j), a, z, slopes, factors, some)
+    for c in range(n):
+        _add_expanded(G, factors[c], some[c], found[c])
+    return found
+
+
+@compiled
+def common_growth(w, classes, log_counts, a, i, j, slopes, rows):
+    """e^ what the relations between two classes add to y, (N, n, H1) for classes in rows (N,).
+
+    And (N, n), whether there are any: where there are none, nothing is filled in.
+    """
+    n, H1, N, G = len(classes), w.G.shape[2], len(rows), w.G
+    z, _ = _units(w, classes, log_counts, a, i, j)
+    place = np.full(n, -1)
+    for c in range(N):
+        place[rows[c]] = c
+    factors, some = np.empty((n, *w.g.shape), np.float32), np.empty((n, len(G)), np.bool_)
+    target = np.empty(len(a), np.int64)
+    found, filled = np.empty((N, n, H1), np.float32), np.zeros((N, n), np.bool_)
+    for c in range(N):
+        one = rows[c]
+        factors[:], some[:] = np.float32(0.0), False
+        for e in range(len(a)):
+            other = -1
+            if (i[e] == one) != (j[e] == one):
+                other = j[e] if i[e] == one else i[e]
+                if 0 <= place[other] < c:
+                    other = -1
+            target[e] = other
+        _gather(target, a, z, slopes, factors, some)
+        for other in range(n):
+            earlier = place[other]
+            if 0 <= earlier < c:
+                filled[c, other] = filled[earlier, one]
+                if filled[c, other]:
+                    found[c, other] = found[earlier, one]
+            elif np.any(some[other]):
+                filled[c, other], into = True, found[c, other]
+                into[:] = np.float32(0.0)
+                _add_expanded(G, factors[other], some[other], into)
+                for h in range(H1):
+                    into[h] = exp(into[h])
+    return found, filled
+
+
+@compiled
+def implied(gamma, B, x, n, a, i, j, r):
     """What the given relations that hold imply for all others, (A, n, n); see `implications`.
 
     Args:
-        gamma: (1 + G, A, F).
-        z: (1 + G,) 1 and what the context says of how strictly the rules hold.
+        gamma: (1 + G, A, F).  B: (G, H1).
+        x: (H1,) logits of h1 given the objects: how strictly the rules hold.
         n: classes of the scene.
     """
-    A = gamma.shape[1]
+    A, F = gamma.shape[1:]
     steps = 2 * A
-    weight = np.zeros(gamma.shape[1:], np.float32)
-    for q in range(len(z)):
+    # (F, A): what one feature says of all relations lies together.
+    weight, mean = np.empty((F, A), np.float32), means(x)
+    for b in range(A):
+        for f in range(F):
+            weight[f, b] = gamma[0, b, f]
+    for q in range(len(B)):
+        strictness = np.float32(0.0)
+        for h in range(len(mean)):
+            strictness += B[q, h] * mean[h]
         for b in range(A):
-            for f in range(gamma.shape[2]):
-                weight[b, f] += z[q] * gamma[q, b, f]
+            for f in range(F):
+                weight[f, b] += strictness * gamma[1 + q, b, f]
     for b in range(A):
         weight[b, b] = np.float32(0.0)
+    # Relations in both directions; the second ends of one relation from one class as a set of bits.
     both = np.zeros((steps, n, n), np.bool_)
+    words = -(-n // _WORD)
+    ends = np.zeros((steps, n, words), np.uint64)
     for e in range(len(a)):
         if r[e] > 0 and i[e] != j[e]:
-            both[a[e], i[e], j[e]] = True
-            both[A + a[e], j[e], i[e]] = True
-    shift = np.zeros((A, n, n), np.float32)
-    outgoing, incoming = both.sum(2), both.sum(1)
-    first = steps + steps * steps
+            for c, x_, y_ in ((a[e], i[e], j[e]), (A + a[e], j[e], i[e])):
+                both[c, x_, y_] = True
+                ends[c, x_, y_ // _WORD] |= np.uint64(1) << np.uint64(y_ % _WORD)
+    shift = np.zeros((n, n, A), np.float32)
+    _add_degrees(both, weight[steps + steps * steps :], shift)
+    for c in range(steps):
+        for x_ in range(n):
+            for y_ in range(n):
+                if both[c, x_, y_]:
+                    for b in range(A):
+                        shift[x_, y_, b] += weight[c, b]
+    _add_paths(both, ends, weight[steps:], shift)
+    found = np.empty((A, n, n), np.float32)
+    for x_ in range(n):
+        for y_ in range(n):
+            for b in range(A):
+                found[b, x_, y_] = shift[x_, y_, b]
+    return found
+
+
+@compiled
+def _add_degrees(both, weight, shift):
+    """What the other neighbours of either end say: weight (2 steps, A), out of x and into y."""
+    steps, n = both.shape[:2]
+    A = weight.shape[1]
+    outgoing, incoming = np.zeros((steps, n), np.int64), np.zeros((steps, n), np.int64)
     for c in range(steps):
         for x in range(n):
             for y in range(n):
-                held = both[c, x, y]
-                out = min(np.float32(outgoing[c, x] - held), _MOST)
-                into = min(np.float32(incoming[c, y] - held), _MOST)
-                for b in range(A):
-                    if held:
-                        shift[b, x, y] += weight[b, c]
-                    shift[b, x, y] += weight[b, first + c] * out
-                    shift[b, x, y] += weight[b, first + steps + c] * into
-    seen = np.zeros((n, n), np.bool_)
+                outgoing[c, x] += both[c, x, y]
+                incoming[c, y] += both[c, x, y]
+    out, into = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
     for c in range(steps):
-        for d in range(steps):
-            seen[:] = False
-            feature = steps + c * steps + d
-            for x in range(n):
+        for x in range(n):
+            for b in range(A):
+                out[x, b] += weight[c, b] * min(np.float32(outgoing[c, x]), _MOST)
+                into[x, b] += weight[steps + c, b] * min(np.float32(incoming[c, x]), _MOST)
+    for x in range(n):
+        for y in range(n):
+            for b in range(A):
+                shift[x, y, b] += out[x, b] + into[y, b]
+    for c in range(steps):
+        for x in range(n):
+            for y in range(n):
+                # The pair itself is no other neighbour.
+                if both[c, x, y]:
+                    for b in range(A):
+                        if outgoing[c, x] <= _MOST:
+                            shift[x, y, b] -= weight[c, b]
+                        if incoming[c, y] <= _MOST:
+                            shift[x, y, b] -= weight[steps + c, b]
+
+
+@compiled
+def _add_paths(both, ends, weight, shift):
+    """What a path of two steps from x to y says: weight (steps², A)."""
+    steps, n, words = ends.shape
+    A = weight.shape[1]
+    seen = np.empty(words, np.uint64)
+    for c in range(steps):
+        for x in range(n):
+            if not np.any(ends[c, x]):
+                continue
+            for d in range(steps):
+                seen[:] = np.uint64(0)
                 for k in range(n):
                     if both[c, x, k]:
-                        for y in range(n):
-                            if both[d, k, y]:
-                                seen[x, y] = True
-                for y in range(n):
-                    if seen[x, y]:
-                        for b in range(A):
-                            shift[b, x, y] += weight[b, feature]
-    return shift
+                        for word in range(words):
+                            seen[word] |= ends[d, k, word]
+                row = weight[c * steps + d]
+                for word in range(words):
+                    left, y = seen[word], word * _WORD
+                    while left:
+                        if left & np.uint64(1):
+                            for b in range(A):
+                                shift[x, y, b] += row[b]
+                        left >>= np.uint64(1)
+                        y += 1

@@ -10,6 +10,8 @@ import numpy as np
 from app.boltzmann.elementary import exp, log, logistic
 from app.compiling import compiled
 
+_LANES = 32
+
 
 @compiled
 def hidden_logits(bias, W, classes, confidence):
@@ -23,60 +25,82 @@ def hidden_logits(bias, W, classes, confidence):
 
 
 @compiled
-def _gain(off, rest, growth, product):
-    """sum_k log of (off + rest e^W) / (off + rest), as in `scoring`."""
-    lanes = len(product)
-    for lane in range(lanes):
-        product[lane] = np.float32(1.0)
-    for start in range(0, len(off), lanes):
-        end = min(start + lanes, len(off))
-        a, b, c = off[start:end], rest[start:end], growth[start:end]
-        for lane in range(len(a)):
-            product[lane] *= (a[lane] + b[lane] * c[lane]) / (a[lane] + b[lane])
-    for lane in range(lanes):
-        product[lane] = log(product[lane])
-    total = np.float32(0.0)
-    for lane in range(lanes):
-        total += product[lane]
-    return total
+def _gain(off, on, growth, group, product, total):
+    """sum_k log of (off + on e^W) / (off + on), as in `scoring`, over whole blocks of lanes."""
+    for lane in range(_LANES):
+        total[lane] = np.float32(0.0)
+    for first in range(0, len(off), group * _LANES):
+        for lane in range(_LANES):
+            product[lane] = np.float32(1.0)
+        for start in range(first, min(first + group * _LANES, len(off)), _LANES):
+            end = start + _LANES
+            a, b, c = off[start:end], on[start:end], growth[start:end]
+            for lane in range(_LANES):
+                product[lane] *= (a[lane] + b[lane] * c[lane]) / (a[lane] + b[lane])
+        for lane in range(_LANES):
+            total[lane] += log(product[lane])
+    gain = np.float32(0.0)
+    for lane in range(_LANES):
+        gain += total[lane]
+    return gain
 
 
 @compiled
-def leave_one_out(x, W, share, rows, common, group):
-    """See `ClosedForm.leave_one_out`; W (n, H1) are the rows of the classes."""
-    n, H1 = W.shape
-    on, off = np.empty(H1, np.float32), np.empty(H1, np.float32)
+def without_each(y, W, classes, share, group):
+    """The gain of each class, its share (n, H1) of y taken out.
+
+    Returns:
+        (n,) the gains, and what `without_pairs` needs, in whole blocks of lanes: sigmoid(-y); of
+        each class, sigmoid(y) e^-share, e^-share and e^W.
+    """
+    n, H1 = share.shape
+    size = -(-H1 // _LANES) * _LANES
+    # What fills up a block is off for certain, and gains nothing.
+    off, rest = np.ones(size, np.float32), np.zeros((n, size), np.float32)
+    fall, growth = np.ones((n, size), np.float32), np.ones((n, size), np.float32)
+    on = np.empty(H1, np.float32)
     for k in range(H1):
-        on[k], off[k] = logistic(x[k]), logistic(-x[k])
-    # e^W of what is judged, e^-share of what is left out.
-    growth, fall = np.empty((n, H1), np.float32), np.empty((n, H1), np.float32)
+        on[k] = logistic(y[k])
+    for k in range(H1):
+        off[k] = logistic(-y[k])
+    product, total = np.empty(_LANES, np.float32), np.empty(_LANES, np.float32)
+    gains = np.empty(n, np.float32)
     for i in range(n):
-        weight, added, up, down = W[i], share[i], growth[i], fall[i]
+        weight, added, up, down, left = W[classes[i]], share[i], growth[i], fall[i], rest[i]
+        # One array a loop: with more, the compiler gives up proving them apart.
         for k in range(H1):
             up[k] = exp(weight[k])
-            down[k] = exp(-added[k])
-    # Each lane takes a product of at most `group` factors.
-    product = np.empty(max(-(-H1 // group), min(64, H1)), np.float32)
-    alone, pairs = np.empty(n, np.float32), np.zeros((len(rows), n), np.float32)
-    rest, both = np.empty(H1, np.float32), np.empty(H1, np.float32)
-    for i in range(n):
-        down = fall[i]
         for k in range(H1):
-            rest[k] = on[k] * down[k]
-        alone[i] = _gain(off, rest, growth[i], product)
+            down[k] = exp(-added[k])
+        for k in range(H1):
+            left[k] = on[k] * down[k]
+        gains[i] = _gain(off, left, up, group, product, total)
+    return gains, off, rest, fall, growth
+
+
+@compiled
+def without_pairs(off, rest, fall, growth, rows, common, filled, group):
+    """The gain of the classes in rows (N,) where one further class is left out, (N, n).
+
+    Args:
+        off, rest, fall, growth: see `without_each`.
+        common, filled: see `given_kernels.common_growth`; empty where nothing is given.
+    """
+    n, size = fall.shape
+    both, gains = np.zeros(size, np.float32), np.zeros((len(rows), n), np.float32)
+    product, total = np.empty(_LANES, np.float32), np.empty(_LANES, np.float32)
     for c in range(len(rows)):
         i = rows[c]
-        down = fall[i]
-        for k in range(H1):
-            rest[k] = on[k] * down[k]
+        left = rest[i]
         for j in range(n):
             if j != i:
                 down = fall[j]
-                for k in range(H1):
-                    both[k] = rest[k] * down[k]
-                if len(common):
+                for k in range(size):
+                    both[k] = left[k] * down[k]
+                if len(filled) and filled[c, j]:
+                    # Relations between the two go out with either, so they must not go out twice.
                     twice = common[c, j]
-                    for k in range(H1):
-                        both[k] *= exp(twice[k])
-                pairs[c, j] = _gain(off, both, growth[i], product)
-    return alone, pairs
+                    for k in range(len(twice)):
+                        both[k] *= twice[k]
+                gains[c, j] = _gain(off, both, growth[i], group, product, total)
+    return gains

@@ -1,6 +1,8 @@
 """Compiled loops of the relation part: log-odds of units whose logits are normal.
 
-Formulas in `closed_form`. Units go from subject classes (n,) to object classes (m,), in that order.
+Formulas in `closed_form`. A pair is a subject class and an object class; it has one unit a
+relation. Inner loops run over a fixed number of pairs, or over four rows of weights at a time, so
+that the compiler keeps vector registers full however small a scene is.
 """
 
 from __future__ import annotations
@@ -8,193 +10,309 @@ from __future__ import annotations
 import numpy as np
 
 from app.boltzmann.elementary import exp, log, logistic
+from app.boltzmann.matrix_kernels import ROWS, add_products
 from app.compiling import compiled, compiled_in_any_order, inlined
 
 NO_UNIT = np.float32(-30.0)
 """No log-odds of a relation is below."""
 
+SPREAD, SHIFT = 2654435761, 16
+"""A pair's key times the first, shifted by the second, is the number of its bucket."""
+
+_PAIRS = 32
+_CANDIDATES = 16
+
 _ROOT_3 = np.float32(3.0**0.5)
 # Where three nodes are enough, as √3 σ.
 _NARROW = np.float32(0.75 * 3.0**0.5)
+# The trapezoidal rule beyond: positive nodes, in units of σ, and their weights against that of 0.
+_STEP = np.float32(0.25)
+_TAIL = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 
 
-@inlined
-def _dot(a, b):
-    total = np.float32(0.0)
-    for k in range(len(a)):
-        total += a[k] * b[k]
-    return total
+@compiled
+def set_means(x, out):
+    """sigmoid(x) into out."""
+    for k in range(len(x)):
+        out[k] = logistic(x[k])
+
+
+@compiled
+def means(x):
+    """sigmoid(x)."""
+    mean = np.empty(len(x), np.float32)
+    set_means(x, mean)
+    return mean
 
 
 @compiled_in_any_order
 def _moments(mean, w, first, last):
-    """What all units of relations first to last - 1 share: R + M m, d + P·m, and C."""
-    A, K, H1 = w.M.shape
-    r = w.F.shape[1]
-    shared, bias = np.empty((A, K), np.float32), np.empty(A, np.float32)
-    C, spread = np.empty((A, r, r), np.float32), np.empty(H1, np.float32)
+    """Of relations first to last - 1, in N contexts with means (N, H1): (R, d) + G m, and C."""
+    N = len(mean)
+    through = np.empty((N, *w.g.shape), np.float32)
+    C = np.zeros((N, *w.FF.shape[:2]), np.float32)
+    spread = np.empty(mean.shape, np.float32)
+    for n in range(N):
+        for h in range(mean.shape[1]):
+            spread[n, h] = mean[n, h] * (np.float32(1.0) - mean[n, h])
     for a in range(first, last):
-        M_a, F_a = w.M[a], w.F[a]
-        for k in range(K):
-            shared[a, k] = w.R[a, k] + _dot(M_a[k], mean)
-        bias[a] = w.d[a] + _dot(w.P[a], mean)
-        for p in range(r):
-            row = F_a[p]
-            for h in range(H1):
-                spread[h] = row[h] * (mean[h] * (np.float32(1.0) - mean[h]))
-            for q in range(p + 1):
-                C[a, p, q] = _dot(spread, F_a[q])
-    return shared, bias, C
+        for n in range(N):
+            through[n, a] = w.g[a]
+        add_products(w.G[a], mean, through[:, a])
+        add_products(w.FF[a], spread, C[:, a])
+    return through, C
 
 
-@inlined
-def residual(w, a, i, j):
-    """w' of (a, i, j), 0 where there is none."""
-    row = a * len(w.S) + i
-    low, high = w.start[row], w.start[row + 1]
-    while low < high:
-        middle = (low + high) // 2
-        if w.column[middle] < j:
-            low = middle + 1
-        else:
-            high = middle
-    if low < w.start[row + 1] and w.column[low] == j:
-        return w.residual[low]
-    return np.float32(0.0)
+@compiled
+def residual_row(start, keys, pair):
+    """Which row of w' is that of a pair; the last, of zeros, where it has none."""
+    # A search by halves costs more: nobody can guess its branches.
+    bucket = (pair * SPREAD >> SHIFT) & (len(start) - 2)
+    for row in range(start[bucket], start[bucket + 1]):
+        if keys[row] == pair:
+            return row
+    return len(keys)
 
 
 @inlined
 def _log_odds(mean, spread):
     """log-odds of E[sigmoid(ℓ)] for a normal ℓ, by three nodes: 0 and ±√3 σ with weights 4 : 1 : 1.
 
-    Off by .0003 at most in p where √3 σ < `_NARROW`.
+    Off by .0003 at most in p where √3 σ < `_NARROW`. With u = e^-|mean| and q = e^spread the nodes
+    are u/(1 + u), uq/(1 + uq) and u/(q + u), and nothing can overflow.
     """
-    on = np.float32(4.0) * logistic(mean) + logistic(mean + spread) + logistic(mean - spread)
-    off = np.float32(4.0) * logistic(-mean) + logistic(-mean - spread) + logistic(spread - mean)
-    return log(on) - log(off)
+    u, q = exp(-abs(mean)), exp(spread)
+    a, b, c = np.float32(1.0) + u, np.float32(1.0) + u * q, q + u
+    on = np.float32(4.0) * b * c + a * (q * c + b)
+    off = np.float32(4.0) * b * c + a * (c + q * b)
+    away = abs(mean) - log(on / off)
+    return away if mean >= np.float32(0.0) else -away
 
 
 @compiled
-def _log_odds_of_wide(mean, spread):
-    """The same by the trapezoidal rule, for any σ up to 10 and more."""
-    on, off = np.float32(0.0), np.float32(0.0)
-    for node in range(-20, 21):
-        t = np.float32(0.25) * np.float32(node)
-        weight = exp(np.float32(-0.5) * t * t)
-        logit = mean + t * spread / _ROOT_3
-        on += weight * logistic(logit)
-        off += weight * logistic(-logit)
-    return log(on) - log(off)
-
-
-@compiled_in_any_order
-def _normal(moments, w, first, subjects, log_subjects, objects, log_objects, mean, spread):
-    """Mean and √3 σ of the logits of all units from subjects to objects, (relations, n, m)."""
-    shared, bias, C = moments
-    K, r = shared.shape[1], C.shape[1]
-    z, y = np.empty(K, np.float32), np.empty(r, np.float32)
-    # Rows by name: an index that may be negative keeps the compiler from taking eight at a time.
-    for a in range(first, first + len(mean)):
-        shared_a, C_a, Y_a, Y0_a = shared[a], C[a], w.Y[a], w.Y0[a]
-        for i in range(len(subjects)):
-            subject = subjects[i]
-            S_i = w.S[subject]
-            base = bias[a] + w.s[a, subject] + w.n[a, 0] * log_subjects[i]
-            for j in range(len(objects)):
-                other = objects[j]
-                total = base + w.o[a, other] + w.n[a, 1] * log_objects[j]
-                total += residual(w, a, subject, other)
-                dot = np.float32(0.0)
-                O_j = w.O[other]
-                for k in range(K):
-                    z[k] = S_i[k] * O_j[k]
-                for k in range(K):
-                    dot += z[k] * shared_a[k]
-                mean[a - first, i, j] = total + dot
-                variance = np.float32(0.0)
-                for p in range(r):
-                    dot, row = Y0_a[p], Y_a[p]
-                    for k in range(K):
-                        dot += z[k] * row[k]
-                    y[p] = dot
-                    cross = np.float32(0.0)
-                    for q in range(p):
-                        cross += C_a[p, q] * y[q]
-                    variance += dot * (np.float32(2.0) * cross + C_a[p, p] * dot)
-                spread[a - first, i, j] = np.sqrt(np.float32(3.0) * max(variance, np.float32(0.0)))
+def _wide_log_odds(mean, spread, out):
+    """The same of many (E,), by the trapezoidal rule: for any σ up to 10 and more."""
+    E = len(mean)
+    u, step, q = np.empty(E, np.float32), np.empty(E, np.float32), np.empty(E, np.float32)
+    on, off = np.empty(E, np.float32), np.empty(E, np.float32)
+    for e in range(E):
+        u[e] = exp(-abs(mean[e]))
+        step[e] = exp(_STEP / _ROOT_3 * spread[e])
+        q[e] = np.float32(1.0)
+        on[e] = off[e] = np.float32(1.0) / (np.float32(1.0) + u[e])
+    for node in range(len(_TAIL)):
+        weight = _TAIL[node]
+        for e in range(E):
+            q[e] = min(q[e] * step[e], np.float32(1e30))
+            up = np.float32(1.0) / (np.float32(1.0) + u[e] * q[e])
+            down = np.float32(1.0) / (q[e] + u[e])
+            on[e] += weight * (q[e] * up + down)
+            off[e] += weight * (up + q[e] * down)
+    for e in range(E):
+        away = abs(mean[e]) - log(on[e] / off[e])
+        out[e] = away if mean[e] >= np.float32(0.0) else -away
 
 
 @compiled
 def to_log_odds(means, spreads):
     """Log-odds of E[sigmoid] in place of the means (E,) of logits, for their √3 σ."""
     # All of them without a branch, many at a time; then the few wide ones again.
-    narrow = np.empty(len(means), np.float32)
+    wide = 0
     for e in range(len(means)):
-        narrow[e] = _log_odds(means[e], spreads[e])
+        wide += spreads[e] >= _NARROW
+    where = np.empty(wide, np.int64)
+    some, some_spreads = np.empty(wide, np.float32), np.empty(wide, np.float32)
+    if wide:
+        wide = 0
+        for e in range(len(means)):
+            if spreads[e] >= _NARROW:
+                where[wide], some[wide], some_spreads[wide] = e, means[e], spreads[e]
+                wide += 1
+        _wide_log_odds(some, some_spreads, some)
     for e in range(len(means)):
-        if spreads[e] >= _NARROW:
-            narrow[e] = _log_odds_of_wide(means[e], spreads[e])
-    for e in range(len(means)):
-        means[e] = max(narrow[e], NO_UNIT)
+        means[e] = max(_log_odds(means[e], spreads[e]), NO_UNIT)
+    for k in range(wide):
+        means[where[k]] = max(some[k], NO_UNIT)
 
 
-@compiled
-def _fill(moments, w, first, subjects, log_subjects, objects, log_objects, out):
-    """Log-odds of all units from subjects to objects into out (relations, n, m)."""
-    spread = np.empty(out.shape, np.float32)
-    _normal(moments, w, first, subjects, log_subjects, objects, log_objects, out, spread)
-    to_log_odds(out.reshape(-1), spread.reshape(-1))
+@compiled_in_any_order
+def _rows(through, C, w, first, last):
+    """Mean and coordinates of a logit as rows (A, 1 + r, K) on S_i * O_j and constants (A, 1 + r).
+
+    With C = L L' the variance q'C q is |L'q|²: the coordinates are L'q.
+    """
+    A, r, K = len(w.g), w.Y.shape[1], w.Y.shape[2]
+    R = -(-(1 + r) // ROWS) * ROWS
+    rows, constants = np.zeros((A, R, K), np.float32), np.zeros((A, R), np.float32)
+    L = np.zeros((r, r), np.float32)
+    for a in range(first, last):
+        t = 0
+        for p in range(r):
+            for q in range(p + 1):
+                total = C[a, t]
+                for k in range(q):
+                    total -= L[p, k] * L[q, k]
+                # Directions that nothing varies in have no root to divide by.
+                if p == q:
+                    L[p, p] = np.sqrt(max(total, np.float32(0.0)))
+                else:
+                    L[p, q] = total / L[q, q] if L[q, q] > 0.0 else np.float32(0.0)
+                t += 1
+        through_a, rows_a, Y_a = through[a], rows[a], w.Y[a]
+        constants[a, 0] = through_a[K]
+        for k in range(K):
+            rows_a[0, k] = through_a[k]
+        for p in range(r):
+            for q in range(p + 1):
+                weight, row, into = L[p, q], Y_a[p], rows_a[1 + q]
+                constants[a, 1 + q] += weight * w.Y0[a, p]
+                for k in range(K):
+                    into[k] += weight * row[k]
+    return rows, constants
+
+
+@compiled_in_any_order
+def _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread):
+    """Mean and √3 σ of the logits of all units of pairs (E,), into (A, E up to whole blocks)."""
+    rows, constants = functions
+    A, R, K = rows.shape
+    # By name: to take an array from the tuple again and again is to count references to it.
+    S, O, s, o, n = w.S, w.O, w.s, w.o, w.n  # noqa: E741
+    start_of, keys, residual, r, V = w.start, w.key, w.residual, w.Y.shape[1], len(w.S)
+    z, base = np.zeros((_PAIRS, K), np.float32), np.zeros((A, _PAIRS), np.float32)
+    y = np.empty((R, _PAIRS), np.float32)
+    for start in range(0, len(subjects), _PAIRS):
+        for e in range(min(_PAIRS, len(subjects) - start)):
+            i, j = subjects[start + e], objects[start + e]
+            log_i, log_j = log_subjects[start + e], log_objects[start + e]
+            S_i, O_j, z_e = S[i], O[j], z[e]
+            for k in range(K):
+                z_e[k] = S_i[k] * O_j[k]
+            own = residual_row(start_of, keys, i * V + j)
+            for a in range(A):
+                total = s[i, a] + n[a, 0] * log_i + o[j, a] + n[a, 1] * log_j
+                base[a, e] = total + residual[own, a]
+        for a in range(A):
+            for p in range(1 + r):
+                y_p, constant = y[p], constants[a, p]
+                for e in range(_PAIRS):
+                    y_p[e] = constant
+            add_products(rows[a], z, y.T)
+            base_a, y_0 = base[a], y[0]
+            into, variance = mean[a, start : start + _PAIRS], spread[a, start : start + _PAIRS]
+            for e in range(_PAIRS):
+                into[e] = base_a[e] + y_0[e]
+                variance[e] = np.float32(0.0)
+            for p in range(r):
+                y_p = y[1 + p]
+                for e in range(_PAIRS):
+                    variance[e] += y_p[e] * y_p[e]
+            for e in range(_PAIRS):
+                variance[e] = np.sqrt(np.float32(3.0) * variance[e])
 
 
 @inlined
-def means(x):
-    """sigmoid(x)."""
-    mean = np.empty(len(x), np.float32)
-    for k in range(len(x)):
-        mean[k] = logistic(x[k])
-    return mean
+def _whole_blocks(pairs):
+    return -(-pairs // _PAIRS) * _PAIRS
 
 
 @compiled
-def relation_log_odds(x, w, classes, log_counts, shift):
+def relation_log_odds(y, w, classes, log_counts, shift):
     """Log-odds of E[sigmoid(ℓ_e + shift_e)] between the classes of a scene, (A, n, n)."""
-    n = len(classes)
-    mean, spread = np.empty((len(w.d), n, n), np.float32), np.empty((len(w.d), n, n), np.float32)
-    moments = _moments(means(x), w, 0, len(w.d))
-    _normal(moments, w, 0, classes, log_counts, classes, log_counts, mean, spread)
-    logits, shifts = mean.reshape(-1), shift.reshape(-1)
-    for e in range(len(shifts)):
-        logits[e] += shifts[e]
+    A, n = len(w.g), len(classes)
+    subjects, objects = np.empty(n * n, np.int64), np.empty(n * n, np.int64)
+    log_subjects, log_objects = np.empty(n * n, np.float32), np.empty(n * n, np.float32)
+    for i in range(n):
+        for j in range(n):
+            e = i * n + j
+            subjects[e], objects[e] = classes[i], classes[j]
+            log_subjects[e], log_objects[e] = log_counts[i], log_counts[j]
+    size = _whole_blocks(n * n)
+    mean, spread = np.zeros((A, size), np.float32), np.empty((A, size), np.float32)
+    through, C = _moments(means(y).reshape(1, -1), w, 0, A)
+    functions = _rows(through[0], C[0], w, 0, A)
+    _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread)
+    if len(shift):
+        shifts = shift.reshape(A, -1)
+        for a in range(A):
+            for e in range(n * n):
+                mean[a, e] += shifts[a, e]
     to_log_odds(mean.reshape(-1), spread.reshape(-1))
+    return mean[:, : n * n].copy().reshape(A, n, n)
+
+
+@compiled
+def placement_log_odds(y, W, w, candidates, anchors, log_counts):
+    """Relations of absent candidates to anchors and back, (N, A, m) both, were they there."""
+    A, N, m = len(w.g), len(candidates), len(anchors)
+    found = np.empty((2, N, A, m), np.float32)
+    subjects, objects = np.empty(2 * m, np.int64), np.empty(2 * m, np.int64)
+    log_subjects, log_objects = np.zeros(2 * m, np.float32), np.zeros(2 * m, np.float32)
+    log_objects[:m] = log_counts
+    log_subjects[m:] = log_counts
+    size = _whole_blocks(2 * m)
+    mean, spread = np.zeros((A, size), np.float32), np.empty((A, size), np.float32)
+    for start in range(0, N, _CANDIDATES):
+        some = candidates[start : start + _CANDIDATES]
+        through, C = _moments(_means_with(y, W, some), w, 0, A)
+        for c in range(len(some)):
+            subjects[:m], objects[:m] = some[c], anchors
+            subjects[m:], objects[m:] = anchors, some[c]
+            functions = _rows(through[c], C[c], w, 0, A)
+            _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread)
+            to_log_odds(mean.reshape(-1), spread.reshape(-1))
+            found[0, start + c] = mean[:, :m]
+            found[1, start + c] = mean[:, m : 2 * m]
+    return found[0], found[1]
+
+
+@compiled
+def _means_with(y, W, candidates):
+    """Means of h1 once each candidate is there, (N, H1): as factorial as without it."""
+    mean = np.empty((len(candidates), len(y)), np.float32)
+    for c in range(len(candidates)):
+        row, into = W[candidates[c]], mean[c]
+        for k in range(len(y)):
+            into[k] = logistic(y[k] + row[k])
     return mean
 
 
-@compiled
-def placement_log_odds(x, W, w, candidates, anchors, log_counts):
-    """Relations of absent candidates to anchors and back, (N, A, m) both, were they there."""
-    A, m = len(w.d), len(anchors)
-    forward = np.empty((len(candidates), A, 1, m), np.float32)
-    backward = np.empty((len(candidates), A, m, 1), np.float32)
-    one = np.zeros(1, np.float32)
-    for c in range(len(candidates)):
-        # p(h1 | v and the candidate): as factorial as without it.
-        moments = _moments(means(x + W[candidates[c]]), w, 0, A)
-        candidate = candidates[c : c + 1]
-        _fill(moments, w, 0, candidate, one, anchors, log_counts, forward[c])
-        _fill(moments, w, 0, anchors, log_counts, candidate, one, backward[c])
-    return forward[:, :, 0], backward[:, :, :, 0]
-
-
-@compiled
-def placed_log_odds(x, W, w, candidates, anchor, relation, one, log_count, outgoing):
-    """One relation of absent candidates to one anchor, or back, (N,)."""
-    out, unit = np.empty(len(candidates), np.float32), np.empty((1, 1, 1), np.float32)
-    for c in range(len(candidates)):
-        moments = _moments(means(x + W[candidates[c]]), w, relation, relation + 1)
-        candidate = candidates[c : c + 1]
-        if outgoing:
-            _fill(moments, w, relation, candidate, one, anchor, log_count, unit)
+@compiled_in_any_order
+def _normal_unit(functions, w, a, i, log_i, j, log_j):
+    """Mean and √3 σ of the logit of one unit."""
+    rows, constants = functions
+    K, r = w.S.shape[1], w.Y.shape[1]
+    S_i, O_j, z = w.S[i], w.O[j], np.empty(K, np.float32)
+    mean = w.s[i, a] + w.n[a, 0] * log_i + w.o[j, a] + w.n[a, 1] * log_j
+    mean += w.residual[residual_row(w.start, w.key, i * len(w.S) + j), a]
+    for k in range(K):
+        z[k] = S_i[k] * O_j[k]
+    variance = np.float32(0.0)
+    for p in range(1 + r):
+        row, dot = rows[a, p], constants[a, p]
+        for k in range(K):
+            dot += row[k] * z[k]
+        if p == 0:
+            mean += dot
         else:
-            _fill(moments, w, relation, anchor, log_count, candidate, one, unit)
-        out[c] = unit[0, 0, 0]
-    return out
+            variance += dot * dot
+    return mean, np.sqrt(np.float32(3.0) * variance)
+
+
+@compiled
+def placed_log_odds(y, W, w, candidates, anchor, relation, log_count, outgoing):
+    """One relation of absent candidates to one anchor, or back, (N,)."""
+    N, a, none = len(candidates), relation, np.float32(0.0)
+    mean, spread = np.empty(N, np.float32), np.empty(N, np.float32)
+    for start in range(0, N, _CANDIDATES):
+        some = candidates[start : start + _CANDIDATES]
+        through, C = _moments(_means_with(y, W, some), w, a, a + 1)
+        for c in range(len(some)):
+            functions = _rows(through[c], C[c], w, a, a + 1)
+            i, log_i, j, log_j = some[c], none, anchor, log_count
+            if not outgoing:
+                i, log_i, j, log_j = anchor, log_count, some[c], none
+            found = _normal_unit(functions, w, a, i, log_i, j, log_j)
+            mean[start + c], spread[start + c] = found
+    to_log_odds(mean, spread)
+    return mean

@@ -1,12 +1,15 @@
-"""What the four questions answer. Objects are named by their position in `Scene.objects`."""
+"""What the four questions answer. Objects are named by their position in `Scene.objects`.
+
+What there are dozens of in an answer is a named tuple, which takes a third of the time to make.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class RelationAnswer:
+class RelationAnswer(NamedTuple):
     """`subject` stands in `relation` to `object`; probability that an annotator would list it."""
 
     subject: int
@@ -15,8 +18,7 @@ class RelationAnswer:
     probability: float
 
 
-@dataclass(frozen=True, slots=True)
-class Placement:
+class Placement(NamedTuple):
     """A missing thing would stand in `relation` to `object`."""
 
     relation: str
@@ -24,8 +26,7 @@ class Placement:
     probability: float
 
 
-@dataclass(frozen=True, slots=True)
-class MissingAnswer:
+class MissingAnswer(NamedTuple):
     """An absent class.
 
     Attributes:
@@ -42,16 +43,14 @@ class MissingAnswer:
     placements: tuple[Placement, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Because:
+class Because(NamedTuple):
     """What the presence of one object adds to the log-odds of another; negative speaks against."""
 
     object: int
     log_odds_change: float
 
 
-@dataclass(frozen=True, slots=True)
-class OutlierAnswer:
+class OutlierAnswer(NamedTuple):
     """How badly an object fits.
 
     Attributes:
@@ -70,8 +69,7 @@ class OutlierAnswer:
     because: tuple[Because, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class MisplacedAnswer:
+class MisplacedAnswer(NamedTuple):
     """A relation of the scene and the probability that it is false."""
 
     subject: int

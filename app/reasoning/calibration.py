@@ -7,52 +7,52 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.registry.description import Calibration, PairSlope
+from app.boltzmann.elementary import logistic
+from app.compiling import compiled, inlined
+from app.registry.description import Calibration
 
 Floats = NDArray[np.floating[Any]]
 
 
 def sigmoid(x: Floats) -> Floats:
-    """1 / (1 + e^-x); beyond ±80 as there."""
-    p: Floats = 1.0 / (1.0 + np.exp(-np.clip(x, -80.0, 80.0)))
+    """1 / (1 + e^-x); below -80 as there."""
+    p: Floats = 1.0 / (1.0 + np.exp(np.minimum(-x, 80.0)))
     return p
 
 
-def softmax(scores: Floats) -> Floats:
-    """e^s over its sum, for scores (N,)."""
-    weight = np.exp(scores - scores.max())
-    found: Floats = weight / weight.sum()
-    return found
-
-
-def relation_slopes(calibration: Calibration, *, given: bool) -> tuple[PairSlope, ...]:
-    """The entries for scenes of which some relations are given, or none."""
-    return (given and calibration.relation_given) or calibration.relation
-
-
+@compiled
 def relation_probability(
-    entries: tuple[PairSlope, ...], log_odds: Floats, log_count: Floats, classes: int
+    slopes: NDArray[np.float64], log_odds: Floats, log_count: Floats, classes: int
 ) -> Floats:
-    """Probability that a relation is listed for one pair of instances.
+    """Probability that a relation is listed for one pair of instances, (B, A, n, m).
 
     Args:
-        entries: one a relation; see `relation_slopes`.
-        log_odds: (..., A, n, m) of the class-level units.
+        slopes: (A, 4), one of those of `RelationSlopes`.
+        log_odds: (B, A, n, m) of the class-level units.
         log_count: (n, m), log of the instance pairs of both classes.
         classes: how many distinct ones the scene has.
     """
-    size = float(np.log(classes))
-    table = np.array(
-        [(e.intercept + e.log_classes * size, e.slope, e.log_count) for e in entries],
-        dtype=log_odds.dtype,
-    )
-    intercept, slope, weight = table.T[:, :, None, None]
-    return sigmoid(intercept + slope * log_odds + weight * log_count)
+    p = np.empty_like(log_odds)
+    size = np.log(classes)
+    for a in range(p.shape[1]):
+        slope, weight = np.float32(slopes[a, 1]), np.float32(slopes[a, 2])
+        intercept = np.float32(slopes[a, 0] + slopes[a, 3] * size)
+        for b in range(len(p)):
+            for i in range(p.shape[2]):
+                row, found, counts = log_odds[b, a, i], p[b, a, i], log_count[i]
+                for j in range(len(row)):
+                    found[j] = intercept + slope * row[j] + weight * counts[j]
+    # Of all at once, since a row is short.
+    logits = p.reshape(-1)
+    for e in range(len(logits)):
+        logits[e] = logistic(np.float32(logits[e]))
+    return p
 
 
+@inlined
 def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
     """Scale p(a(x,y)) and p(a(y,x)), which exclude each other, down to a sum of at most 1."""
-    total = np.maximum(forward + backward, 1.0)
+    total = np.maximum(forward + backward, np.float32(1.0))
     return forward / total, backward / total
 
 

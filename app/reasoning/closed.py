@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
-from app.boltzmann.closed_form import ClosedForm, Given
+from app.boltzmann.closed_form import ClosedForm, WithoutEach
+from app.reasoning.given import given_relations
 from app.reasoning.present import present
 from app.registry.artifact import Artifact
-from app.scene.evidence import class_evidence
 from app.scene.scene import Scene
 
 Floats = NDArray[np.float32]
@@ -21,13 +23,10 @@ class ClosedPosterior:
     def __init__(self, artifact: Artifact, closed: ClosedForm, scene: Scene) -> None:
         self.present = present(scene, artifact.machine.spec)
         self._closed, self._scorer = closed, artifact.scorer
-        presence = self.present.presence.astype(np.float32)
         self._context = closed.context(
-            self.present.classes,
-            presence,
-            np.log(self.present.counts).astype(np.float32),
+            *(self.present.classes, self.present.presence, self.present.log_counts),
             scene.room_type,
-            _given(scene, presence, artifact.machine.spec.A),
+            given_relations(scene, self.present, artifact.machine.spec.A),
         )
 
     @property
@@ -42,6 +41,10 @@ class ClosedPosterior:
     def relation_log_odds(self) -> Floats:
         """Normal logits."""
         return self._closed.relation_log_odds(self._context)
+
+    def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
+        """Normal logits."""
+        return self._closed.unit_log_odds(self._context, relation, subject, object_)
 
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
         """Normal logits."""
@@ -58,22 +61,15 @@ class ClosedPosterior:
 
     def log_odds_given_rest(self) -> Floats:
         """Exact where no relation is given."""
-        alone, _ = self._closed.leave_one_out(self._context, np.zeros(0, dtype=np.int64))
-        return self._closed.b[self.present.classes] + alone
+        return self._closed.b[self.present.classes] + self._without_each.gain
 
     def reasons(self, rows: Places) -> Floats:
         """Exact where no relation is given."""
-        alone, pairs = self._closed.leave_one_out(self._context, rows)
-        change = alone[rows, None] - pairs
+        each = self._without_each
+        change = each.gain[rows, None] - self._closed.without_pairs(self._context, each, rows)
         change[np.arange(len(rows)), rows] = 0.0
         return change
 
-
-def _given(scene: Scene, presence: Floats, relations: int) -> Given | None:
-    """The relations between classes that the scene states or shows, of those the machine knows."""
-    if not (scene.relations or scene.relations_complete or scene.poses):
-        return None
-    found = class_evidence(scene)
-    a, i, j = np.nonzero(found.observed[:relations])
-    holds = found.holds[a, i, j].astype(np.float32)
-    return Given(a, i, j, holds, presence[i] * presence[j])
+    @cached_property
+    def _without_each(self) -> WithoutEach:
+        return self._closed.without_each(self._context)

@@ -87,6 +87,10 @@ class DrawnPosterior:
         on, off = mean_log_p(torch.softmax(log_weight, dim=0), logits + implied)
         return _numpy(units.grid((on - off).clamp(min=NO_UNIT), NO_UNIT))
 
+    def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
+        """Among all of them."""
+        return self.relation_log_odds()[relation, subject, object_]
+
     @torch.inference_mode()
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
         """Over draws weighed as if the candidate were there."""
@@ -182,7 +186,8 @@ def _rows(size: int) -> int:
 
 
 def _numpy(values: Tensor) -> Floats:
-    found: Floats = values.numpy()
+    """In the order that compiled loops are compiled for."""
+    found: Floats = values.contiguous().numpy()
     return found
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.reasoning.answers import MissingAnswer
-from app.reasoning.calibration import missing_scores, placed_scores, softmax
+from app.reasoning.calibration import missing_scores, placed_scores
+from app.reasoning.listing import absent_things, likeliest_classes
 from app.reasoning.placements import placements
 from app.reasoning.posterior import posterior
-from app.reasoning.ranking import best
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene
@@ -45,10 +45,7 @@ def missing(
         raise ValueError(f"top_k must be at least 1, not {top_k}")
     place = _place(scene, spec.A, at)
     given = posterior(artifact, scene)
-    structure = artifact.vocabulary.structure
-    usable = ~structure
-    usable[given.present.classes] = False
-    absent = np.flatnonzero(usable)
+    absent = absent_things(artifact.vocabulary.structure, given.present.classes)
     chosen = _chosen(absent, spec.V, candidates)
     if not chosen.any():
         return ()
@@ -60,19 +57,20 @@ def missing(
         row = int(given.present.row[anchor])
         log_p = given.placed_log_p(absent, relation, row, outgoing=outgoing)
         scores = placed_scores(calibration, log_odds, log_p)
-    entries = calibration.placement or calibration.relation
-    # By score: probabilities of far classes may all round to zero.
-    where = best(scores, chosen, top_k)
+    where, probabilities = likeliest_classes(scores, chosen, top_k)
+    found = absent[where]
     labels = artifact.vocabulary.labels
     return tuple(
-        MissingAnswer(labels[index], probability, value, standing)
-        for index, probability, value, standing in zip(
-            absent[where].tolist(),
-            softmax(scores)[where].tolist(),
-            log_odds[where].tolist(),
-            placements(given, absent[where], structure, entries),
-            strict=True,
-        )
+        [
+            MissingAnswer(labels[index], probability, value, standing)
+            for index, probability, value, standing in zip(
+                found.tolist(),
+                probabilities.tolist(),
+                log_odds[where].tolist(),
+                placements(artifact, given, found),
+                strict=True,
+            )
+        ]
     )
 
 

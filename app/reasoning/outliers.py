@@ -6,7 +6,9 @@ import numpy as np
 
 from app.reasoning.answers import Because, MisplacedAnswer, OutlierAnswer
 from app.reasoning.calibration import false_log_odds, intruder_log_odds, sigmoid
+from app.reasoning.listing import strongest
 from app.reasoning.posterior import Posterior, posterior
+from app.reasoning.ranking import best
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
@@ -48,23 +50,25 @@ def outliers(
     log_odds = given.log_odds_given_rest()
     intruder = intruder_log_odds(calibration, log_odds, len(log_odds))
     row = given.present.row
-    order = np.argsort(-intruder[row], kind="stable")
-    explained = row[order[: _affordable(given)]].tolist()
-    reasons = _reasons(given, list(dict.fromkeys(explained)))
+    judged = intruder[row]
+    order = best(judged, np.ones(len(row), dtype=np.bool_), len(row)).tolist()
     rows, values = row.tolist(), log_odds.tolist()
+    reasons = _reasons(given, list(dict.fromkeys([rows[k] for k in order[: _affordable(given)]])))
     probability = sigmoid(intruder).tolist()
     labels = artifact.vocabulary.labels
     classes = given.present.classes.tolist()
     found = tuple(
-        OutlierAnswer(
-            object=position,
-            label=labels[classes[row := rows[position]]],
-            probability=probability[row],
-            log_odds=values[row],
-            is_outlier=probability[row] >= threshold,
-            because=reasons.get(row, ()),
-        )
-        for position in order.tolist()
+        [
+            OutlierAnswer(
+                object=position,
+                label=labels[classes[row := rows[position]]],
+                probability=probability[row],
+                log_odds=values[row],
+                is_outlier=probability[row] >= threshold,
+                because=reasons.get(row, ()),
+            )
+            for position in order
+        ]
     )
     return found, _misplaced(artifact, given, scene)
 
@@ -87,16 +91,14 @@ def _reasons(given: Posterior, explained: list[int]) -> dict[int, tuple[Because,
     classes = len(given.present.classes)
     if classes < 2:
         return dict.fromkeys(explained, ())
-    change = given.reasons(np.array(explained, dtype=np.int64))
-    # The class itself is no reason; its 0 sorts last, or among others that change nothing.
-    strength = np.abs(change)
-    strength[np.arange(len(explained)), explained] = -1.0
-    order = np.argsort(-strength, axis=1, kind="stable")[:, : min(REASONS, classes - 1)]
-    positions = given.present.first[order].tolist()
-    values = np.take_along_axis(change, order, axis=1).tolist()
+    rows = np.array(explained, dtype=np.int64)
+    places, values = strongest(given.reasons(rows), rows, REASONS)
+    first = given.present.first.tolist()
     return {
-        row: tuple(Because(position, value) for position, value in zip(*found, strict=True))
-        for row, *found in zip(explained, positions, values, strict=True)
+        row: tuple(
+            [Because(first[place], value) for place, value in zip(some, their_values, strict=True)]
+        )
+        for row, some, their_values in zip(explained, places.tolist(), values.tolist(), strict=True)
     }
 
 
@@ -106,10 +108,12 @@ def _misplaced(artifact: Artifact, given: Posterior, scene: Scene) -> tuple[Misp
     if not stated:
         return ()
     row = given.present.row
-    relation, subject, object_ = np.array(stated).T
-    log_odds = given.relation_log_odds()[relation, row[subject], row[object_]]
+    relation, subject, object_ = np.array(stated).T.copy()
+    log_odds = given.unit_log_odds(relation, row[subject], row[object_])
     p = sigmoid(false_log_odds(artifact.calibration, log_odds)).tolist()
     return tuple(
-        MisplacedAnswer(stated[k][1], CANONICAL[stated[k][0]], stated[k][2], p[k])
-        for k in np.argsort(log_odds, kind="stable").tolist()
+        [
+            MisplacedAnswer(stated[k][1], CANONICAL[stated[k][0]], stated[k][2], p[k])
+            for k in np.argsort(log_odds, kind="stable").tolist()
+        ]
     )

@@ -43,6 +43,9 @@ class Posterior(Protocol):
     def relation_log_odds(self) -> Floats:
         """Every relation between the classes present, each without itself, (A, n, n)."""
 
+    def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
+        """The same of some relations (E,), from and to places in `present.classes`, (E,)."""
+
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
         """Relations of absent classes (N,), were they there, to places (m,) in `present.classes`.
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.reasoning.answers import RelationAnswer
-from app.reasoning.calibration import exclusive, relation_probability, relation_slopes
+from app.reasoning.listing import likeliest_relations, pairs_of_things
 from app.reasoning.posterior import posterior, relations_given
-from app.reasoning.ranking import best
+from app.reasoning.present import Present
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, OPPOSITES
 from app.scene.scene import Scene
@@ -45,47 +45,38 @@ def relations(
         raise ValueError(f"top_k must be at least 1, not {top_k}")
     if not 0 <= min_probability <= 1:
         raise ValueError(f"min_probability must be in [0, 1], not {min_probability}")
-    given = posterior(artifact, scene)
-    asked = _asked(artifact, scene, pairs)
-    if not asked.any():
+    if not scene.objects:
         return ()
+    given = posterior(artifact, scene)
+    present, slopes = given.present, artifact.relation_slopes
+    asked = _asked(artifact, present, pairs)
     log_odds = given.relation_log_odds()
-    log_counts = np.log(given.present.counts).astype(log_odds.dtype)
-    entries = relation_slopes(artifact.calibration, given=relations_given(scene))
-    p = relation_probability(entries, log_odds, log_counts[:, None] + log_counts, len(log_counts))
-    p, backward = exclusive(p, p.swapaxes(1, 2))
-    names = CANONICAL[: len(p)]
-    if include_opposites:
-        p = np.concatenate([p, backward])
-        names = names + tuple(OPPOSITES[name] for name in names)
-    row = given.present.row
-    # (N, N, relations): the flat order is that of positions, so a stable sort breaks ties by it.
-    grid = p[:, row[:, None], row].transpose(1, 2, 0)
-    usable = asked[..., None] & (grid >= min_probability)
-    where = best(grid.ravel(), usable.ravel(), top_k)
-    subject, object_, relation = np.unravel_index(where, grid.shape)
+    found = likeliest_relations(
+        slopes.given if relations_given(scene) else slopes.alone,
+        *(log_odds, present.log_counts, present.row, asked),
+        *(min_probability, include_opposites, top_k),
+    )
+    names = CANONICAL[: len(log_odds)]
+    names += tuple([OPPOSITES[name] for name in names])
+    subjects, objects, kinds, probabilities = (values.tolist() for values in found)
     return tuple(
-        RelationAnswer(x, names[a], y, probability)
-        for x, y, a, probability in zip(
-            subject.tolist(),
-            object_.tolist(),
-            relation.tolist(),
-            grid.ravel()[where].tolist(),
-            strict=True,
-        )
+        [
+            RelationAnswer(x, names[a], y, probability)
+            for x, y, a, probability in zip(subjects, objects, kinds, probabilities, strict=True)
+        ]
     )
 
 
 def _asked(
-    artifact: Artifact, scene: Scene, pairs: Sequence[tuple[int, int]] | None
+    artifact: Artifact, present: Present, pairs: Sequence[tuple[int, int]] | None
 ) -> NDArray[np.bool_]:
     """(N, N) which ordered pairs to answer."""
-    size = len(scene.objects)
+    asked: NDArray[np.bool_]
     if pairs is None:
         structure = artifact.vocabulary.structure
-        thing = np.array([not structure[entry.class_index] for entry in scene.objects], dtype=bool)
-        usable: NDArray[np.bool_] = thing[:, None] & thing & ~np.eye(size, dtype=np.bool_)
-        return usable
+        asked = pairs_of_things(structure, present.classes, present.row)
+        return asked
+    size = len(present.row)
     asked = np.zeros((size, size), dtype=np.bool_)
     for subject, object_ in pairs:
         if subject == object_ or not (0 <= subject < size and 0 <= object_ < size):

@@ -16,6 +16,7 @@ from app.registry.description import Calibration, Description
 from app.registry.durable import sync_directory, write_file
 from app.registry.errors import ArtifactError
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
+from app.registry.slopes import RelationSlopes
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.registry.verified import read_verified
 from app.scene.vocabulary import Vocabulary
@@ -62,6 +63,11 @@ class Artifact:
         from app.boltzmann.closed_form import ClosedForm
 
         return ClosedForm(self.machine) if ClosedForm.fits(self.machine) else None
+
+    @cached_property
+    def relation_slopes(self) -> RelationSlopes:
+        """The calibration of relations in arrays."""
+        return RelationSlopes.of(self.calibration)
 
     @cached_property
     def fantasies(self) -> Fantasies:

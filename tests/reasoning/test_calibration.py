@@ -9,7 +9,8 @@ import pytest
 
 from app.reasoning import missing, outliers, relations
 from app.reasoning.calibration import exclusive, relation_probability
-from app.registry.description import CountSlope, PairSlope, Slope
+from app.registry.description import Calibration, CountSlope, PairSlope, Slope
+from app.registry.slopes import RelationSlopes
 from tests.reasoning.artifacts import larger_artifact, scene_of
 
 
@@ -23,7 +24,8 @@ def test_relations_have_a_calibration_each():
     )
     log_odds = np.arange(16.0).reshape(4, 2, 2) / 8 - 1
     log_count = np.array([[0.0, 0.5], [1.0, 2.0]])
-    p = relation_probability(entries, log_odds, log_count, 7)
+    slopes = RelationSlopes.of(Calibration(relation=entries)).alone
+    p = relation_probability(slopes, log_odds[None], log_count, 7)[0]
     for a in range(4):
         for x in range(2):
             for y in range(2):

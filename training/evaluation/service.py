@@ -21,11 +21,11 @@ from app.reasoning.calibration import (
     exclusive,
     false_log_odds,
     relation_probability,
-    relation_slopes,
     sigmoid,
 )
 from app.reasoning.units import NO_UNIT
 from app.registry import Artifact
+from app.registry.slopes import RelationSlopes
 from app.scene import CANONICAL, OPPOSITES
 from training.batches import Batch, SceneTensors
 from training.datasets import EncodedScene
@@ -133,8 +133,11 @@ def directly(artifact: Artifact) -> Asked:
         pairs = np.zeros(values.shape[-2:], values.dtype)
         told = (batch.observed & (batch.holds > 0)).flatten(1).any(1).tolist()
         sizes = (batch.classes >= 0).sum(1).tolist()
+        slopes = RelationSlopes.of(calibration)
         rows = [
-            relation_probability(relation_slopes(calibration, given=given), value, pairs, size)
+            relation_probability(slopes.given if given else slopes.alone, value[None], pairs, size)[
+                0
+            ]
             for value, given, size in zip(values, told, sizes, strict=True)
         ]
         p = np.stack(rows)

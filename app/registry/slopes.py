@@ -1,0 +1,41 @@
+"""A calibration's entries of relations as arrays, for the loops that answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.registry.description import Calibration, PairSlope
+
+Table = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelationSlopes:
+    """Of each canonical relation intercept, slope, log_count and log_classes, (A, 4).
+
+    Attributes:
+        alone: for scenes of which no relation is given.
+        given: of which some are.
+        placement: for a missing object and one that is there.
+    """
+
+    alone: Table
+    given: Table
+    placement: Table
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> RelationSlopes:
+        """The entries of a calibration, each kind standing in where another is empty."""
+        alone = calibration.relation
+        return cls(
+            _table(alone),
+            _table(calibration.relation_given or alone),
+            _table(calibration.placement or alone),
+        )
+
+
+def _table(entries: tuple[PairSlope, ...]) -> Table:
+    return np.array([(e.intercept, e.slope, e.log_count, e.log_classes) for e in entries])
