@@ -13,6 +13,7 @@ from rich.console import Console
 from benchmarks.gibbs import gibbs
 from benchmarks.log_odds import log_odds
 from benchmarks.report import Result, describe_machine, document
+from benchmarks.scaling import scaling
 from benchmarks.service import NoModelError, service
 from benchmarks.training import training_step
 
@@ -23,6 +24,7 @@ class Name(StrEnum):
     GIBBS = "gibbs"
     TRAINING = "training"
     LOG_ODDS = "log-odds"
+    SCALING = "scaling"
     SERVICE = "service"
 
 
@@ -62,6 +64,8 @@ def _run(name: Name, store: Path) -> list[Result]:
             return [training_step()]
         case Name.LOG_ODDS:
             return [log_odds()]
+        case Name.SCALING:
+            return scaling()
         case Name.SERVICE:
             return service(store=store)
 

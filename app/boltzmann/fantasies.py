@@ -34,7 +34,7 @@ from app.boltzmann.machine import BoltzmannMachine
 from app.boltzmann.mean_field import Evidence, mean_field
 
 _WORD = 32
-_OTHER_ROOM = 6.0
+OTHER_ROOM = 6.0
 
 
 def words(classes: int) -> int:
@@ -103,7 +103,7 @@ class Fantasies:
             known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
             own = self.machine.fantasy_rooms == clamp.room.unsqueeze(1)
             hint = self._room.T[clamp.room.clamp(min=0)]
-            hint = torch.where(own.any(1, keepdim=True), -_OTHER_ROOM * ~own, hint)
+            hint = torch.where(own.any(1, keepdim=True), -OTHER_ROOM * ~own, hint)
             weight = weight + known * hint
         if clamp.h1 is not None:
             weight = weight + clamp.h1.to(given.dtype) @ self._unit.T

@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # importing torch takes seconds; writing and listing artifact
     from app.boltzmann import BoltzmannMachine
     from app.boltzmann.closed_form import ClosedForm
     from app.boltzmann.fantasies import Fantasies
+    from app.boltzmann.scene_chains import SceneChains
     from app.boltzmann.scoring import ContextScorer
 
 
@@ -68,6 +69,13 @@ class Artifact:
     def relation_slopes(self) -> RelationSlopes:
         """The calibration of relations in arrays."""
         return RelationSlopes.of(self.calibration)
+
+    @cached_property
+    def scene_chains(self) -> SceneChains | None:
+        """Compiled chains that draw scenes; None for machines that have none."""
+        from app.boltzmann.scene_chains import SceneChains
+
+        return SceneChains(self.machine) if SceneChains.fits(self.machine) else None
 
     @cached_property
     def fantasies(self) -> Fantasies:

@@ -19,6 +19,7 @@ from benchmarks.__main__ import main
 from benchmarks.gibbs import gibbs
 from benchmarks.log_odds import log_odds
 from benchmarks.report import Result, describe_machine, document, duration
+from benchmarks.scaling import scaling
 from benchmarks.service import MISSING, NoModelError, service
 from benchmarks.timing import Timings, interleave
 from benchmarks.training import training_step
@@ -67,6 +68,21 @@ def test_log_odds_agree_with_those_of_the_yardstick():
     result = log_odds(V=30, H=12, objects=5, K=2, rounds=2)
     check_complete(result, 2)
     assert result.facts["largest difference from scikit-learn"] < 1e-4
+
+
+@pytest.mark.system
+def test_scaling():
+    results = scaling(classes=(20, 45), H1=66, K=3, N=8, objects=4, rounds=2)
+    for result in results:
+        check_complete(result, 2)
+    assert [result.name.split()[1] for result in results] == [
+        "relations",
+        "missing",
+        "outliers",
+        "generate",
+    ]
+    sizes = [value for name, value in results[0].facts.items() if name.endswith("artifact in MB")]
+    assert sizes[0] < sizes[1]
 
 
 @pytest.mark.system

@@ -1,0 +1,96 @@
+"""Scenes drawn by compiled chains, one by one, for machines that have them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.boltzmann import philox
+from app.boltzmann.scene_chains import ConditionedChains, Conditions, Drawn
+from app.reasoning.answers import GeneratedScene
+from app.reasoning.chains import held_units
+from app.reasoning.exclusion import Triple, staying
+from app.reasoning.present import Present, present
+from app.registry.artifact import Artifact
+from app.scene.evidence import class_evidence
+from app.scene.relations import CANONICAL
+from app.scene.scene import Scene
+
+
+def chain_scenes(
+    artifact: Artifact,
+    scene: Scene,
+    count: int,
+    seed: int,
+    steps: int,
+    temperature: float,
+    context: Mapping[str, Sequence[int]],
+) -> tuple[GeneratedScene, ...]:
+    """See `generate`. Every chain has a random stream of its own.
+
+    Raises:
+        ValueError: the machine has no compiled chains.
+    """
+    chains = artifact.scene_chains
+    if chains is None:
+        raise ValueError("this machine has no compiled chains")
+    held, _ = held_units(artifact.machine, context)
+    spec = artifact.machine.spec
+    classes = present(scene, spec)
+    conditions = _conditions(scene, classes, spec.A, np.flatnonzero(held.numpy()))
+    conditioned = chains.given(conditions, temperature)
+    shown = ~artifact.vocabulary.structure
+    shown[classes.classes] = True
+    of = classes.classes[classes.row].tolist()
+    given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
+    return tuple(
+        _scene(artifact, conditioned, drawn, shown[drawn.classes], given)
+        for drawn in (conditioned.draw(steps, philox.stream(seed, place)) for place in range(count))
+    )
+
+
+def _conditions(
+    scene: Scene, classes: Present, relations: int, held: NDArray[np.int64]
+) -> Conditions:
+    a = i = j = np.zeros(0, dtype=np.int64)
+    r = np.zeros(0, dtype=np.bool_)
+    if scene.relations or scene.relations_complete or scene.poses:
+        found = class_evidence(scene)
+        # A machine may know fewer relations than there are.
+        a, i, j = np.nonzero(found.observed[:relations])
+        r = found.holds[a, i, j]
+    return Conditions(
+        classes=classes.classes,
+        log_counts=np.log(classes.counts).astype(np.float32),
+        a=a,
+        i=i,
+        j=j,
+        r=r,
+        held=held,
+        room=scene.room_type,
+    )
+
+
+def _scene(
+    artifact: Artifact,
+    chains: ConditionedChains,
+    drawn: Drawn,
+    shown: NDArray[np.bool_],
+    given: set[Triple],
+) -> GeneratedScene:
+    labels = artifact.vocabulary.labels
+    units = np.nonzero(drawn.r & shown[:, None] & shown)
+    a, i, j = units
+    named = np.stack([a, drawn.classes[i], drawn.classes[j]], axis=1)
+    stay = staying(named, drawn.logits[units], given, artifact.vocabulary.structure)
+    kept = np.zeros_like(drawn.r)
+    kept[units] = stay
+    triples = sorted({*map(tuple, named[stay].tolist()), *given})
+    return GeneratedScene(
+        objects=tuple(labels[index] for index in drawn.classes[shown].tolist()),
+        relations=tuple((labels[i], CANONICAL[a], labels[j]) for a, i, j in triples),
+        log_score=chains.log_score(drawn, shown, kept),
+        context={"h1": tuple(drawn.h1.tolist())},
+    )

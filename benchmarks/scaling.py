@@ -1,0 +1,190 @@
+"""What a larger vocabulary costs: memory of the loaded model, and latency of every question.
+
+Random weights of the shipped default's sizes, as wide as trained ones spread and with as many
+objects a scene: how long an answer takes depends on these, not on what the weights say. Random
+relation weights lie in more directions than trained ones, so `/relations` takes longer here than
+with a trained model; the ratios between vocabularies are what this is for.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+
+from app import reasoning
+from app.boltzmann import BoltzmannMachine, MachineSpec, Triway
+from app.boltzmann.fantasies import pack_scenes
+from app.registry.artifact import Artifact, load_artifact, write_artifact
+from app.registry.description import Calibration, Description, VocabularyEntry
+from app.scene.scene import Scene, SceneObject
+from app.scene.vocabulary import ObjectClass, Vocabulary
+from benchmarks.report import Fact, Result
+from benchmarks.timing import interleave
+from benchmarks.yardsticks import object_machine, presence, random_scenes
+
+CLASSES = (417, 2_000, 10_000)
+OBJECTS, SCENES = 12, 8
+
+# Standard deviations of the trained default's weights; the rest is drawn by `object_machine`.
+_SPREAD = {"S": 0.065, "O": 0.065, "R": 0.32, "M": 0.23, "P": 0.06, "B": 0.14}
+_TRIPLES_A_CLASS = 17
+_MEGABYTE = 1e6
+
+
+def scaling(
+    *,
+    classes: Sequence[int] = CLASSES,
+    H1: int = 200,
+    K: int = 32,
+    N: int = 512,
+    objects: int = OBJECTS,
+    rounds: int = 31,
+) -> list[Result]:
+    """One result for each question: the same machine but for V, called in turns.
+
+    Args:
+        classes: vocabulary sizes V, the least first: it is the yardstick of the others.
+        N: fantasies.
+        objects: in the scene that is asked about, the same for all.
+    """
+    scene = _scene(classes[0], objects)
+    with TemporaryDirectory() as folder:
+        paths = {V: _write(Path(folder) / str(V), V, H1, K, N, objects) for V in classes}
+        memory = {V: _memory(paths[classes[0]], paths[V], scene) for V in classes}
+        files = {V: sum(file.stat().st_size for file in paths[V].iterdir()) for V in classes}
+        artifacts = {V: load_artifact(path) for V, path in paths.items()}
+    facts: dict[str, Fact] = {}
+    for V in classes:
+        facts[f"{_name(V)}, artifact in MB"] = files[V] / _MEGABYTE
+        facts[f"{_name(V)}, loaded and asked everything, resident MB"] = memory[V] / _MEGABYTE
+        facts[f"{_name(V)}, resident kB a class"] = memory[V] / V / 1e3
+    results: list[Result] = []
+    for question, ask in _questions(scene).items():
+        calls = {_name(V): _call(ask, artifact) for V, artifact in artifacts.items()}
+        results.append(
+            Result(
+                name=f"scaling {question}",
+                title=f"/{question}: how many times as long as with {_name(classes[0])}",
+                subject=_name(classes[0]),
+                timings=interleave(calls, rounds=rounds),
+                facts={} if results else facts,
+            )
+        )
+    return results
+
+
+def _name(V: int) -> str:
+    return f"{V:,} classes"
+
+
+Question = Callable[[Artifact], object]
+
+
+def _call(ask: Question, artifact: Artifact) -> Callable[[], object]:
+    return lambda: ask(artifact)
+
+
+def _questions(scene: Scene) -> Mapping[str, Question]:
+    return {
+        "relations": lambda artifact: reasoning.relations(artifact, scene),
+        "missing": lambda artifact: reasoning.missing(artifact, scene),
+        "outliers": lambda artifact: reasoning.outliers(artifact, scene),
+        f"generate of {SCENES}": lambda artifact: reasoning.generate(
+            artifact, scene, count=SCENES, seed=1
+        ),
+    }
+
+
+def _scene(V: int, objects: int) -> Scene:
+    """Objects among the first V classes, by their frequencies."""
+    drawn = random_scenes(1, V, objects, torch.Generator().manual_seed(1))[0].tolist()
+    return Scene(tuple(SceneObject(_label(i), _label(i), i) for i in drawn))
+
+
+def _label(number: int) -> str:
+    return f"class {number}"
+
+
+def _write(path: Path, V: int, H1: int, K: int, N: int, objects: int) -> Path:
+    spec = MachineSpec(
+        "triway", V=V, A=4, H1=H1, C=33, K=K, T=_TRIPLES_A_CLASS * V, G=8, N=N, form="local"
+    )
+    machine = _machine(spec, objects)
+    vocabulary = Vocabulary(
+        [ObjectClass(_label(number)) for number in range(V)],
+        [f"room {number}" for number in range(spec.C)],
+    )
+    description = Description(
+        name="random",
+        version="0.0.1",
+        created=datetime.now(UTC),
+        spec=spec.to_dict(),
+        vocabulary=VocabularyEntry.of(vocabulary),
+        calibration=Calibration.neutral(spec.A),
+        training={"objective": "none: random weights"},
+        data=(),
+        metrics=(),
+        terms="none",
+        libraries={},
+    )
+    write_artifact(path, description, machine.state_dict())
+    return path
+
+
+@torch.no_grad()
+def _machine(spec: MachineSpec, objects: int) -> BoltzmannMachine:
+    machine = object_machine(spec, objects)
+    generator = torch.Generator().manual_seed(2)
+    if not isinstance(machine, Triway):
+        raise TypeError("scaling is measured of a Triway")
+    for name, spread in _SPREAD.items():
+        parameter = machine.get_parameter(name)
+        parameter.copy_(torch.randn(parameter.shape, generator=generator) * spread)
+    machine.d.fill_(-2.0)
+    # Rules that nobody learnt would only turn relations on by the hundred.
+    machine.get_parameter("gamma").mul_(0.2)
+    # Distinct (a, i, j), sorted, spread over all of them.
+    units = spec.A * spec.V**2
+    keys = (torch.arange(spec.T, dtype=torch.float64) * (units / spec.T)).long()
+    square = spec.V**2
+    machine.set_triples(torch.stack([keys // square, keys // spec.V % spec.V, keys % spec.V], 1))
+    if spec.N:
+        dreamt = presence(random_scenes(spec.N, spec.V, objects, generator), spec.V)
+        machine.fantasies.copy_(pack_scenes(dreamt))
+        machine.fantasy_rooms.copy_(torch.arange(spec.N) % spec.C)
+    return machine
+
+
+def _memory(first: Path, path: Path, scene: Scene) -> int:
+    """Resident bytes that loading a model and asking it everything adds to a process of its own."""
+    # A process that has asked another model before holds the compiled loops already.
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_resident, (first, path, scene))
+
+
+def _resident(first: Path, path: Path, scene: Scene) -> int:
+    torch.set_num_threads(1)
+    kept = [_asked(first, scene)]
+    before = _resident_bytes()
+    kept.append(_asked(path, scene))
+    return _resident_bytes() - before
+
+
+def _asked(path: Path, scene: Scene) -> Artifact:
+    artifact = load_artifact(path)
+    for ask in _questions(scene).values():
+        ask(artifact)
+    return artifact
+
+
+def _resident_bytes() -> int:
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")

@@ -1,0 +1,294 @@
+"""Compiled chains draw from the machine: by enumeration of small machines, and beside the tensors.
+
+Stationarity is tested as in `test_gibbs`: states drawn from the enumerated joint, one sweep, and
+the histogram against p. A class's relations to itself are left out, as the chains do.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from app.boltzmann import MachineSpec, build, chain_kernels, philox
+from app.boltzmann.fantasies import Fantasies, pack_scenes
+from app.boltzmann.gibbs import Clamp, present_classes, run, sample_relations
+from app.boltzmann.scene_chains import Conditions, SceneChains
+from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+
+CHAINS = 20_000
+# McDiarmid: one chain moves a total variation by 1/N, so P(TV > E + t) <= exp(-2 N t²) = 1e-9.
+SLACK = math.sqrt(9 * math.log(10) / (2 * CHAINS))
+NAMES = [
+    name
+    for name, spec in SMALL.items()
+    if spec.variant == "triway" and spec.form == "local" and not spec.H2
+]
+NOTHING = np.zeros(0, dtype=np.int64)
+
+
+def conditions(classes=(), relations=(), held=(), room=None):
+    """Relations are (a, i, j, r), i and j places in classes."""
+    a, i, j, r = np.array(sorted(relations), dtype=np.int64).reshape(-1, 4).T.copy()
+    return Conditions(
+        classes=np.array(classes, dtype=np.int64),
+        log_counts=np.zeros(len(classes), dtype=np.float32),
+        a=a,
+        i=i,
+        j=j,
+        r=r > 0,
+        held=np.array(held, dtype=np.int64),
+        room=room,
+    )
+
+
+def rounded(name):
+    """A small machine in float32, and the same weights in float64."""
+    single = copy.deepcopy(small_machine(name)).float().requires_grad_(False)
+    return single, copy.deepcopy(single).double()
+
+
+def code(v, r, h1):
+    """One integer for a state; r (A, V, V), its diagonal left out."""
+    off = ~np.eye(r.shape[-1], dtype=bool)
+    bits = np.concatenate([v, r[..., off].reshape(*v.shape[:-1], -1), h1], -1).astype(np.int64)
+    return (bits << np.arange(bits.shape[-1])).sum(-1)
+
+
+def law(joint, given):
+    """Codes and probabilities of the states where given, without r in one that implies."""
+    spec = joint.machine.spec
+    r = joint.r.numpy().reshape(-1, spec.A, spec.V, spec.V)
+    if spec.G:
+        r = np.zeros_like(r)
+    codes = code(joint.v.numpy(), r, joint.h1.numpy())
+    p = np.where(given.numpy(), joint.p.numpy(), 0.0)
+    keys, which = np.unique(codes, return_inverse=True)
+    return keys, np.bincount(which, p / p.sum())
+
+
+def check_stationary(name, condition, given, room=None, beta=1.0):
+    single, double = rounded(name)
+    spec = double.spec
+    joint = enumerate_joint(double if beta == 1 else double.scaled(beta), room)
+    where = given(joint)
+    keys, p = law(joint, where)
+    chains = SceneChains(single).given(condition, 1 / beta)
+    q = torch.where(where, joint.p, 0.0)
+    picked = q.multinomial(CHAINS, True, generator=torch.Generator().manual_seed(1))
+    starts = joint.v[picked].numpy().astype(np.uint8), joint.h1[picked].numpy().astype(np.uint8)
+    found = np.zeros(CHAINS, dtype=np.int64)
+    for chain, (on, h1) in enumerate(zip(*starts, strict=True)):
+        drawn = chains.move(on.copy(), h1.copy(), 1, philox.stream(5, chain))
+        r = np.zeros((spec.A, spec.V, spec.V))
+        if not spec.G:
+            r[:, drawn.classes[:, None], drawn.classes] = drawn.r
+        v, h1 = np.zeros(spec.V), np.zeros(spec.H1)
+        v[drawn.classes], h1[drawn.h1] = 1, 1
+        found[chain] = code(v, r, h1)
+    place = np.searchsorted(keys, found).clip(max=len(keys) - 1)
+    assert (keys[place] == found).all()
+    assert (p[place] > 0).all(), "a state of probability zero"
+    frequency = np.bincount(place, minlength=len(keys)) / CHAINS
+    floor = 0.5 * np.sqrt(2 * p * (1 - p) / (math.pi * CHAINS)).sum()
+    assert 0.5 * np.abs(frequency - p).sum() < 1.1 * floor + SLACK
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("beta", [1.0, 0.5])
+def test_chains_are_stationary(name, beta):
+    check_stationary(name, conditions(room=1), lambda joint: joint.p >= 0, room=1, beta=beta)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("r", [0, 1])
+def test_chains_are_stationary_under_conditions(name, r):
+    """Two classes present, a unit held on, one relation between them seen on or off."""
+
+    def given(joint):
+        e = joint.edges
+        unit = (e.relation[0] == 0) & (e.subject[0] == 0) & (e.object[0] == 1)
+        seen = joint.r[:, int(unit.nonzero()[0])] == r
+        return (joint.v[:, :2] > 0).all(1) & (joint.h1[:, 1] > 0) & seen
+
+    check_stationary(name, conditions([0, 1], [(0, 0, 1, r)], [1]), given)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_observed_relations_tell_of_the_context(name):
+    """Every relation between two classes seen, some on: h1 from chains of 20 sweeps
+    that start anywhere, against the joint; the yardstick as above, with .02 for the start."""
+    single, double = rounded(name)
+    joint = enumerate_joint(double)
+    spec, e = double.spec, joint.edges
+    seen = [(a, i, j, (a + i) % 2) for a in range(spec.A) for i in (0, 1) for j in (0, 1)]
+    where = (joint.v[:, :2] > 0).all(1)
+    for a, i, j, r in seen:
+        unit = (e.relation[0] == a) & (e.subject[0] == i) & (e.object[0] == j)
+        where &= joint.r[:, int(unit.nonzero()[0])] == r
+    p = torch.where(where, joint.p, 0.0)
+    contexts = joint.h1.long() @ (1 << torch.arange(spec.H1))
+    expected = torch.zeros(2**spec.H1).double().scatter_add(0, contexts, p / p.sum())
+    chains = SceneChains(single).given(conditions([0, 1], seen))
+    found = np.zeros(2**spec.H1)
+    for chain in range(CHAINS):
+        found[(1 << chains.draw(20, philox.stream(2, chain)).h1).sum()] += 1 / CHAINS
+    assert 0.5 * np.abs(found - expected.numpy()).sum() < 0.02 + SLACK
+
+
+# -- beside the tensors ------------------------------------------------------------------------
+
+WIDE = MachineSpec("triway", V=40, A=4, H1=70, K=6, T=900, C=3, G=3, N=24, form="local")
+
+
+@pytest.fixture(scope="module")
+def wide():
+    """Random weights, some six classes a scene."""
+    generator = torch.Generator().manual_seed(0)
+    machine = build(WIDE).requires_grad_(False)
+    keys = torch.randperm(WIDE.A * WIDE.V**2, generator=generator)[: WIDE.T].sort().values
+    triples = [keys // WIDE.V**2, keys // WIDE.V % WIDE.V, keys % WIDE.V]
+    machine.set_triples(torch.stack(triples, 1))
+    for name, parameter in machine.named_parameters():
+        scale = {"W": 0.25, "M": 0.2, "gamma": 0.3, "B": 0.2}.get(name, 0.6)
+        parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
+    machine.kappa.zero_()
+    machine.b -= machine.W.sum(1) / 2 + 2
+    machine.d -= 1
+    machine.fantasies.copy_(pack_scenes((torch.rand(24, 40, generator=generator) < 0.15).float()))
+    machine.fantasy_rooms.copy_(torch.arange(24) % 3 - 1)
+    return machine.eval()
+
+
+def torch_clamp(machine, rows, condition):
+    classes = torch.from_numpy(condition.classes).expand(rows, -1)
+    mask = torch.zeros(machine.spec.V, dtype=torch.bool)
+    mask[classes[0]] = True
+    held = torch.zeros(machine.spec.H1, dtype=torch.bool)
+    held[torch.from_numpy(condition.held)] = True
+    room = None if condition.room is None else torch.full((rows,), condition.room)
+    if not len(condition.a):
+        return mask, Clamp(v=mask, h1=held, room=room)
+    shape = (machine.spec.A, len(condition.classes), len(condition.classes))
+    observed, r = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape)
+    for a, i, j, on in zip(condition.a, condition.i, condition.j, condition.r, strict=True):
+        observed[a, i, j], r[a, i, j] = True, float(on)
+    edges = machine.edges(classes)
+    return mask, Clamp(
+        v=mask,
+        h1=held,
+        edges=edges,
+        r=r.view(1, -1).expand(rows, -1),
+        observed=observed.view(1, -1).expand(rows, -1),
+        room=room,
+    )
+
+
+CONDITIONS = {
+    "nothing": conditions(),
+    "classes": conditions([3, 17, 30]),
+    "relations": conditions([3, 17, 30], [(0, 0, 1, 1), (1, 1, 2, 1), (2, 2, 0, 0), (3, 0, 2, 1)]),
+    "context": conditions([5], held=[2, 44]),
+    "room": conditions([5], room=1),
+    "room without a fantasy": conditions([5], room=2),
+}
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_fantasies_are_weighed_as_the_tensors_weigh_them(wide, name):
+    condition, chains = CONDITIONS[name], SceneChains(wide)
+    mask, clamp = torch_clamp(wide, 1, condition)
+    expected = Fantasies(wide).log_weight(mask.float().unsqueeze(0), clamp).softmax(1)[0]
+    w = chains.weights
+    found = chain_kernels.fantasy_weights(
+        w, condition.classes, condition.held, chains.hint(condition.room)
+    )
+    np.testing.assert_allclose(np.diff(found, prepend=0), expected, atol=1e-5)
+    assert found[-1] == 1
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+@pytest.mark.parametrize("temperature", [1.0, 1.6])
+def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
+    """Means over 1,500 chains each, of every class, every unit and the number of relations of each
+    kind: 114 differences within 5.5 standard errors fail by chance with probability 5e-6."""
+    condition, rows = CONDITIONS[name], 1500
+    mask, clamp = torch_clamp(wide, rows, condition)
+    generator = torch.Generator().manual_seed(0)
+    state = Fantasies(wide).start(mask.float().repeat(rows, 1), generator, clamp)
+    tempered = wide.scaled(1 / temperature)
+    state = run(tempered, state, generator, 5, clamp, relations=False)
+    state = run(tempered, state, generator, 1, clamp)
+    grid = state.edges.unflatten(state.r * state.edges.ends_present(state.v))
+    off = state.edges.subjects.unsqueeze(2) != state.edges.subjects.unsqueeze(1)
+    counts = (grid * off.unsqueeze(1)).sum((2, 3))
+    expected = torch.cat([state.v, state.h1, counts], 1).double().numpy()
+    chains = SceneChains(wide).given(condition, temperature)
+    found = np.zeros_like(expected)
+    for chain, row in enumerate(found):
+        drawn = chains.draw(6, philox.stream(9, chain))
+        row[drawn.classes] = 1
+        row[40 + drawn.h1] = 1
+        row[110:] = drawn.r.sum((1, 2)) - np.trace(drawn.r, axis1=1, axis2=2)
+    error = np.sqrt((found.var(0) + expected.var(0)) / rows) + 1e-9
+    assert (np.abs(found.mean(0) - expected.mean(0)) <= 5.5 * error + 1e-9).all()
+    assert (found[:, condition.classes] == 1).all()
+    assert (found[:, 40 + condition.held] == 1).all()
+
+
+def test_relations_that_imply_each_other_are_drawn_as_by_tensors():
+    """Three classes, one relation, strong implications: the law of its six units from 40,000 draws
+    each. Two samples: total variation within its mean and 1e-9 of McDiarmid."""
+    rows = 40_000
+    spec = MachineSpec("triway", V=3, A=1, H1=3, K=2, G=2, form="local")
+    generator = torch.Generator().manual_seed(4)
+    machine = build(spec).requires_grad_(False)
+    for parameter in machine.parameters():
+        parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    machine.kappa.zero_()
+    v, h1 = torch.ones(rows, 3), torch.tensor([[1.0, 0, 1]]).expand(rows, -1)
+    _, r = sample_relations(machine, v, h1, generator)
+    chains = SceneChains(machine)
+    w, nothing = chains.weights, chains.given(conditions())
+    classes = np.arange(3)
+    logits = chain_kernels.relation_logits(w, classes, np.array([1, 0, 1], np.uint8))
+    off = ~np.eye(3, dtype=bool)
+    bits = 1 << np.arange(6)
+    expected = np.bincount(r.view(-1, 3, 3).numpy()[:, off].astype(int) @ bits, minlength=64) / rows
+    found = np.zeros(64)
+    for chain in range(rows):
+        stream = philox.stream(0, chain)
+        drawn = chain_kernels.relations(
+            w, nothing.bias, classes, logits, nothing.observed, np.float32(1), stream
+        )
+        found[drawn[0][off] @ bits] += 1 / rows
+    mean = 0.5 * np.sqrt(4 * expected * (1 - expected) / (math.pi * rows)).sum()
+    slack = math.sqrt(9 * math.log(10) / rows)
+    assert 0.5 * np.abs(found - expected).sum() < 1.1 * mean + slack
+    # The test could not pass without implications.
+    alone = 1 / (1 + np.exp(-logits[0][off]))
+    independent = np.array(
+        [np.prod(np.where(row >> np.arange(6) & 1, alone, 1 - alone)) for row in range(64)]
+    )
+    assert 0.5 * np.abs(found - independent).sum() > 3 * (mean + slack)
+
+
+def test_logits_are_those_of_the_machine(wide):
+    chains = SceneChains(wide)
+    drawn = chains.given(conditions([3, 17, 30])).draw(3, philox.stream(0, 0))
+    v, h1 = torch.zeros(1, 40), torch.zeros(1, 70)
+    v[0, drawn.classes], h1[0, drawn.h1] = 1, 1
+    edges = wide.edges(present_classes(v))
+    expected = edges.unflatten(wide.relation_logits(edges, v, h1))[0]
+    np.testing.assert_allclose(drawn.logits, expected, atol=1e-4)
+
+
+def test_other_machines_are_refused():
+    for name in ("rbm", "triway-seed", "triway-local-two-layers", "triway-local"):
+        machine = small_machine(name)  # float64
+        assert not SceneChains.fits(machine)
+        with pytest.raises(ValueError, match="one layer in float32"):
+            SceneChains(machine)
