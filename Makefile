@@ -4,7 +4,7 @@ PORT ?= 8000
 PYTHON ?= python3
 # The index for CPU builds of torch, where the default index would bring a CUDA build. See README.md.
 TORCH_INDEX_URL ?=
-# Further arguments for pytest, the benchmarks or the lock's resolver: make test ARGS="-k geometry".
+# Further arguments for pytest, the audit, the benchmarks or the lock's resolver: make test ARGS="-k geometry".
 ARGS ?=
 
 VENV := .venv
@@ -18,7 +18,7 @@ SERVICE := $(VENV)/.installed-service
 EVERYTHING := $(VENV)/.installed-everything
 
 .DEFAULT_GOAL := help
-.PHONY: help run test setup format bench lock clean
+.PHONY: help run test audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -33,6 +33,9 @@ test: $(EVERYTHING)  ## lint, format, types, import rules, then the tests
 	$(BIN)/python -m mypy --no-error-summary
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python -m pytest --numprocesses auto --dist loadscope $(ARGS)
+
+audit: $(EVERYTHING)  ## known vulnerabilities, risky code, bills of materials (build/)
+	$(BIN)/python scripts/audit.py $(ARGS)
 
 setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need
 

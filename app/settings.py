@@ -6,9 +6,10 @@ import os
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
-from pydantic import BeforeValidator, Field, SecretStr, field_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import BeforeValidator, Field, SecretStr, ValidationInfo, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 MAX_OBJECTS = 256
 """The contract's limit on objects in one scene; settings may lower it, never raise it."""
@@ -27,6 +28,24 @@ def _is_installed(module: str) -> bool:
 
 def _lower(value: object) -> object:
     return value.strip().lower() if isinstance(value, str) else value
+
+
+def _words(value: object) -> object:
+    return tuple(value.replace(",", " ").split()) if isinstance(value, str) else value
+
+
+def _is_origin(text: str) -> bool:
+    """Whether a browser would send this text, to the letter, as the origin of a page."""
+    try:
+        parts = urlsplit(text)
+        port = parts.port
+    except ValueError:
+        return False
+    if parts.scheme not in {"http", "https"} or not parts.hostname or "*" in parts.hostname:
+        return False
+    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+    usual = {"http": 80, "https": 443}[parts.scheme]
+    return text == f"{parts.scheme}://{host}" + ("" if port in {None, usual} else f":{port}")
 
 
 class Settings(BaseSettings):
@@ -57,6 +76,22 @@ class Settings(BaseSettings):
             description="key of the admin routes, at least 16 characters; without it they are off"
         ),
     ] = None
+    api_key: Annotated[
+        SecretStr | None,
+        Field(
+            description="key of every route but health and pages, at least 16 characters and not "
+            "the admin key; without it those routes are open"
+        ),
+    ] = None
+    cors_origins: Annotated[
+        tuple[str, ...],
+        NoDecode,
+        BeforeValidator(_words),
+        Field(
+            description="origins whose pages a browser lets read answers, as in "
+            "`https://panel.example:8443`, parted by commas; none by default"
+        ),
+    ] = ()
     max_body_bytes: Annotated[
         int, Field(ge=1024, le=64 * 2**20, description="largest request body")
     ] = 2 * 2**20
@@ -107,6 +142,11 @@ class Settings(BaseSettings):
         """Seconds from SIGTERM until the process ends, at most."""
         return self.drain_seconds + self.drain_timeout + 1.0
 
+    @property
+    def secrets(self) -> list[str]:
+        """What no log may hold."""
+        return [key.get_secret_value() for key in (self.admin_key, self.api_key) if key]
+
     @field_validator("store")
     @classmethod
     def _is_directory(cls, value: Path) -> Path:
@@ -129,15 +169,37 @@ class Settings(BaseSettings):
             raise ValueError(f"SCENE_OPENTELEMETRY needs {_ENDPOINTS[0]}, the collector's URL")
         return value
 
-    @field_validator("admin_key")
+    @field_validator("admin_key", "api_key")
     @classmethod
-    def _is_strong(cls, value: SecretStr | None) -> SecretStr | None:
+    def _is_strong(cls, value: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
         if value is None:
             return None
         key = value.get_secret_value()
         # The key travels in a header, so it must survive one; a short one can be tried out.
         if len(key) < 16 or not (key.isascii() and key.isprintable()) or " " in key:
             raise ValueError(
-                "SCENE_ADMIN_KEY must have at least 16 printable ASCII characters and no space"
+                f"SCENE_{str(info.field_name).upper()} must have at least 16 printable ASCII "
+                "characters and no space"
+            )
+        return value
+
+    @field_validator("api_key")
+    @classmethod
+    def _is_not_the_admin_key(
+        cls, value: SecretStr | None, info: ValidationInfo
+    ) -> SecretStr | None:
+        if value is not None and value == info.data.get("admin_key"):
+            raise ValueError(
+                "SCENE_API_KEY must differ from SCENE_ADMIN_KEY: clients are no administrators"
+            )
+        return value
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _are_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if not all(map(_is_origin, value)):
+            raise ValueError(
+                "SCENE_CORS_ORIGINS must list origins as browsers send them: http or https, host "
+                "in lower case, port where it is not the usual one, no path and no wildcard"
             )
         return value

@@ -29,7 +29,7 @@ def build(
     """The application that answers for ``runtime``.
 
     Args:
-        settings: limits, admin key, pages.
+        settings: limits, keys, origins, pages.
         runtime: what answers.
         lifespan: starts and stops it.
         **metadata: title, description and version for the documentation.

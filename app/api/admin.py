@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hmac
 from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
@@ -11,18 +10,16 @@ from fastapi.security import APIKeyHeader, HTTPBearer
 from starlette.requests import Request
 from starlette.responses import Response
 
-from app.api import catalogue
+from app.api import catalogue, keys
 from app.api.body import JSONRoute
 from app.api.problems import ProblemError
 from app.settings import Settings
 
-_HEADER: Final = "X-Admin-Key"
-
 # For the documentation alone, where they make the routes usable: dependencies are resolved after
 # the body has been read, and a stranger's body is not to be read.
 SCHEMES: Final = [
-    Security(APIKeyHeader(name=_HEADER, scheme_name="admin key", auto_error=False)),
-    Security(HTTPBearer(scheme_name="admin key as bearer token", auto_error=False)),
+    Security(APIKeyHeader(name=keys.ADMIN_KEY, scheme_name="admin-key", auto_error=False)),
+    Security(HTTPBearer(scheme_name="admin-key-as-bearer-token", auto_error=False)),
 ]
 
 
@@ -33,12 +30,7 @@ def check(request: Request) -> None:
         ProblemError: of kind `catalogue.UNAUTHORIZED`, also where no key is configured.
     """
     settings: Settings = request.app.state.settings
-    scheme, _, token = request.headers.get("authorization", "").partition(" ")
-    given = request.headers.get(_HEADER) or (token.strip() if scheme.lower() == "bearer" else "")
-    expected = settings.admin_key.get_secret_value() if settings.admin_key else ""
-    # In constant time, and first: neither the key nor whether there is one shows in the clock.
-    equal = hmac.compare_digest(given.encode(), expected.encode())
-    if not (equal and expected):
+    if not keys.carries(request.headers, keys.ADMIN_KEY, settings.admin_key):
         raise ProblemError(
             catalogue.UNAUTHORIZED,
             "This route needs the service's admin key.",

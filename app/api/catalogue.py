@@ -46,9 +46,18 @@ BAD_REQUEST: Final = ProblemType(
 UNAUTHORIZED: Final = ProblemType(
     "unauthorized",
     401,
-    "A valid admin key is required",
-    "Send the key as X-Admin-Key, or as Authorization: Bearer. A service that was started without "
-    "SCENE_ADMIN_KEY refuses every key.",
+    "A valid key is required",
+    "Administration needs the admin key, as X-Admin-Key or as Authorization: Bearer; a service "
+    "that was started without SCENE_ADMIN_KEY refuses every one. A service that was started with "
+    "SCENE_API_KEY asks for that key on every other route, as X-API-Key or as Authorization: "
+    "Bearer, but for health and pages such as this.",
+)
+ORIGIN_REFUSED: Final = ProblemType(
+    "origin-refused",
+    403,
+    "Pages of this origin may not ask this",
+    "A browser asked whether a page from elsewhere may send a request. Origins are allowed by "
+    "SCENE_CORS_ORIGINS, and they may ask questions and read; administration is not for pages.",
 )
 NOT_FOUND: Final = ProblemType(
     "not-found",
@@ -186,6 +195,7 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         NOT_JSON,
         BAD_REQUEST,
         UNAUTHORIZED,
+        ORIGIN_REFUSED,
         NOT_FOUND,
         MODEL_NOT_FOUND,
         METHOD_NOT_ALLOWED,

@@ -1,4 +1,4 @@
-"""Plain ASGI middleware: request ids, access lines and metrics, and the limit on bodies.
+"""Plain ASGI middleware: ids, log lines and metrics, headers, origins, defects, keys, body sizes.
 
 None of it derives from `BaseHTTPMiddleware`, three of which cost three quarters of the throughput.
 """
@@ -13,12 +13,15 @@ from collections.abc import Callable
 from typing import Final
 
 from fastapi import FastAPI
+from pydantic import SecretStr
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import Request
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api import catalogue
-from app.api.problems import ProblemError, respond
+from app.api import catalogue, keys
+from app.api.problems import ProblemError, from_exception, report_defect, respond
 from app.api.turnstile import Turnstile
 from app.serving.metrics import Metrics
 from app.serving.record import SUCCESS, RequestRecord
@@ -45,7 +48,7 @@ def install(
     metrics: Metrics,
     is_draining: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Add all of it to an application.
+    """Add all of it to an application, from the inside out.
 
     Args:
         is_draining: whether nothing new is to be begun.
@@ -57,7 +60,14 @@ def install(
         timeout=settings.request_timeout_ms / 1e3,
         is_draining=is_draining,
     )
-    # Added last, so outermost: an answer of those above carries the id as well.
+    # Outside these: a stranger's request takes no place, and not even its size is judged.
+    if settings.api_key is not None:
+        app.add_middleware(KeyGuard, api_key=settings.api_key, admin_key=settings.admin_key)
+    # Inside of all that adds to answers: those of defects carry id and headers as any other.
+    app.add_middleware(Defects)
+    if settings.cors_origins:
+        app.add_middleware(CrossOrigin, origins=settings.cors_origins)
+    app.add_middleware(SafeHeaders)
     app.add_middleware(RequestContext, metrics=metrics, access_log=settings.access_log)
 
 
@@ -133,6 +143,152 @@ class RequestContext:
 def _route(scope: Scope) -> str:
     """The template of the route that answered: what was asked may hold anything."""
     return getattr(scope.get("route"), "path", "-")
+
+
+class SafeHeaders:
+    """Tells browsers to take answers for what they are and to keep none of what was computed.
+
+    What an answer says for itself stands: pages have a policy of their own, and files, which have
+    an entity tag, may be kept.
+    """
+
+    _ALWAYS: Final = (
+        (b"x-content-type-options", b"nosniff"),
+        (b"referrer-policy", b"no-referrer"),
+    )
+    _POLICY: Final = (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'")
+    _NOT_KEPT: Final = (b"cache-control", b"no-store")
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = [*message.get("headers", ()), *self._ALWAYS]
+                names = {name for name, _ in headers}
+                if b"content-security-policy" not in names:
+                    headers.append(self._POLICY)
+                if not names & {b"cache-control", b"etag"}:
+                    headers.append(self._NOT_KEPT)
+                message["headers"] = headers
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
+
+
+class CrossOrigin(CORSMiddleware):
+    """Lets pages of the listed origins ask and read, without cookies, and no others.
+
+    Args:
+        app: what answers.
+        origins: as browsers send them.
+    """
+
+    def __init__(self, app: ASGIApp, origins: tuple[str, ...]) -> None:
+        super().__init__(
+            app,
+            allow_origins=origins,
+            # Administration is for people at a terminal: a page needs neither PUT nor its key.
+            allow_methods=("GET", "POST"),
+            allow_headers=(
+                "Authorization",
+                "Content-Type",
+                keys.API_KEY,
+                "X-Request-Id",
+                "X-Request-Timeout-Ms",
+            ),
+            expose_headers=("Retry-After", "X-Request-Id"),
+        )
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        try:
+            await super().__call__(scope, receive, send)
+        except _PreflightRefusedError as refused:
+            problem = ProblemError(
+                catalogue.ORIGIN_REFUSED,
+                "The origin, the method or a header is not allowed.",
+                headers={"Vary": refused.vary},
+            )
+            await respond(Request(scope), problem)(scope, receive, send)
+
+    def preflight_response(self, request_headers: Headers) -> Response:
+        """The answer to a browser that asks first; a refusal is a problem, not plain text."""
+        answer = super().preflight_response(request_headers)
+        if answer.status_code != 200:
+            raise _PreflightRefusedError(answer.headers["vary"])
+        return answer
+
+
+class _PreflightRefusedError(Exception):
+    def __init__(self, vary: str) -> None:
+        super().__init__(vary)
+        self.vary = vary
+
+
+class Defects:
+    """Answers what nothing else has caught, as long as no answer has begun."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        begun = False
+
+        async def send_and_note(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self.app(scope, receive, send_and_note)
+        except Exception as error:
+            if begun:
+                # Half an answer cannot be taken back: the server breaks the connection off.
+                raise
+            request = Request(scope)
+            report_defect(error, request.state.request_id)
+            await respond(request, from_exception(error))(scope, receive, send)
+
+
+class KeyGuard:
+    """Lets through what is open, and who carries the API key or the admin key.
+
+    The admin routes ask for the admin key once more: here it only opens the door.
+    """
+
+    def __init__(self, app: ASGIApp, *, api_key: SecretStr, admin_key: SecretStr | None) -> None:
+        self.app = app
+        self.api_key = api_key
+        self.admin_key = admin_key
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] == "lifespan" or keys.is_open(scope) or self._may_enter(scope):
+            await self.app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            # Before it is accepted: the server answers the handshake with 403.
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            problem = ProblemError(
+                catalogue.UNAUTHORIZED,
+                "This service needs its API key, or for administration its admin key.",
+                headers={"WWW-Authenticate": "Bearer"},
+            )
+            await respond(Request(scope), problem)(scope, receive, send)
+
+    def _may_enter(self, scope: Scope) -> bool:
+        headers = Headers(scope=scope)
+        asks = keys.carries(headers, keys.API_KEY, self.api_key)
+        administers = keys.carries(headers, keys.ADMIN_KEY, self.admin_key)
+        return asks or administers
 
 
 class BodyLimit:

@@ -7,7 +7,7 @@ from typing import Any, Final
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
 
-from app.api import catalogue, examples
+from app.api import catalogue, examples, keys
 from app.api.catalogue import ProblemType
 from app.api.problems import MEDIA_TYPE, ProblemError
 from app.api.turnstile import MAX_TIMEOUT_MS, TIMEOUT_HEADER
@@ -42,6 +42,10 @@ _TIMEOUT_PARAMETER: Final = {
     "description": "milliseconds after which nobody waits for the answer: work that has not begun "
     "by then is dropped (504)",
     "schema": {"type": "integer", "minimum": 1, "maximum": MAX_TIMEOUT_MS},
+}
+_KEY_SCHEMES: Final = {
+    "api-key": {"type": "apiKey", "in": "header", "name": keys.API_KEY},
+    "api-key-as-bearer-token": {"type": "http", "scheme": "bearer"},
 }
 TAGS: Final = [
     {"name": "questions", "description": "The four questions about one scene."},
@@ -115,4 +119,17 @@ class DocumentedAPI(FastAPI):
                         del operation["responses"]["422"]
             schemas.pop("HTTPValidationError", None)
             schemas.pop("ValidationError", None)
+            if self.state.settings.api_key is not None:
+                _ask_for_keys(document)
         return super().openapi()
+
+
+def _ask_for_keys(document: dict[str, Any]) -> None:
+    """Say of each operation that is not open, and not for administrators, that it needs a key."""
+    document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            if path not in keys.OPEN_ROUTES and "security" not in operation:
+                operation["security"] = [{name: []} for name in _KEY_SCHEMES]
+                unauthorized = problems(catalogue.UNAUTHORIZED)[catalogue.UNAUTHORIZED.status]
+                operation["responses"][str(catalogue.UNAUTHORIZED.status)] = unauthorized

@@ -36,7 +36,7 @@ _POLICY: Final = "; ".join(
         "frame-ancestors 'none'",
     )
 )
-_HEADERS: Final = {"Content-Security-Policy": _POLICY, "X-Content-Type-Options": "nosniff"}
+_HEADERS: Final = {"Content-Security-Policy": _POLICY}
 
 _PAGE: Final = """<!doctype html>
 <html lang="en">

@@ -214,12 +214,10 @@ def respond(request: Request, problem: ProblemError) -> Response:
     headers = dict(problem.headers or {})
     if problem.status_code in (429, 503):
         headers["Retry-After"] = str(request.app.state.settings.retry_after)
-    request_id = _request_id(request)
     return Response(
-        problem.describe(request_id).model_dump_json(exclude_none=True),
+        problem.describe(_request_id(request)).model_dump_json(exclude_none=True),
         problem.status_code,
-        # The last resort answers outside every middleware, so it must add the id itself.
-        headers=headers | {"X-Request-Id": request_id},
+        headers=headers,
         media_type=MEDIA_TYPE,
     )
 
@@ -228,16 +226,15 @@ async def _handle(request: Request, error: Exception) -> Response:
     return respond(request, from_exception(error))
 
 
-async def _handle_defect(request: Request, error: Exception) -> Response:
-    report_defect(error, _request_id(request))
-    return respond(request, from_exception(error))
-
-
 Handler = Callable[[Request, Exception], Any]
 
 
 def install(app: FastAPI) -> None:
-    """Answer every failure of ``app`` with a problem, in place of the framework's own handlers."""
+    """Answer failures of ``app`` with problems, in place of the framework's own handlers.
+
+    Defects are not among them: the framework raises them again after its handler has answered, and
+    the server then drops a connection that the client has just been told it may use again.
+    `middleware.Defects` answers them.
+    """
     for kind in (HTTPException, RequestValidationError, ServingError):
         app.add_exception_handler(kind, _handle)
-    app.add_exception_handler(Exception, _handle_defect)

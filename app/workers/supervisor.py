@@ -71,7 +71,7 @@ def supervise(settings: Settings) -> int:
         "app",
         host=settings.host,
         port=settings.port,
-        log_config=log_config(settings.log_level, settings.log_format),
+        log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
     )
     # Bound and not listening: connections are refused until the first worker is ready.
     patience = Patience(drain=settings.longest_drain)

@@ -28,7 +28,7 @@ Serve = Callable[..., AbstractAsyncContextManager[httpx.AsyncClient]]
 @asynccontextmanager
 async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient]:
     """A client of the application over a store, inside its lifespan."""
-    app = create_app(Settings(store=store, admin_key=ADMIN_KEY, **settings))
+    app = create_app(Settings(store=store, **{"admin_key": ADMIN_KEY, **settings}))
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
         app.router.lifespan_context(app),
@@ -73,8 +73,10 @@ class LiveService:
     log: Path
 
 
-def launch(store: Path, log: Path, **variables: str) -> LiveService:
-    """Start ``python -m app`` on a free port and wait until it answers."""
+def launch(
+    store: Path, log: Path, *, program: tuple[str, ...] = ("-m", "app"), **variables: str
+) -> LiveService:
+    """Start ``python -m app`` (or another program) on a free port and wait until it answers."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -89,7 +91,7 @@ def launch(store: Path, log: Path, **variables: str) -> LiveService:
     }
     with log.open("w") as stream:
         process = subprocess.Popen(
-            [sys.executable, "-m", "app"], env=environment, stderr=stream, text=True
+            [sys.executable, *program], env=environment, stderr=stream, text=True
         )
     client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30)
     deadline = time.monotonic() + 60

@@ -232,3 +232,44 @@ def test_a_broken_default_lives_and_is_not_ready(tmp_path: Path) -> None:
         service.client.close()
         service.process.terminate()
         service.process.wait(timeout=30)
+
+
+# The service with a defect in one question: `python -c` in place of `python -m app`.
+DEFECTIVE = """
+import sys
+from types import SimpleNamespace
+from app.__main__ import main
+from app.serving import questions
+
+def fail(*_, **__):
+    raise ZeroDivisionError
+
+questions.reasoning = SimpleNamespace(**{**vars(questions.reasoning), "missing": fail})
+sys.exit(main())
+"""
+
+
+def test_a_connection_outlives_a_defect(shared_store: Path, tmp_path: Path) -> None:
+    service = launch(shared_store, tmp_path / "log", program=("-c", DEFECTIVE))
+    try:
+        body = json.dumps(SCENE).encode()
+        request = (
+            b"POST /missing HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+            b"Content-Length: " + str(len(body)).encode() + b"\r\n\r\n" + body
+        )
+        with socket.create_connection(("127.0.0.1", service.port), timeout=10) as connection:
+            for _ in range(3):
+                connection.sendall(request)
+                received = b""
+                while not received.endswith(b"}"):
+                    chunk = connection.recv(65536)
+                    assert chunk, "the connection was dropped, and its client was not told"
+                    received += chunk
+                assert received.startswith(b"HTTP/1.1 500")
+                assert b"/problems/internal-error" in received
+        # Each is in the log once, under its id.
+        assert service.log.read_text().count("ZeroDivisionError") == 3
+    finally:
+        service.client.close()
+        service.process.terminate()
+        service.process.wait(timeout=30)

@@ -448,6 +448,36 @@ async def test_chunked_bodies_over_the_limit_are_refused(shared_store: Path) -> 
         assert response.status_code == 200
 
 
+# ------------------------------------------------------------------------------ broken bodies
+
+
+@pytest.mark.parametrize("path", ["/relations", "/generate", "/missing/batch"])
+async def test_a_body_that_breaks_off_is_no_request(client: httpx.AsyncClient, path: str) -> None:
+    messages: list[dict[str, Any]] = [
+        {"type": "http.request", "body": b'{"objects": [', "more_body": True},
+        {"type": "http.disconnect"},
+    ]
+    sent: list[Any] = []
+
+    async def receive() -> dict[str, Any]:
+        return messages.pop(0)
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    scope = {
+        "type": "http",
+        "method": "POST",
+        "path": path,
+        "query_string": b"",
+        "headers": [(b"content-type", b"application/json"), (b"content-length", b"99")],
+    }
+    await client.app(scope, receive, send)  # type: ignore[attr-defined]
+    start, body = sent
+    response = httpx.Response(start["status"], headers=start["headers"], content=body["body"])
+    problem(response, 400, "bad-request")
+
+
 # --------------------------------------------------------------------------------- request ids
 
 
@@ -533,6 +563,16 @@ async def test_every_problem_type_has_a_page(client: httpx.AsyncClient) -> None:
         assert page.headers["content-type"].startswith("text/html")
         assert re.escape(str(kind.status)) in page.text
         assert f'href="problems/{slug}"' in index
+
+
+def test_every_problem_type_is_provoked_by_a_test() -> None:
+    # As in `problem(response, 404, "not-found")`, here and beside.
+    checked = {
+        (slug, int(status))
+        for file in Path(__file__).parent.glob("test_*.py")
+        for status, slug in re.findall(r'\b(\d{3}),\s*"([a-z-]+)"\)', file.read_text("utf-8"))
+    }
+    assert {(slug, kind.status) for slug, kind in PROBLEM_TYPES.items()} <= checked
 
 
 # --------------------------------------------------------------------------------- any input

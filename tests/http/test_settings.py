@@ -7,12 +7,13 @@ import logging
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
-from app.serving.logs import JSONFormatter, log_config
+from app.serving.logs import JSONFormatter, PlainFormatter, log_config
 from app.settings import Settings
 
 
@@ -27,6 +28,8 @@ def test_the_defaults_are_safe(tmp_path: Path) -> None:
     settings = Settings(store=tmp_path)
     assert settings.host == "127.0.0.1"
     assert settings.admin_key is None
+    assert settings.api_key is None
+    assert settings.cors_origins == ()
     assert settings.max_objects == 256
     assert settings.workers == 1
 
@@ -61,6 +64,20 @@ def test_settings_come_from_the_environment(
         ("admin_key", "too-short"),
         ("admin_key", "has spaces in between"),
         ("admin_key", "sixteen-chars-é-no"),
+        ("api_key", "too-short"),
+        ("api_key", "has spaces in between"),
+        ("cors_origins", "*"),
+        ("cors_origins", "null"),
+        ("cors_origins", "https://*.example"),
+        ("cors_origins", "panel.example"),
+        ("cors_origins", "https://panel.example/"),
+        ("cors_origins", "https://panel.example/path"),
+        ("cors_origins", "https://Panel.example"),
+        ("cors_origins", "https://user@panel.example"),
+        ("cors_origins", "https://panel.example:443"),
+        ("cors_origins", "https://panel.example:port"),
+        ("cors_origins", "ftp://panel.example"),
+        ("cors_origins", "https://good.example, https://bad.example/"),
         ("max_body_bytes", 0),
         ("max_body_bytes", 2**40),
         ("max_objects", 0),
@@ -81,8 +98,28 @@ def test_nonsense_is_refused(tmp_path: Path, name: str, value: object) -> None:
         Settings(**{"store": tmp_path, name: value})
     (fault,) = error.value.errors()
     assert fault["loc"] == (name,)
-    if name == "admin_key":
+    if name.endswith("_key"):
         assert str(value) not in str(error.value)
+        assert f"SCENE_{name.upper()}" in fault["msg"]
+
+
+def test_the_two_keys_differ(tmp_path: Path) -> None:
+    key = "0123456789abcdef"
+    with pytest.raises(ValidationError, match="SCENE_API_KEY must differ") as error:
+        Settings(store=tmp_path, admin_key=key, api_key=key)
+    assert key not in str(error.value)
+    assert Settings(store=tmp_path, admin_key=key, api_key=key + "x").secrets == [key, key + "x"]
+
+
+def test_origins_are_listed_as_browsers_send_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCENE_STORE", str(tmp_path))
+    assert Settings().cors_origins == ()
+    origins = ("https://panel.example", "http://10.0.0.7:8080", "http://[::1]:3000")
+    for between in (",", ", ", " "):
+        monkeypatch.setenv("SCENE_CORS_ORIGINS", between.join(origins))
+        assert Settings().cors_origins == origins
 
 
 def test_a_store_that_is_a_file_is_refused(tmp_path: Path) -> None:
@@ -119,4 +156,32 @@ def test_log_lines_are_json() -> None:
 def test_the_log_configuration_is_one(style: str) -> None:
     config = log_config("info", style)  # type: ignore[arg-type]
     assert config["handlers"]["stderr"]["formatter"] == style
-    assert config["root"]["level"] == "INFO"
+    assert logging.getLevelName(config["root"]["level"]) == "INFO"
+
+
+@pytest.mark.parametrize(
+    ("level", "of_libraries"), [("debug", "INFO"), ("info", "INFO"), ("error", "ERROR")]
+)
+def test_libraries_tell_nothing_below_info(level: str, of_libraries: str) -> None:
+    config = log_config(level, "json")
+    assert config["loggers"]["app"]["level"] == level.upper()
+    assert logging.getLevelName(config["root"]["level"]) == of_libraries
+
+
+@pytest.mark.parametrize("secret", ["0123456789abcdef", 'quote"and\\backslash'])
+@pytest.mark.parametrize("kind", [JSONFormatter, PlainFormatter])
+def test_secrets_are_masked_wherever_they_turn_up(
+    kind: Callable[[list[str]], logging.Formatter], secret: str
+) -> None:
+    try:
+        raise ValueError(f"no {secret} here")
+    except ValueError:
+        record = logging.LogRecord(
+            "app", logging.ERROR, "file", 1, "it was %s", (secret,), sys.exc_info()
+        )
+    line = kind([secret]).format(record)
+    assert "it was **********" in line
+    assert "no ********** here" in line
+    assert secret not in line
+    if kind is JSONFormatter:
+        assert secret not in json.dumps(json.loads(line))

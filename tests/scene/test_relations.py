@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,6 +14,7 @@ from app.scene.relations import (
     contradiction,
     opposite,
 )
+from app.schemas import RelationName
 
 relations = st.sampled_from(RELATIONS)
 
@@ -20,6 +23,10 @@ def test_the_eight_relations() -> None:
     assert CANONICAL == ("left", "front", "on-top", "above")
     assert (*CANONICAL, "right", "behind", "under", "below") == RELATIONS
     assert {name: opposite(name) for name in CANONICAL} == OPPOSITES
+
+
+def test_requests_speak_of_the_same_relations() -> None:
+    assert set(get_args(RelationName)) == set(RELATIONS)
 
 
 @given(relations)

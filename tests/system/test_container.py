@@ -98,6 +98,36 @@ def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     assert service["cap_drop"] == ["ALL"]
     assert "no-new-privileges:true" in service["security_opt"]
     assert {"memory", "pids"} <= service["deploy"]["resources"]["limits"].keys()
+    assert not {"privileged", "cap_add", "devices", "pid", "ipc", "network_mode"} & service.keys()
+    assert all("/var/run" not in volume for volume in service["volumes"])
+
+
+@pytest.mark.parametrize("name", ["scene", "train"])
+def test_what_services_write_is_bounded(compose: dict[str, Any], name: str) -> None:
+    service = compose["services"][name]
+    assert service["logging"]["driver"] == "json-file"
+    assert {"max-size", "max-file"} <= service["logging"]["options"].keys()
+    (temporary,) = service["tmpfs"]
+    assert {"noexec", "nosuid", "nodev"} <= set(temporary.partition(":")[2].split(","))
+    assert re.search(r"\bsize=\d+m\b", temporary)
+
+
+def test_the_service_is_watched_and_its_own_files_are_not_its_to_change(
+    stages: dict[str, list[Instruction]], compose: dict[str, Any]
+) -> None:
+    assert {"interval", "timeout", "retries"} <= compose["services"]["scene"]["healthcheck"].keys()
+    owned = [i.argument for i in stages["runtime"] if "chown" in i.flags]
+    assert owned == ["model_store ./model_store"]
+
+
+def test_keys_come_from_the_caller_and_stand_in_no_file(
+    stages: dict[str, list[Instruction]], compose: dict[str, Any]
+) -> None:
+    environment = compose["services"]["scene"]["environment"]
+    for key in ("SCENE_ADMIN_KEY", "SCENE_API_KEY"):
+        assert key in environment
+        assert environment[key] is None
+        assert not any(key in i.argument for stage in stages.values() for i in stage)
 
 
 def test_nothing_is_published_beyond_this_machine_unless_asked(compose: dict[str, Any]) -> None:

@@ -1,0 +1,88 @@
+"""What every answer tells a browser about itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import pytest
+
+from app.serving import questions
+from tests.http.conftest import LiveService
+
+pytestmark = pytest.mark.anyio
+
+NOTHING = "default-src 'none'; frame-ancestors 'none'"
+COMPUTED = [
+    ("POST", "/relations", {"objects": ["bed"]}),
+    ("POST", "/missing/batch", {"scenes": [{"objects": ["bed"]}]}),
+    ("GET", "/models", None),
+    ("GET", "/models/default/vocabulary", None),
+    ("GET", "/health/live", None),
+    ("GET", "/openapi.json", None),
+    ("POST", "/relations", {"objects": []}),
+    ("POST", "/models/refresh", None),
+    ("GET", "/nowhere", None),
+    ("GET", "/static/nowhere", None),
+    ("DELETE", "/relations", None),
+]
+
+
+def check(response: httpx.Response) -> None:
+    """What holds for every answer."""
+    assert response.headers["x-content-type-options"] == "nosniff"
+    assert response.headers["referrer-policy"] == "no-referrer"
+    assert "frame-ancestors 'none'" in response.headers["content-security-policy"]
+    assert "server" not in response.headers
+    assert "x-powered-by" not in response.headers
+    # One of each: a browser joins two policies, and two cache rules contradict each other.
+    names = [name for name, _ in response.headers.raw]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize(("method", "path", "body"), COMPUTED)
+async def test_what_is_computed_is_kept_nowhere_and_is_no_page(
+    client: httpx.AsyncClient, method: str, path: str, body: Any
+) -> None:
+    response = await client.request(method, path, json=body)
+    check(response)
+    assert response.headers["cache-control"] == "no-store"
+    assert response.headers["content-security-policy"] == NOTHING
+
+
+async def test_a_defect_is_answered_with_the_same_headers(
+    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(questions.reasoning, "missing", fail)
+    response = await client.post("/missing", json={"objects": ["bed"]})
+    assert response.status_code == 500
+    check(response)
+    assert response.headers["cache-control"] == "no-store"
+    assert response.headers["content-security-policy"] == NOTHING
+
+
+@pytest.mark.parametrize("path", ["/docs", "/redoc", "/problems", "/problems/not-json"])
+async def test_pages_keep_their_own_policy(client: httpx.AsyncClient, path: str) -> None:
+    response = await client.get(path)
+    check(response)
+    assert "script-src 'self'" in response.headers["content-security-policy"]
+
+
+@pytest.mark.parametrize("path", ["/static/pages.css", "/docs/swagger-ui-bundle.js"])
+async def test_files_may_be_kept(client: httpx.AsyncClient, path: str) -> None:
+    response = await client.get(path)
+    check(response)
+    assert "cache-control" not in response.headers
+    tag = {"If-None-Match": response.headers["etag"]}
+    again = await client.get(path, headers=tag)
+    assert again.status_code == 304
+    check(again)
+
+
+@pytest.mark.system
+def test_the_server_does_not_name_itself(live: LiveService) -> None:
+    for path in ("/health/live", "/docs", "/nowhere"):
+        check(live.client.get(path))

@@ -1,0 +1,234 @@
+"""The API key: asked for wherever it is not said to be needless, before anything is read."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from app.api import keys
+from tests.http.conftest import ADMIN_KEY, serve
+from tests.http.test_documentation import operations
+from tests.http.test_problems import problem
+
+pytestmark = pytest.mark.anyio
+
+API_KEY = "incorrect-zebra-capacitor-nail"
+# Said once more, so that a route is opened on purpose or not at all.
+OPEN_OPERATIONS = {"/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"}
+PAGES = [
+    "/",
+    "/docs",
+    "/docs/swagger-ui.css",
+    "/redoc",
+    "/redoc/redoc.standalone.js",
+    "/openapi.json",
+    "/problems",
+    "/problems/unauthorized",
+    "/static/pages.css",
+]
+SCENE = {"objects": ["bed", "lamp"]}
+
+
+@pytest.fixture(scope="module")
+async def guarded(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
+    """A client, without a key, of a service that asks for one."""
+    async with serve(shared_store, api_key=API_KEY) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+async def document(guarded: httpx.AsyncClient) -> dict[str, Any]:
+    document: dict[str, Any] = (await guarded.get("/openapi.json")).json()
+    return document
+
+
+async def test_every_operation_but_health_needs_a_key(
+    guarded: httpx.AsyncClient, document: dict[str, Any]
+) -> None:
+    assert len(document["paths"]) > len(OPEN_OPERATIONS)
+    for method, path, _ in operations(document):
+        response = await guarded.request(method, path)
+        if path in OPEN_OPERATIONS:
+            assert response.status_code == 200, path
+        else:
+            problem(response, 401, "unauthorized")
+            assert response.headers["www-authenticate"] == "Bearer"
+
+
+@pytest.mark.parametrize("path", PAGES)
+async def test_pages_need_no_key(guarded: httpx.AsyncClient, path: str) -> None:
+    assert (await guarded.get(path)).status_code in {200, 307}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/nowhere",
+        "/metrics",
+        "//health/live",
+        "/health/live/",
+        "/health/live/../../models",
+        "/health",
+        "/Health/live",
+        "/v2/models/default/ready",
+        "/static",
+        "/docsx",
+        "/openapi.json/x",
+    ],
+)
+async def test_what_is_not_listed_needs_a_key(guarded: httpx.AsyncClient, path: str) -> None:
+    problem(await guarded.get(path), 401, "unauthorized")
+
+
+@pytest.mark.parametrize(
+    "folder", ["/static/%2e%2e", "/docs/%2e%2e", "/problems/%2e%2e", "/static//", "/redoc/."]
+)
+async def test_an_open_folder_leads_nowhere_else(guarded: httpx.AsyncClient, folder: str) -> None:
+    # Dots are encoded, or the client would resolve them before it asks.
+    for path in ("models", "relations", "v2/models/default"):
+        problem(await guarded.get(f"{folder}/{path}"), 404, "not-found")
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"X-API-Key": ""},
+        {"X-API-Key": "wrong"},
+        {"X-API-Key": API_KEY[:-1]},
+        {"X-API-Key": API_KEY + "x"},
+        {"X-API-Key": "é".encode()},
+        {"X-API-Key": ADMIN_KEY},
+        {"X-Admin-Key": API_KEY},
+        {"Authorization": API_KEY},
+        {"Authorization": f"Basic {API_KEY}"},
+        {"Authorization": "Bearer "},
+        {"Cookie": f"X-API-Key={API_KEY}"},
+    ],
+)
+async def test_other_keys_are_refused(guarded: httpx.AsyncClient, headers: Any) -> None:
+    problem(await guarded.post("/relations", json=SCENE, headers=headers), 401, "unauthorized")
+
+
+async def test_a_key_in_the_address_is_none(guarded: httpx.AsyncClient) -> None:
+    # Addresses end up in histories and in the logs of proxies.
+    response = await guarded.post(f"/relations?api_key={API_KEY}", json=SCENE)
+    problem(response, 401, "unauthorized")
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"X-API-Key": API_KEY},
+        {"Authorization": f"Bearer {API_KEY}"},
+        {"Authorization": f"bearer {API_KEY}"},
+        {"X-Admin-Key": ADMIN_KEY},
+        {"Authorization": f"Bearer {ADMIN_KEY}"},
+    ],
+)
+async def test_either_key_opens_questions(guarded: httpx.AsyncClient, headers: Any) -> None:
+    assert (await guarded.post("/relations", json=SCENE, headers=headers)).status_code == 200
+    assert (await guarded.get("/models", headers=headers)).status_code == 200
+
+
+async def test_administration_needs_the_admin_key_and_no_other(
+    guarded: httpx.AsyncClient,
+) -> None:
+    api = {"X-API-Key": API_KEY}
+    bearer = {"Authorization": f"Bearer {ADMIN_KEY}"}
+    for headers in (api, {"Authorization": f"Bearer {API_KEY}"}):
+        problem(await guarded.post("/models/refresh", headers=headers), 401, "unauthorized")
+    for headers in ({"X-Admin-Key": ADMIN_KEY}, bearer, api | bearer):
+        assert (await guarded.post("/models/refresh", headers=headers)).status_code == 200
+
+
+async def test_without_an_admin_key_no_key_administers(shared_store: Path) -> None:
+    async with serve(shared_store, api_key=API_KEY, admin_key=None) as client:
+        for headers in ({}, {"X-Admin-Key": ""}, {"X-API-Key": API_KEY}, {"X-Admin-Key": "None"}):
+            response = await client.post("/models/refresh", headers=headers)
+            problem(response, 401, "unauthorized")
+
+
+async def test_of_a_strangers_body_nothing_is_read(guarded: httpx.AsyncClient) -> None:
+    async def body() -> AsyncIterator[bytes]:
+        nonlocal read
+        read = True
+        yield b"{"
+
+    for path in ("/relations", "/models/aliases/default"):
+        read = False
+        method = "PUT" if "aliases" in path else "POST"
+        response = await guarded.request(method, path, content=body())
+        problem(response, 401, "unauthorized")
+        assert not read
+    # And no size is judged: who may not ask is told so first.
+    headers = {"Content-Length": "999999999"}
+    response = await guarded.post("/relations", content=b"", headers=headers)
+    problem(response, 401, "unauthorized")
+
+
+async def test_behind_a_prefix_the_same_is_open(shared_store: Path) -> None:
+    async with serve(shared_store, api_key=API_KEY) as client:
+        transport = httpx.ASGITransport(
+            client.app,  # type: ignore[attr-defined]
+            raise_app_exceptions=False,
+            root_path="/robot",
+        )
+        async with httpx.AsyncClient(transport=transport, base_url="http://service") as behind:
+            assert (await behind.get("/robot/health/live")).status_code == 200
+            problem(await behind.get("/robot/models"), 401, "unauthorized")
+            problem(await behind.get("/robot/static"), 401, "unauthorized")
+            headers = {"X-API-Key": API_KEY}
+            assert (await behind.get("/robot/models", headers=headers)).status_code == 200
+
+
+async def test_a_websocket_without_a_key_is_closed_before_it_opens(
+    guarded: httpx.AsyncClient,
+) -> None:
+    sent: list[dict[str, Any]] = []
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "websocket.connect"}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    scope = {"type": "websocket", "path": "/stream", "headers": [], "query_string": b""}
+    await guarded.app(scope, receive, send)  # type: ignore[attr-defined]
+    assert sent == [{"type": "websocket.close", "code": 1008}]
+
+
+# ------------------------------------------------------------------------------------ OpenAPI
+
+
+async def test_the_document_tells_where_a_key_is_needed(document: dict[str, Any]) -> None:
+    schemes = document["components"]["securitySchemes"]
+    assert schemes["api-key"] == {"type": "apiKey", "in": "header", "name": keys.API_KEY}
+    assert schemes["api-key-as-bearer-token"] == {"type": "http", "scheme": "bearer"}
+    for _, path, operation in operations(document):
+        named = {name for entry in operation.get("security", ()) for name in entry}
+        if path in OPEN_OPERATIONS:
+            assert named == set()
+            assert "401" not in operation["responses"]
+            continue
+        administration = "administration" in operation["tags"]
+        kind = "admin-key" if administration else "api-key"
+        assert named == {kind, f"{kind}-as-bearer-token"}, path
+        assert (
+            "unauthorized"
+            in operation["responses"]["401"]["content"]["application/problem+json"]["examples"]
+        )
+
+
+async def test_without_a_key_the_document_asks_for_none(client: httpx.AsyncClient) -> None:
+    document = (await client.get("/openapi.json")).json()
+    assert set(document["components"]["securitySchemes"]) == {
+        "admin-key",
+        "admin-key-as-bearer-token",
+    }
+    for _, _, operation in operations(document):
+        assert ("security" in operation) == ("administration" in operation["tags"])

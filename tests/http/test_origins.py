@@ -1,0 +1,144 @@
+"""Pages from elsewhere: none may read an answer unless its origin is listed."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from app.serving import questions
+from tests.http.conftest import serve
+from tests.http.test_problems import problem
+
+pytestmark = pytest.mark.anyio
+
+LISTED, SECOND, OTHER = "https://panel.example", "http://10.0.0.7:8080", "https://other.example"
+API_KEY = "incorrect-zebra-capacitor-nail"
+SCENE = {"objects": ["bed", "lamp"]}
+
+
+@pytest.fixture(scope="module")
+async def shared(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
+    """A client of a service that two origins may ask."""
+    async with serve(shared_store, cors_origins=[LISTED, SECOND], max_body_bytes=2048) as client:
+        yield client
+
+
+async def preflight(
+    client: httpx.AsyncClient, origin: str, method: str = "POST", headers: str = "content-type"
+) -> httpx.Response:
+    asked = {
+        "Origin": origin,
+        "Access-Control-Request-Method": method,
+        "Access-Control-Request-Headers": headers,
+    }
+    return await client.options("/relations", headers=asked)
+
+
+def allowed(response: httpx.Response, origin: str) -> None:
+    assert response.headers["access-control-allow-origin"] == origin
+    assert "access-control-allow-credentials" not in response.headers
+    assert "Origin" in response.headers["vary"]
+
+
+async def test_by_default_no_origin_is_allowed(client: httpx.AsyncClient) -> None:
+    problem(await preflight(client, LISTED), 405, "method-not-allowed")
+    response = await client.post("/relations", json=SCENE, headers={"Origin": LISTED})
+    assert response.status_code == 200
+    assert not [name for name in response.headers if name.startswith("access-control")]
+
+
+@pytest.mark.parametrize("origin", [LISTED, SECOND])
+async def test_a_listed_origin_reads_answers(shared: httpx.AsyncClient, origin: str) -> None:
+    response = await shared.post("/relations", json=SCENE, headers={"Origin": origin})
+    assert response.status_code == 200
+    allowed(response, origin)
+    exposed = response.headers["access-control-expose-headers"].split(", ")
+    assert set(exposed) == {"X-Request-Id", "Retry-After"}
+
+
+async def test_a_listed_origin_may_ask(shared: httpx.AsyncClient) -> None:
+    for headers in ("content-type", "content-type, x-api-key", "authorization, x-request-id"):
+        response = await preflight(shared, LISTED, headers=headers)
+        assert response.status_code == 200
+        allowed(response, LISTED)
+        assert response.headers["x-request-id"]
+        assert response.headers["cache-control"] == "no-store"
+
+
+@pytest.mark.parametrize(
+    ("origin", "method", "headers"),
+    [
+        (OTHER, "POST", "content-type"),
+        ("null", "POST", "content-type"),
+        (LISTED + ".other.example", "POST", "content-type"),
+        (LISTED, "PUT", "content-type"),
+        (LISTED, "DELETE", "content-type"),
+        (LISTED, "POST", "x-admin-key"),
+        (LISTED, "POST", "x-anything"),
+    ],
+)
+async def test_what_is_not_allowed_is_refused_beforehand(
+    shared: httpx.AsyncClient, origin: str, method: str, headers: str
+) -> None:
+    response = await preflight(shared, origin, method, headers)
+    problem(response, 403, "origin-refused")
+    # Without this header a browser goes no further, and with another's it must not either.
+    assert response.headers.get("access-control-allow-origin") != origin
+    assert "Origin" in response.headers["vary"]
+
+
+async def test_another_origin_reads_nothing(shared: httpx.AsyncClient) -> None:
+    response = await shared.post("/relations", json=SCENE, headers={"Origin": OTHER})
+    assert "access-control-allow-origin" not in response.headers
+    assert "Origin" in response.headers["vary"]
+
+
+async def test_errors_can_be_read_too(
+    shared: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(questions.reasoning, "missing", fail)
+    origin = {"Origin": LISTED}
+    media = origin | {"Content-Type": "application/json"}
+    for status, response in (
+        (400, await shared.post("/relations", content=b"{", headers=media)),
+        (401, await shared.post("/models/refresh", headers=origin)),
+        (404, await shared.get("/nowhere", headers=origin)),
+        (405, await shared.get("/relations", headers=origin)),
+        (413, await shared.post("/relations", content=b" " * 4096, headers=media)),
+        (415, await shared.post("/relations", content=b"{}", headers=origin)),
+        (422, await shared.post("/relations", json={}, headers=origin)),
+        (500, await shared.post("/missing", json=SCENE, headers=origin)),
+    ):
+        assert response.status_code == status
+        allowed(response, LISTED)
+        assert response.json()["request_id"] == response.headers["x-request-id"]
+
+
+async def test_browsers_ask_beforehand_without_a_key(shared_store: Path) -> None:
+    async with serve(shared_store, cors_origins=[LISTED], api_key=API_KEY) as client:
+        response = await preflight(client, LISTED, headers="content-type, x-api-key")
+        assert response.status_code == 200
+        response = await client.post("/relations", json=SCENE, headers={"Origin": LISTED})
+        problem(response, 401, "unauthorized")
+        allowed(response, LISTED)
+        headers = {"Origin": LISTED, "X-API-Key": API_KEY}
+        response = await client.post("/relations", json=SCENE, headers=headers)
+        assert response.status_code == 200
+        allowed(response, LISTED)
+
+
+@pytest.mark.parametrize("media", ["text/plain", "application/x-www-form-urlencoded"])
+async def test_no_page_asks_without_asking_beforehand(
+    client: httpx.AsyncClient, media: str
+) -> None:
+    # The media types that a browser sends to anybody without a preflight.
+    headers = {"Origin": OTHER, "Content-Type": media}
+    response = await client.post("/relations", content=b'{"objects": ["bed"]}', headers=headers)
+    problem(response, 415, "unsupported-media-type")

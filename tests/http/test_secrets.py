@@ -1,0 +1,150 @@
+"""Keys and payloads reach no log, whatever the level and however a request fails."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from tests.http.conftest import ADMIN_KEY, LiveService, launch
+
+pytestmark = pytest.mark.system
+
+API_KEY = "incorrect-zebra-capacitor-nail"
+# What a client sends by mistake is a secret too, if perhaps of another service.
+MISTAKEN = "mistaken-walrus-umbrella-fork"
+SECRETS = (ADMIN_KEY, API_KEY, MISTAKEN)
+
+# The service with a defect whose own words quote a key: `python -c` in place of `python -m app`.
+DEFECTIVE = f"""
+import sys
+from types import SimpleNamespace
+from app.__main__ import main
+from app.serving import questions
+
+def fail(*_, **__):
+    raise ValueError("no class for {API_KEY}, {ADMIN_KEY}")
+
+# Not in the module itself, or the models would be refused when they are warmed up.
+questions.reasoning = SimpleNamespace(**{{**vars(questions.reasoning), "missing": fail}})
+sys.exit(main())
+"""
+
+
+@pytest.fixture(scope="module", params=["json", "plain"])
+def defective(
+    request: pytest.FixtureRequest, shared_store: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[LiveService]:
+    """A service that tells as much as it can be made to, and cannot say what is missing."""
+    service = launch(
+        shared_store,
+        tmp_path_factory.mktemp("defective") / "log",
+        program=("-c", DEFECTIVE),
+        SCENE_API_KEY=API_KEY,
+        SCENE_LOG_LEVEL="debug",
+        SCENE_LOG_FORMAT=request.param,
+    )
+    yield service
+    service.client.close()
+    service.process.kill()
+    service.process.wait(timeout=30)
+
+
+def stop(service: LiveService) -> str:
+    """Everything that was written, the last words included."""
+    service.process.terminate()
+    service.process.wait(timeout=30)
+    return service.log.read_text()
+
+
+def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> None:
+    client = defective.client
+    sent = [
+        {},
+        {"X-API-Key": API_KEY},
+        {"X-Admin-Key": ADMIN_KEY},
+        {"X-API-Key": MISTAKEN},
+        {"Authorization": f"Bearer {API_KEY}"},
+        {"Authorization": f"Bearer {MISTAKEN}"},
+        {"Authorization": f"Basic {MISTAKEN}"},
+        {"Cookie": f"key={MISTAKEN}"},
+        {"X-Request-Id": f"{MISTAKEN} {API_KEY}", "X-API-Key": API_KEY},
+    ]
+    statuses = set()
+    for headers in sent:
+        for key in SECRETS:
+            for method, path, body in (
+                ("GET", "/health/live", None),
+                ("GET", f"/{key}", None),
+                ("GET", f"/models/{key}?key={key}", None),
+                ("POST", f"/relations?api_key={key}", {"objects": [key], "model": key}),
+                ("POST", "/relations", {"objects": ["bed"], key: key}),
+                ("POST", "/relations", {"objects": [{"id": key, "label": "bed"}]}),
+                ("POST", "/missing", {"objects": [{"id": key, "label": "bed"}]}),
+                ("POST", "/models/refresh", None),
+                ("PUT", f"/models/aliases/{key}", {"model": key}),
+                ("DELETE", f"/relations?{key}", None),
+            ):
+                response = client.request(method, path, json=body, headers=headers)
+                statuses.add(response.status_code)
+    assert {200, 401, 404, 405, 422, 500} <= statuses
+
+    # What the server itself has a word about: handshakes, broken HTTP, clients that leave.
+    handshake = (
+        "GET /stream?key={key} HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\n"
+        "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n{header}{key}\r\n\r\n"
+    )
+    broken = "GET /{key} HTTP/1.1\r\nHost x\r\n{header}{key}\r\n\r\n"
+    left = (
+        "POST /relations HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        "{header}{key}\r\nContent-Length: 99\r\n\r\n{key}"
+    )
+    for text in (handshake, broken, left):
+        for header, key in (
+            ("X-API-Key: ", API_KEY),
+            ("X-Admin-Key: ", ADMIN_KEY),
+            ("X-API-Key: ", MISTAKEN),
+            ("Authorization: Bearer ", MISTAKEN),
+        ):
+            with socket.create_connection(("127.0.0.1", defective.port), timeout=10) as connection:
+                connection.sendall(text.format(key=key, header=header).encode())
+                if text is left:
+                    connection.shutdown(socket.SHUT_WR)
+                with suppress(ConnectionError):
+                    while connection.recv(65536):
+                        pass
+    assert client.get("/health/live").status_code == 200
+
+    log = stop(defective)
+    # It did tell of the defect, and of requests: there was something to find a key in.
+    assert "ValueError: no class for **********, **********" in log
+    assert "GET /health/live 200" in log
+    for secret in SECRETS:
+        assert secret not in log
+
+
+def test_a_refused_key_is_not_repeated(tmp_path: Path) -> None:
+    short, spaced = "too-short-key", "a key that has spaces in it"
+    environment = {
+        **os.environ,
+        "SCENE_STORE": str(tmp_path),
+        "SCENE_ADMIN_KEY": short,
+        "SCENE_API_KEY": spaced,
+    }
+    run = subprocess.run(
+        [sys.executable, "-m", "app"], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert run.returncode == 2
+    assert {line.partition(":")[0] for line in run.stderr.splitlines()} == {
+        "SCENE_ADMIN_KEY",
+        "SCENE_API_KEY",
+    }
+    assert short not in run.stdout + run.stderr
+    assert spaced not in run.stdout + run.stderr

@@ -1,0 +1,135 @@
+"""The audit never takes silence for a clean bill of health."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scripts import audit
+from scripts.audit import Outcome, Verdict, exit_status, judge
+
+pytestmark = pytest.mark.system
+
+FLAW = {"id": "PYSEC-2019-217", "fix_versions": ["2.10.1"], "aliases": [], "description": ""}
+
+
+def report(*entries: dict[str, Any]) -> str:
+    """What pip-audit writes with --format=json."""
+    return json.dumps({"dependencies": list(entries), "fixes": []})
+
+
+def sound(name: str) -> dict[str, Any]:
+    return {"name": name, "version": "1.0", "vulns": []}
+
+
+def flawed(name: str) -> dict[str, Any]:
+    return {"name": name, "version": "2.10", "vulns": [FLAW]}
+
+
+def skipped(name: str) -> dict[str, Any]:
+    return {"name": name, "skip_reason": f"Dependency not found on PyPI: {name} (1.0)"}
+
+
+def test_a_package_is_sound_where_an_answer_says_so() -> None:
+    outcome = judge(report(sound("a"), sound("b")), "", {"a", "b"})
+    assert outcome == Outcome(Verdict.OK, ("no known vulnerability in 2 packages",))
+
+
+def test_a_flaw_is_named_with_its_cure() -> None:
+    outcome = judge(report(sound("a"), flawed("b"), skipped("c")), "", {"a", "b", "c"})
+    assert outcome == Outcome(Verdict.FOUND, ("b 2.10: PYSEC-2019-217, fixed in 2.10.1",))
+
+
+@pytest.mark.parametrize(
+    ("output", "trouble", "reason"),
+    [
+        # A mirror without the index's JSON pages: pip-audit exits with 0 and finds "no known
+        # vulnerabilities".
+        (report(skipped("a"), skipped("b")), "No known vulnerabilities found", "about a, b"),
+        (report(sound("a"), skipped("b")), "No known vulnerabilities found", "about b"),
+        (report(sound("a")), "No known vulnerabilities found", "about b"),
+        (report(), "No known vulnerabilities found", "about a, b"),
+        # No name resolution: a traceback, and nothing on standard output.
+        ("", "Traceback (most recent call last):\n  ...\nConnectionError: failed", "Connection"),
+        ("", "ERROR:pip_audit._cli:Tip: your network may be blocking this service.", "blocking"),
+        ("", "", "no answer"),
+        ("<html>Sign in</html>", "", "no answer"),
+        ("[]", "", "no answer"),
+    ],
+)
+def test_silence_is_not_run(output: str, trouble: str, reason: str) -> None:
+    outcome = judge(output, trouble, {"a", "b"})
+    assert outcome.verdict is Verdict.NOT_RUN
+    assert reason in outcome.lines[0]
+
+
+@pytest.mark.parametrize(
+    ("answers", "verdict", "locks_asked"),
+    [
+        # Only a service that knows the canary's flaw is asked about the locks.
+        ({"pypi": flawed, "osv": flawed}, Verdict.OK, ["pypi"]),
+        ({"pypi": sound, "osv": flawed}, Verdict.OK, ["osv"]),
+        ({"pypi": skipped, "osv": flawed}, Verdict.OK, ["osv"]),
+        ({"pypi": skipped, "osv": sound}, Verdict.NOT_RUN, []),
+    ],
+)
+def test_a_service_without_advisories_is_not_believed(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    answers: dict[str, Any],
+    verdict: Verdict,
+    locks_asked: list[str],
+) -> None:
+    asked = []
+
+    def ask(service: str, *arguments: str) -> tuple[str, str]:
+        if any("canary" in argument for argument in arguments):
+            return report(answers[service]("jinja2")), ""
+        asked.append(service)
+        return report(*map(sound, set().union(*map(audit.pinned, audit.LOCKS)))), ""
+
+    monkeypatch.setattr(audit, "ask", ask)
+    monkeypatch.setattr(audit, "BILLS", tmp_path)
+    assert audit.advisories().verdict is verdict
+    assert asked == locks_asked
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "strict", "lenient"),
+    [
+        ([Verdict.OK, Verdict.OK], 0, 0),
+        ([Verdict.OK, Verdict.NOT_RUN], 3, 0),
+        ([Verdict.FOUND, Verdict.NOT_RUN], 1, 1),
+        ([Verdict.FOUND, Verdict.OK], 1, 1),
+    ],
+)
+def test_the_exit_status_tells_what_was_found_from_what_was_not_run(
+    verdicts: list[Verdict], strict: int, lenient: int
+) -> None:
+    assert exit_status(verdicts, may_be_unreachable=False) == strict
+    assert exit_status(verdicts, may_be_unreachable=True) == lenient
+
+
+def test_the_bills_name_every_locked_package(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(audit, "BILLS", tmp_path)
+    outcome = audit.bills_of_materials()
+    assert outcome.verdict is Verdict.OK, outcome.lines
+    bill = json.loads((tmp_path / "sbom-service.cdx.json").read_text())
+    assert bill["bomFormat"] == "CycloneDX"
+    assert bill["metadata"]["component"]["name"] == "scene-boltzmann"
+    purls = {component["purl"] for component in bill["components"]}
+    assert "pkg:pypi/torch@2.13.0" in purls
+    assert len(purls) == len(audit.pinned("requirements.lock"))
+
+
+def test_risky_code_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "risky.py").write_text("import pickle\npickle.loads(input())\n")
+    monkeypatch.setattr(audit, "SOURCES", (str(tmp_path),))
+    outcome = audit.risky_code()
+    assert outcome.verdict is Verdict.FOUND
+    assert "B301" in "".join(outcome.lines)
