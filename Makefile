@@ -6,6 +6,8 @@ PYTHON ?= python3
 TORCH_INDEX_URL ?=
 # Further arguments for pytest, the audit, the benchmarks or the lock's resolver: make test ARGS="-k geometry".
 ARGS ?=
+# How long a soak lasts.
+MINUTES ?= 10
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -18,7 +20,7 @@ SERVICE := $(VENV)/.installed-service
 EVERYTHING := $(VENV)/.installed-everything
 
 .DEFAULT_GOAL := help
-.PHONY: help run test audit setup format bench lock clean
+.PHONY: help run test chaos soak audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -36,6 +38,12 @@ test: $(EVERYTHING)  ## lint, format, types, import rules, then the tests
 
 audit: $(EVERYTHING)  ## known vulnerabilities, risky code, bills of materials (build/)
 	$(BIN)/python scripts/audit.py $(ARGS)
+
+chaos: $(EVERYTHING)  ## attack a live service: hostile requests, overload, swaps (minutes)
+	$(BIN)/python -m pytest tests/chaos $(ARGS)
+
+soak: $(EVERYTHING)  ## ten minutes of mixed use: nothing may grow (MINUTES=10)
+	CHAOS_SOAK_MINUTES=$(MINUTES) $(BIN)/python -m pytest tests/chaos/test_soak.py $(ARGS)
 
 setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need
 

@@ -26,6 +26,8 @@ from pydantic_core import PydanticCustomError
 
 MAX_BATCH = 256
 MAX_SEED = 2**63 - 1
+MAX_RELATIONS = 65536
+"""No setting allows more, and a million wrong ones would take seconds to name."""
 
 RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "above", "below"]
 
@@ -181,9 +183,10 @@ class SceneRequest(Request):
     relations: Annotated[
         list[Relation] | None,
         Field(
+            max_length=MAX_RELATIONS,
             description="relations that hold; whatever is not listed is unobserved, unless "
             "`relations_complete`. Left out, they are derived from positions; an empty list says "
-            "that none is known and derives none"
+            "that none is known and derives none",
         ),
     ] = None
     relations_complete: Annotated[

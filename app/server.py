@@ -8,6 +8,7 @@ from types import FrameType
 
 import uvicorn
 
+from app.api.connections import guarded
 from app.main import create_app
 from app.serving.logs import log_config
 from app.serving.peers import Peers
@@ -58,6 +59,9 @@ def build(settings: Settings, peers: Peers | None = None) -> Server:
         host=settings.host,
         port=settings.port,
         root_path=settings.root_path,
+        http=guarded(settings.client_timeout),
+        # No route speaks WebSocket: who asks for one is answered in HTTP, with a problem.
+        ws="none",
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,
         server_header=False,

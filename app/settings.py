@@ -11,6 +11,8 @@ from urllib.parse import urlsplit
 from pydantic import BeforeValidator, Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from app.schemas import MAX_RELATIONS
+
 MAX_OBJECTS = 256
 """The contract's limit on objects in one scene; settings may lower it, never raise it."""
 
@@ -99,7 +101,7 @@ class Settings(BaseSettings):
         int, Field(ge=1, le=MAX_OBJECTS, description="most objects in one scene")
     ] = MAX_OBJECTS
     max_relations: Annotated[
-        int, Field(ge=0, le=65536, description="most relations given in one scene")
+        int, Field(ge=0, le=MAX_RELATIONS, description="most relations given in one scene")
     ] = 4096
     queue_rows: Annotated[
         int,
@@ -120,6 +122,16 @@ class Settings(BaseSettings):
     drain_timeout: Annotated[
         int, Field(ge=1, le=3600, description="seconds that work under way may take after that")
     ] = 25
+    client_timeout: Annotated[
+        float,
+        Field(
+            ge=0.1,
+            le=3600,
+            allow_inf_nan=False,
+            description="seconds a client may take to send a request's head, then its body, and to "
+            "take in the answer",
+        ),
+    ] = 20
     retry_after: Annotated[
         int, Field(ge=1, le=3600, description="seconds named in Retry-After when not ready")
     ] = 2

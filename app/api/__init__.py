@@ -51,8 +51,9 @@ def build(
     for router in (
         questions.router,
         batches.router,
-        models.router,
+        # Before what it shares addresses with: the first that fits an address names its methods.
         models.administration,
+        models.router,
         health.router,
         health.protocol,
     ):

@@ -37,6 +37,7 @@ AnswerT = TypeVar("AnswerT", bound=Answer)
 
 _PROBLEMS: Final = queued(
     catalogue.NOT_JSON,
+    catalogue.REQUEST_TIMEOUT,
     catalogue.BODY_TOO_LARGE,
     catalogue.UNSUPPORTED_MEDIA_TYPE,
     catalogue.INVALID_REQUEST,

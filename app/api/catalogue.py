@@ -43,6 +43,19 @@ BAD_REQUEST: Final = ProblemType(
     "The connection broke off, the request breaks HTTP, or its X-Request-Timeout-Ms is no whole "
     "number of milliseconds from 1 to 600000.",
 )
+REQUEST_TIMEOUT: Final = ProblemType(
+    "request-timeout",
+    408,
+    "The request did not come in time",
+    "The head of a request, and then its body, must each have come within SCENE_CLIENT_TIMEOUT "
+    "seconds. The connection is closed; send the request again on a new one.",
+)
+HEAD_TOO_LARGE: Final = ProblemType(
+    "head-too-large",
+    431,
+    "The request line and headers are over the limit",
+    "Send fewer or shorter headers. The connection is closed.",
+)
 UNAUTHORIZED: Final = ProblemType(
     "unauthorized",
     401,
@@ -199,6 +212,7 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         NOT_FOUND,
         MODEL_NOT_FOUND,
         METHOD_NOT_ALLOWED,
+        REQUEST_TIMEOUT,
         ALIAS_CONFLICT,
         MODEL_UNUSABLE,
         REFRESH_REFUSED,
@@ -209,6 +223,7 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         INVALID_REQUEST,
         UNKNOWN_LABELS,
         CONTRADICTORY_EVIDENCE,
+        HEAD_TOO_LARGE,
         INTERNAL_ERROR,
         NOT_READY,
         MODEL_UNAVAILABLE,

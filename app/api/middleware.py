@@ -5,6 +5,7 @@ None of it derives from `BaseHTTPMiddleware`, three of which cost three quarters
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import re
 import time
@@ -53,7 +54,7 @@ def install(
     Args:
         is_draining: whether nothing new is to be begun.
     """
-    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes, patience=settings.client_timeout)
     app.add_middleware(
         Turnstile,
         limit=settings.queue_rows,
@@ -292,11 +293,15 @@ class KeyGuard:
 
 
 class BodyLimit:
-    """Refuses bodies over ``limit`` bytes: by Content-Length at once, chunked ones as they come."""
+    """Refuses bodies over ``limit`` bytes, and those that take longer than ``patience`` seconds.
 
-    def __init__(self, app: ASGIApp, *, limit: int) -> None:
+    By Content-Length at once, chunked ones as they come.
+    """
+
+    def __init__(self, app: ASGIApp, *, limit: int, patience: float) -> None:
         self.app = app
         self.limit = limit
+        self.patience = patience
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection."""
@@ -309,18 +314,35 @@ class BodyLimit:
             await respond(Request(scope), self._too_large())(scope, receive, send)
             return
         received = 0
+        deadline = asyncio.get_running_loop().time() + self.patience
+        complete = False
 
-        async def receive_within_limit() -> Message:
-            nonlocal received
-            message = await receive()
+        async def receive_within_limits() -> Message:
+            nonlocal received, complete
+            if complete:
+                # Whoever waits now waits for the client to leave, which may take any time.
+                return await receive()
+            try:
+                async with asyncio.timeout_at(deadline):
+                    message = await receive()
+            except TimeoutError:
+                raise self._too_slow() from None
             received += len(message.get("body", b""))
             if received > self.limit:
                 raise self._too_large()
+            complete = not message.get("more_body", False)
             return message
 
-        await self.app(scope, receive_within_limit, send)
+        await self.app(scope, receive_within_limits, send)
 
     def _too_large(self) -> ProblemError:
         return ProblemError(
             catalogue.BODY_TOO_LARGE, f"The body must not be larger than {self.limit} bytes."
+        )
+
+    def _too_slow(self) -> ProblemError:
+        return ProblemError(
+            catalogue.REQUEST_TIMEOUT,
+            f"The body did not come within {self.patience:g} seconds.",
+            headers={"Connection": "close"},
         )

@@ -103,6 +103,7 @@ async def refresh_models(runtime: RuntimeDep, request_id: RequestId) -> RefreshA
         catalogue.REFRESH_REFUSED,
         catalogue.STORE_NOT_WRITABLE,
         catalogue.STORE_BUSY,
+        catalogue.REQUEST_TIMEOUT,
         catalogue.BODY_TOO_LARGE,
         catalogue.UNSUPPORTED_MEDIA_TYPE,
         catalogue.INVALID_REQUEST,

@@ -11,7 +11,7 @@ from app.api import catalogue, examples, keys
 from app.api.catalogue import ProblemType
 from app.api.problems import MEDIA_TYPE, ProblemError
 from app.api.turnstile import MAX_TIMEOUT_MS, TIMEOUT_HEADER
-from app.schemas import FieldError, Problem
+from app.schemas import MAX_SEED, FieldError, Problem
 
 Responses = dict[int | str, dict[str, Any]]
 
@@ -98,6 +98,20 @@ def operation_id(route: APIRoute) -> str:
     return route.name
 
 
+def _state_whole_numbers(node: Any) -> None:
+    """Bounds of integers as integers: the framework keeps doubles, which round the largest up."""
+    if isinstance(node, dict):
+        if node.get("type") == "integer":
+            for bound in ("minimum", "maximum"):
+                if bound in node:
+                    node[bound] = min(int(node[bound]), MAX_SEED)
+        for value in node.values():
+            _state_whole_numbers(value)
+    elif isinstance(node, list):
+        for value in node:
+            _state_whole_numbers(value)
+
+
 class DocumentedAPI(FastAPI):
     """FastAPI, whose document tells what the service really answers."""
 
@@ -121,6 +135,7 @@ class DocumentedAPI(FastAPI):
             schemas.pop("ValidationError", None)
             if self.state.settings.api_key is not None:
                 _ask_for_keys(document)
+            _state_whole_numbers(document)
         return super().openapi()
 
 

@@ -130,9 +130,9 @@ def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
                     message=fault.message,
                     suggestions=list(fault.suggestions),
                 )
-                for fault in error.faults
+                for fault in error.faults[:MAX_ERRORS]
             ]
-            return _faulty(kind, errors)
+            return _faulty(kind, errors, len(error.faults))
         case UnknownModelError():
             return ProblemError(catalogue.MODEL_NOT_FOUND, str(error))
         case ModelUnavailableError():
@@ -167,9 +167,9 @@ def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
             )
 
 
-def _faulty(kind: ProblemType, errors: list[FieldError]) -> ProblemError:
-    count = f"{len(errors)} fault{'' if len(errors) == 1 else 's'}"
-    return ProblemError(kind, f"The request has {count}; see errors.", errors=errors)
+def _faulty(kind: ProblemType, errors: list[FieldError], count: int) -> ProblemError:
+    faults = f"{count} fault{'' if count == 1 else 's'}"
+    return ProblemError(kind, f"The request has {faults}; see errors.", errors=errors)
 
 
 def unfit(
@@ -184,7 +184,9 @@ def unfit(
     """
     of_framework = isinstance(error, RequestValidationError)
     errors = []
-    for entry in error.errors():
+    faults = error.errors()
+    # Only of those that are listed: suggestions for 100,000 members take a minute.
+    for entry in faults[:MAX_ERRORS]:
         location: Location = tuple(entry["loc"])[1:] if of_framework else entry["loc"]
         unknown = str(location[-1]) if entry["type"] == "extra_forbidden" else ""
         errors.append(
@@ -194,7 +196,7 @@ def unfit(
                 suggestions=get_close_matches(unknown[:64], _FIELDS) if unknown else [],
             )
         )
-    return _faulty(catalogue.INVALID_REQUEST, errors)
+    return _faulty(catalogue.INVALID_REQUEST, errors, len(faults))
 
 
 def report_defect(error: Exception, request_id: str) -> None:

@@ -25,6 +25,7 @@ from app.serving import questions
 PROBLEMS: Final = queued(
     catalogue.NOT_JSON,
     catalogue.MODEL_NOT_FOUND,
+    catalogue.REQUEST_TIMEOUT,
     catalogue.BODY_TOO_LARGE,
     catalogue.UNSUPPORTED_MEDIA_TYPE,
     catalogue.INVALID_REQUEST,

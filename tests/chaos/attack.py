@@ -1,0 +1,110 @@
+"""Sending hostile requests and judging the answers."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from app.api.catalogue import PROBLEM_TYPES
+from app.schemas import Problem
+from tests.chaos.corpus import JSON, MARKER, NUMBER, Hostile
+from tests.http.conftest import ADMIN_KEY
+
+_LEAKS = (
+    MARKER,
+    json.dumps(MARKER)[1:-1],
+    MARKER.split()[0],
+    NUMBER,
+    "Traceback",
+    "site-packages",
+    ".py",
+    str(Path.cwd()),
+)
+
+
+@dataclass
+class Report:
+    """What became of an attack.
+
+    Attributes:
+        faults: in words, one for every answer that is not as it must be.
+    """
+
+    statuses: Counter[int] = field(default_factory=Counter)
+    faults: list[str] = field(default_factory=list)
+
+    @property
+    def total(self) -> int:
+        """How many requests were answered."""
+        return sum(self.statuses.values())
+
+
+def faults_of_problem(document: Any, status: int) -> list[str]:
+    """What is wrong with a problem document, if anything."""
+    try:
+        Problem.model_validate(document, extra="forbid")
+    except ValueError as error:
+        return [f"does not fit the schema: {error}"]
+    faults = []
+    kind = PROBLEM_TYPES.get(document["type"].removeprefix("/problems/"))
+    if kind is None or not kind.status == document["status"] == status:
+        faults.append(f"status {status} with type {document['type']}, {document['status']}")
+    # A request id of the right form is the one thing that is repeated.
+    text = json.dumps(document, ensure_ascii=False).replace(document["request_id"], "")
+    faults += [f"repeats or leaks {leak!r}: {text}" for leak in _LEAKS if leak in text]
+    return faults
+
+
+def faults_of_answer(status: int, headers: Mapping[str, str], body: bytes) -> list[str]:
+    """What is wrong with an answer, whatever was asked."""
+    if status >= 500:
+        return [f"status {status}: {body[:300]!r}"]
+    if status < 400:
+        if not headers.get("content-type", "").startswith("application/json"):
+            return []
+        results = json.loads(body).get("results", ())
+        return [
+            fault
+            for entry in results
+            if entry["status"] != 200
+            for fault in faults_of_problem(entry["problem"], entry["status"])
+        ]
+    if headers.get("content-type") != "application/problem+json":
+        return [f"status {status} is no problem document but {headers.get('content-type')}"]
+    document = json.loads(body)
+    faults = faults_of_problem(document, status)
+    if document.get("request_id") != headers.get("x-request-id"):
+        faults.append("request id in the body and in the head differ")
+    return faults
+
+
+def attack(port: int, requests: Iterable[Hostile]) -> Report:
+    """Send requests one after another on one connection, as long as it lasts."""
+    report = Report()
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    for request in requests:
+        headers = JSON | {"X-Admin-Key": ADMIN_KEY} | request.headers
+        # Refused before all of it was sent: the answer is there all the same.
+        with suppress(BrokenPipeError, ConnectionResetError):
+            connection.request(request.method, request.path, request.body, headers)
+        try:
+            response = connection.getresponse()
+            body = response.read()
+        except (http.client.HTTPException, OSError) as error:
+            report.faults.append(f"{request.name}: no answer: {error!r}")
+            connection.close()
+            continue
+        report.statuses[response.status] += 1
+        fields = {name.lower(): value for name, value in response.getheaders()}
+        faults = faults_of_answer(response.status, fields, body)
+        if response.status not in request.expected:
+            faults.append(f"status {response.status}, not one of {sorted(request.expected)}")
+        report.faults += [f"{request.name}: {fault}" for fault in faults]
+    connection.close()
+    return report

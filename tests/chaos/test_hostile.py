@@ -1,0 +1,69 @@
+"""The whole hostile corpus against one live service, which is none the worse for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+from tests.chaos import corpus
+from tests.chaos.attack import attack, faults_of_answer
+from tests.chaos.service import control, descriptors, memory, running
+from tests.chaos.wire import exchange, wires
+from tests.http.conftest import LiveService
+from tests.http.stores import make_store
+
+MAX_GROWTH = 8 * 2**20
+"""Bytes that 20,000 requests may add to what the largest of them left with the allocator."""
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    folder = tmp_path_factory.mktemp("hostile")
+    with running(make_store(folder / "store"), folder / "log", client_timeout="5") as service:
+        yield service
+
+
+def test_no_request_of_the_corpus_breaks_the_service(service: LiveService) -> None:
+    before = control(service)
+    # The largest first and twice: what the allocator keeps for them is kept once. The first round
+    # takes some fifty megabytes, the later ones next to nothing.
+    for _ in range(2):
+        attack(service.port, chain(corpus.whole_bodies(), corpus.nonsense()))
+    resident, files = memory(service), descriptors(service)
+    report = attack(service.port, corpus.everything())
+    assert report.faults == []
+    assert report.total >= 10_000
+    assert 500 not in report.statuses
+    assert control(service) == before
+    assert memory(service) - resident < MAX_GROWTH
+    assert descriptors(service) <= files + 8
+    assert "Traceback" not in service.log.read_text()
+    assert corpus.MARKER.split()[0] not in service.log.read_text()
+
+
+def test_nothing_below_http_breaks_the_service(service: LiveService) -> None:
+    before = control(service)
+    faults = []
+    for wire in wires():
+        answers, closed = exchange(service.port, wire)
+        statuses = tuple(answer.status for answer in answers)
+        if wire.expected is not None and statuses != wire.expected:
+            faults.append(f"{wire.name}: {statuses}, not {wire.expected}")
+        if wire.closes and not closed:
+            faults.append(f"{wire.name}: the connection stays open")
+        for answer in answers:
+            found = faults_of_answer(answer.status, answer.headers, answer.body)
+            faults += [f"{wire.name}: {fault}" for fault in found]
+    assert faults == []
+    assert control(service) == before
+    assert "Traceback" not in service.log.read_text()
+
+
+def test_the_log_holds_no_smuggled_request(service: LiveService, tmp_path: Path) -> None:
+    for wire in wires():
+        if wire.name.startswith("smuggled"):
+            exchange(service.port, wire)
+    assert '"smuggled"' not in service.log.read_text()

@@ -1,0 +1,80 @@
+"""Ten times what the service can do: it refuses what is too much, and is well at once after."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from benchmarks.load.connections import prepared
+from benchmarks.load.windows import at_concurrency, at_rate
+from tests.chaos.load import ConstantLoad, Pulse
+from tests.chaos.service import control, memory, running
+from tests.http.conftest import LiveService
+from tests.http.stores import make_store
+
+SECONDS = float(os.environ.get("CHAOS_OVERLOAD_SECONDS", "30"))
+DEADLINE = 1.0
+HEADERS = {"x-request-timeout-ms": str(round(DEADLINE * 1000))}
+# Sixteen classes are known; scenes are large, so that it is the service that is overloaded and not
+# the client.
+LABELS = ("bed", "nightstand", "lamp", "chair", "table", "desk", "sofa", "sink", "book", "pillow")
+REQUESTS = [
+    prepared(route, {"objects": [*LABELS[k:], *LABELS[:k]] * 6}, HEADERS)
+    for k in range(len(LABELS))
+    for route in ("/missing", "/outliers", "/relations")
+]
+
+
+@pytest.fixture
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    folder = tmp_path_factory.mktemp("overload")
+    store = make_store(folder / "store")
+    # A line a request on a disk that others use is no part of what is tested.
+    with running(store, folder / "log", access_log="false") as service:
+        yield service
+
+
+def sustainable(port: int) -> float:
+    """Answers a second at eight connections; the best of three windows."""
+    return max(asyncio.run(at_concurrency(port, REQUESTS, 8, 2)).rate for _ in range(3))
+
+
+def test_overload_is_refused_and_leaves_nothing_behind(service: LiveService) -> None:
+    before = control(service)
+    rate = sustainable(service.port)
+    # A first overload allocates what every later one uses again.
+    asyncio.run(at_rate(service.port, REQUESTS, 10 * rate, 2, connections=512))
+    resident = memory(service)
+
+    pulse = Pulse(service.port, "/health/live")
+    with pulse.beating():
+        window = asyncio.run(at_rate(service.port, REQUESTS, 10 * rate, SECONDS, connections=512))
+    recovered = asyncio.run(at_concurrency(service.port, REQUESTS, 8, 1)).rate
+
+    assert set(window.statuses) <= {200, 429, 504}
+    assert window.statuses[429] > 0
+    assert set(pulse.statuses) == {200}
+    assert control(service) == before
+    # What follows is time: it is meant for a machine with a core for each of the two sides.
+    assert np.quantile(pulse.seconds, 0.99) < 0.05
+    assert recovered > 0.8 * rate
+    assert memory(service) - resident < 16 * 2**20
+    assert "Traceback" not in service.log.read_text()
+
+
+def test_what_is_accepted_keeps_its_deadline(service: LiveService) -> None:
+    def judge(_: int, status: int, __: object) -> str | None:
+        return None if status in {200, 429, 504} else f"status {status}"
+
+    # Many more at once than are answered within a deadline; each has its own clock.
+    with ConstantLoad(service.port, REQUESTS, judge, connections=1024) as load:
+        time.sleep(SECONDS / 3)
+    assert load.tally.faults == []
+    assert sum(load.tally.statuses.values()) == load.tally.sent
+    assert load.tally.statuses[200] > 0
+    assert np.quantile(load.tally.seconds[200], 0.99) < DEADLINE

@@ -1,0 +1,91 @@
+"""Minutes of ordinary use with everything in it: memory, files and answers stay as they are.
+
+Longer than the other attacks together, so it runs only where it is asked for: `make soak`.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from itertools import chain, count
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.load.connections import prepared
+from tests.chaos import corpus
+from tests.chaos.attack import attack
+from tests.chaos.load import ConstantLoad
+from tests.chaos.service import control, descriptors, memory, running
+from tests.chaos.trends import trend
+from tests.http.conftest import ADMIN_KEY, LiveService
+from tests.http.stores import make_store
+
+MINUTES = float(os.environ.get("CHAOS_SOAK_MINUTES", "0"))
+CYCLE = 5.0
+
+pytestmark = pytest.mark.skipif(MINUTES <= 0, reason="CHAOS_SOAK_MINUTES says how long")
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[LiveService]:
+    with running(make_store(tmp_path / "store"), tmp_path / "log", access_log="false") as service:
+        yield service
+
+
+def cycle(service: LiveService, hostile: list[corpus.Hostile]) -> list[str]:
+    """Some seconds of use: hostile requests, promotions, refreshes."""
+    report = attack(service.port, hostile)
+    faults = report.faults
+    admin = {"X-Admin-Key": ADMIN_KEY}
+    for version in ("1.1.0", "1.0.0"):
+        alias = {"model": f"home@{version}"}
+        response = service.client.put("/models/aliases/default", json=alias, headers=admin)
+        if not response.is_success:
+            faults.append(response.text)
+    response = service.client.post("/models/refresh", headers=admin)
+    if not response.is_success:
+        faults.append(response.text)
+    return faults
+
+
+def test_nothing_grows(service: LiveService) -> None:
+    before = control(service)
+    requests = [
+        prepared(route, {"objects": ["bed", "lamp", "desk", "chair"], "seed": 1} | extra)
+        for route, extra in {
+            "/relations": {},
+            "/missing": {},
+            "/outliers": {},
+            "/generate": {"steps": 8},
+        }.items()
+    ]
+    every = list(corpus.everything())
+    readings: list[int] = []
+    faults: list[str] = []
+
+    def judge(_: int, status: int, answer: Any) -> str | None:
+        return None if status == 200 else f"status {status}: {answer}"
+
+    # What the allocator keeps for the largest bodies is kept once, and is no growth.
+    for _ in range(2):
+        attack(service.port, chain(corpus.whole_bodies(), corpus.nonsense()))
+    files = descriptors(service)
+    end = time.monotonic() + 60 * MINUTES
+    with ConstantLoad(service.port, requests, judge, connections=2) as load:
+        for number in count():
+            if time.monotonic() >= end:
+                break
+            began = time.monotonic()
+            faults += cycle(service, every[number % 97 :: 97])
+            readings.append(memory(service))
+            time.sleep(max(0.0, CYCLE - (time.monotonic() - began)))
+    assert faults + load.tally.faults == []
+    assert sum(load.tally.statuses.values()) == load.tally.sent
+    assert control(service) == before
+    assert descriptors(service) <= files + 8
+    settled = readings[len(readings) // 4 :]
+    grown = trend(settled)
+    assert grown.growth < max(4 * 2**20, grown.noise), grown

@@ -1,0 +1,41 @@
+"""The OpenAPI document against a live service: what it promises is what comes, whatever is sent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import requests
+import schemathesis
+
+from tests.http.conftest import LiveService, launch
+from tests.http.contract import call, documented
+from tests.http.stores import make_store
+
+pytestmark = pytest.mark.system
+
+api = documented(examples=10)
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    """A service of its own: the administration's routes change its store."""
+    folder = tmp_path_factory.mktemp("contract")
+    service = launch(make_store(folder / "store"), folder / "log")
+    yield service
+    service.client.close()
+    service.process.terminate()
+    service.process.wait(timeout=30)
+
+
+@pytest.fixture(scope="module")
+def session() -> Iterator[requests.Session]:
+    with requests.Session() as session:
+        yield session
+
+
+@api.parametrize()
+def test_every_operation_keeps_its_promises(
+    case: schemathesis.Case, service: LiveService, session: requests.Session
+) -> None:
+    call(case, service, session)

@@ -1,0 +1,63 @@
+"""A part of the hostile corpus against a live service; `make chaos` sends all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.chaos import corpus
+from tests.chaos.attack import attack, faults_of_answer
+from tests.chaos.service import control, running
+from tests.chaos.wire import Wire, exchange, wires
+from tests.http.conftest import LiveService
+from tests.http.stores import make_store
+
+pytestmark = pytest.mark.system
+
+EVERY = 53  # a prime, so that each wrong value comes to stand at many places
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    folder = tmp_path_factory.mktemp("hostile")
+    with running(make_store(folder / "store"), folder / "log", client_timeout="5") as service:
+        yield service
+
+
+def test_requests_of_the_corpus_are_refused_in_order(service: LiveService) -> None:
+    before = control(service)
+    report = attack(service.port, list(corpus.everything())[::EVERY])
+    assert report.faults == []
+    assert report.total >= 300
+    assert control(service) == before
+    log = service.log.read_text()
+    assert "Traceback" not in log
+    assert corpus.MARKER.split()[0] not in log
+
+
+@pytest.mark.parametrize("wire", list(wires()), ids=lambda wire: wire.name)
+def test_what_is_wrong_below_http_is_refused_in_order(service: LiveService, wire: Wire) -> None:
+    answers, closed = exchange(service.port, wire)
+    for answer in answers:
+        assert faults_of_answer(answer.status, answer.headers, answer.body) == []
+    if wire.expected is not None:
+        assert tuple(answer.status for answer in answers) == wire.expected
+    assert closed or not wire.closes
+    assert '"smuggled"' not in service.log.read_text()
+
+
+def test_every_field_of_every_request_is_attacked() -> None:
+    from app import schemas
+
+    forms = {
+        "/relations": schemas.RelationsRequest,
+        "/missing": schemas.MissingRequest,
+        "/outliers": schemas.OutliersRequest,
+        "/generate": schemas.GenerateRequest,
+        corpus.ALIAS: schemas.AliasRequest,
+    }
+    for path, form in forms.items():
+        assert set(corpus.VALID[path]) == set(form.model_fields)
+    detection = corpus.SCENE["objects"][1]
+    assert set(detection) == set(schemas.Detection.model_fields)
