@@ -43,9 +43,14 @@ class Supervised:
         await serving
 
     async def _follow(self, serving: asyncio.Future[None]) -> None:
-        await self._follower.follow()
+        try:
+            await self._follower.follow()
+        except Exception:
+            # It may serve something else than the others from now on: it must not go on.
+            _logger.exception("this worker cannot follow the others: it stops")
+        else:
+            _logger.error("the supervisor is gone: this worker stops")
         self._verdicts.put_nowait(None)
-        _logger.error("the supervisor is gone: this worker stops")
         if not serving.done():
             serving.set_exception(ConnectionError("the supervisor is gone"))
         self._orphaned()
@@ -134,7 +139,17 @@ class _Follower:
         self.say("abort", change)
 
     async def follow(self) -> None:
-        """Return when the supervisor is gone."""
+        """Return when the supervisor is gone.
+
+        Raises:
+            Exception: whatever a swap raises; none can be taken back.
+        """
+        try:
+            await self._obey()
+        finally:
+            self._channel.close()
+
+    async def _obey(self) -> None:
         while (message := await self._channel.receive()) is not None:
             match message.kind:
                 case "prepare":
@@ -153,7 +168,6 @@ class _Follower:
                     self._verdicts.put_nowait(message)
                 case _:
                     self._verdicts.put_nowait(message)
-        self._channel.close()
 
     async def _prepare(self, message: Message) -> None:
         wanted = message.generation
