@@ -108,9 +108,12 @@ class Settings(BaseSettings):
         Field(
             ge=256,
             le=2**20,
-            description="most requests that wait to be read, and most scenes that wait for a model",
+            description="most scenes that wait for a model, or are under way there",
         ),
-    ] = 512
+    ] = 4096
+    queue_requests: Annotated[
+        int, Field(ge=1, le=2**20, description="most requests that wait to be read")
+    ] = 256
     request_timeout_ms: Annotated[
         int,
         Field(ge=1, le=600_000, description="of requests that send no X-Request-Timeout-Ms"),

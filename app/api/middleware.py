@@ -57,7 +57,7 @@ def install(
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, patience=settings.client_timeout)
     app.add_middleware(
         Turnstile,
-        limit=settings.queue_rows,
+        limit=settings.queue_requests,
         timeout=settings.request_timeout_ms / 1e3,
         is_draining=is_draining,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ def block_scenes(
     steps: int,
     temperature: float,
     context: Mapping[str, Sequence[int]],
+    stop: Callable[[], bool],
 ) -> tuple[GeneratedScene, ...]:
     """See `generate`. Every block has a random stream of its own."""
     machine = artifact.machine
@@ -39,7 +40,7 @@ def block_scenes(
     given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
     drawn: list[GeneratedScene] = []
     block = 0
-    while len(drawn) < count:
+    while len(drawn) < count and not stop():
         state = run_block(
             artifact.fantasies, observation, clamp, tempered, steps, _stream(seed, block)
         )

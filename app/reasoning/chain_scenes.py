@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ def chain_scenes(
     steps: int,
     temperature: float,
     context: Mapping[str, Sequence[int]],
+    stop: Callable[[], bool],
 ) -> tuple[GeneratedScene, ...]:
     """See `generate`. Every chain has a random stream of its own.
 
@@ -45,10 +46,11 @@ def chain_scenes(
     shown[classes.classes] = True
     of = classes.classes[classes.row].tolist()
     given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
-    return tuple(
-        _scene(artifact, conditioned, drawn, shown[drawn.classes], given)
-        for drawn in (conditioned.draw(steps, philox.stream(seed, place)) for place in range(count))
-    )
+    scenes: list[GeneratedScene] = []
+    while len(scenes) < count and not stop():
+        drawn = conditioned.draw(steps, philox.stream(seed, len(scenes)))
+        scenes.append(_scene(artifact, conditioned, drawn, shown[drawn.classes], given))
+    return tuple(scenes)
 
 
 def _conditions(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from app.reasoning.answers import GeneratedScene
 from app.reasoning.block_scenes import block_scenes
@@ -23,6 +23,7 @@ def generate(
     steps: int | None = None,
     temperature: float = 1.0,
     context: Mapping[str, Sequence[int]] | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> tuple[GeneratedScene, ...]:
     """Draw scenes that contain the evidence, by Gibbs chains that start at fantasies.
 
@@ -46,6 +47,7 @@ def generate(
         steps: Gibbs sweeps of a chain, `STEPS` by default.
         temperature: of the chains; above 1 for more varied scenes.
         context: layer name ("h1", "h2") to the units that are held on.
+        stop: asked between scenes, or blocks of them; once it says so, those drawn so far are all.
 
     Raises:
         ValueError: a number out of range, or a layer or unit that the machine does not have.
@@ -60,4 +62,4 @@ def generate(
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, not {temperature}")
     draw = block_scenes if artifact.scene_chains is None else chain_scenes
-    return draw(artifact, scene, count, seed, steps, temperature, context or {})
+    return draw(artifact, scene, count, seed, steps, temperature, context or {}, stop)

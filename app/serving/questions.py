@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
 from app import reasoning
@@ -146,17 +146,20 @@ async def generate(session: Session, request: GenerateRequest) -> GenerateAnswer
     model, reading = session.read(request, may_be_empty=True)
     _check_context(request, model)
     seed = secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed
-    drawn = await session.draw(
-        request.count,
-        model,
-        reasoning.generate,
-        reading.scene,
-        count=request.count,
-        seed=seed,
-        steps=request.steps,
-        temperature=request.temperature,
-        context=request.context,
-    )
+
+    def draw(stop: Callable[[], bool]) -> tuple[reasoning.GeneratedScene, ...]:
+        return reasoning.generate(
+            model.artifact,
+            reading.scene,
+            count=request.count,
+            seed=seed,
+            steps=request.steps,
+            temperature=request.temperature,
+            context=request.context,
+            stop=stop,
+        )
+
+    drawn = await session.draw(request.count, model, "generate", draw)
     return GenerateAnswer(
         **session.envelope(request, model, reading),
         seed=seed,

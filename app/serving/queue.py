@@ -26,6 +26,8 @@ T = TypeVar("T")
 CHEAP: Final = 1e-3
 """Seconds that a job may hold up the event loop."""
 
+# Seconds between two looks at whether anybody still waits for costly work.
+_LOOK: Final = 0.25
 # So long a tick computes before others get their turn: health checks, and requests to be read.
 _TICK: Final = 2e-3
 # Share of the newest measurement in the expected cost.
@@ -53,6 +55,15 @@ class Ticket:
         if monotonic() >= self.deadline:
             raise DeadlinePassedError("The deadline passed before the answer was begun.")
 
+    async def check_there(self) -> None:
+        """Return if the client still waits.
+
+        Raises:
+            DisconnectedError: it does not.
+        """
+        if self.is_gone is not None and await self.is_gone():
+            raise DisconnectedError("The client has gone.")
+
 
 @dataclass(frozen=True, slots=True)
 class Done(Generic[T]):
@@ -67,9 +78,16 @@ class Done(Generic[T]):
     computed: float
 
 
+_Call = Callable[[Callable[[], bool]], Done[T]]
+
+
+def _never() -> bool:
+    return False
+
+
 @dataclass(slots=True, eq=False)
 class _Job:
-    call: Callable[[], Done[Any]]
+    call: _Call[Any]
     ticket: Ticket
     future: asyncio.Future[Any]
 
@@ -122,12 +140,19 @@ class WorkQueue:
             self.rows -= rows
 
     async def run(
-        self, call: Callable[[], T], ticket: Ticket, *, kind: str, size: float, costly: bool = False
+        self,
+        call: Callable[[Callable[[], bool]], T],
+        ticket: Ticket,
+        *,
+        kind: str,
+        size: float,
+        costly: bool = False,
     ) -> Done[T]:
         """Let a job be done.
 
         Args:
-            call: the work; it may run in another thread.
+            call: the work; it may run in another thread. What it is given says whether the result
+                has been given up, which long work asks from time to time.
             kind: jobs of one kind cost alike, in proportion to ``size``.
             costly: always for the worker thread.
 
@@ -139,9 +164,9 @@ class WorkQueue:
         cost = self._costs.setdefault(kind, _Cost())
         came = monotonic()
 
-        def measured() -> Done[T]:
+        def measured(given_up: Callable[[], bool]) -> Done[T]:
             began = monotonic()
-            result = call()
+            result = call(given_up)
             seconds = monotonic() - began
             cost.learn(seconds, size)
             return Done(result, began - came, seconds)
@@ -168,32 +193,36 @@ class WorkQueue:
                 return
         self._draining = False
 
-    async def _in_thread(self, call: Callable[[], Done[T]], ticket: Ticket) -> Done[T]:
+    async def _in_thread(self, call: _Call[T], ticket: Ticket) -> Done[T]:
         ticket.check()
-        if ticket.is_gone is not None and await ticket.is_gone():
-            raise DisconnectedError("The client has gone.")
-        dropped = False
+        await ticket.check_there()
+        given_up = False
 
-        def unless_dropped() -> Done[T]:
-            # The thread's own queue holds what is dropped until its turn, and no longer.
-            if dropped:
-                raise DeadlinePassedError("dropped")
-            return call()
+        def unless_given_up() -> Done[T]:
+            # The thread's own queue holds what is given up until its turn, and no longer.
+            if given_up:
+                raise DeadlinePassedError("given up")
+            return call(lambda: given_up)
 
         loop = asyncio.get_running_loop()
-        future = loop.run_in_executor(self.executor, unless_dropped)
+        future = loop.run_in_executor(self.executor, unless_given_up)
         try:
-            async with asyncio.timeout(ticket.deadline - monotonic()):
-                return await future
-        except TimeoutError:
-            raise DeadlinePassedError("The deadline passed before the answer was there.") from None
+            while True:
+                left = ticket.deadline - monotonic()
+                await asyncio.wait([future], timeout=min(left, _LOOK))
+                if future.done():
+                    return future.result()
+                if left <= _LOOK:
+                    raise DeadlinePassedError("The deadline passed before the answer was there.")
+                await ticket.check_there()
         finally:
-            dropped = True
+            given_up = True
+            future.cancel()
 
 
 def _settle(job: _Job) -> None:
     try:
         job.ticket.check()
-        job.future.set_result(job.call())
+        job.future.set_result(job.call(_never))
     except Exception as error:  # noqa: BLE001 - it belongs to the request, which raises it
         job.future.set_exception(error)

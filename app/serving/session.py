@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from app.registry import Artifact
@@ -74,38 +73,37 @@ class Session:
         """
         # Pairs of objects are what the relation part is computed for, stated relations or not.
         size = (1 + len(scene.objects)) ** 2
-        return await self._run(
-            model, partial(question, model.artifact, scene, *args, **kwargs), question, size
-        )
+
+        def call(_: Callable[[], bool]) -> T:
+            return question(model.artifact, scene, *args, **kwargs)
+
+        return await self._run(model, call, question.__name__, size)
 
     async def draw(
-        self,
-        rows: int,
-        model: ServedModel,
-        question: Callable[Concatenate[Artifact, Scene, P], T],
-        scene: Scene,
-        *args: P.args,
-        **kwargs: P.kwargs,
+        self, rows: int, model: ServedModel, name: str, draw: Callable[[Callable[[], bool]], T]
     ) -> T:
-        """The same of a question that draws so many scenes: never where others would wait for it.
+        """Let so many scenes be drawn, never where others would wait for it.
+
+        Args:
+            name: of the question.
+            draw: the work; what it is given says whether nobody wants it any more.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
-        call = partial(question, model.artifact, scene, *args, **kwargs)
-        return await self._run(model, call, question, rows, rows=rows, costly=True)
+        return await self._run(model, draw, name, rows, rows=rows, costly=True)
 
     async def _run(
         self,
         model: ServedModel,
-        call: Callable[[], T],
-        question: Callable[..., T],
+        call: Callable[[Callable[[], bool]], T],
+        name: str,
         size: float,
         *,
         rows: int = 1,
         costly: bool = False,
     ) -> T:
-        queue, reference, name = model.queue, model.reference, question.__name__
+        queue, reference = model.queue, model.reference
         with queue.holding(0 if self.holding else rows):
             self.metrics.pending(reference, queue.rows)
             done = await queue.run(call, self.ticket, kind=name, size=size, costly=costly)

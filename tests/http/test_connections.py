@@ -7,9 +7,11 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from typing import Any
 
 import pytest
 
+from app.api.connections import MAX_HEAD
 from tests.chaos.service import control, descriptors, running
 from tests.chaos.wire import BODY, Wire, exchange
 from tests.http.conftest import LiveService
@@ -56,7 +58,19 @@ def test_who_stops_in_the_middle_is_not_waited_for(
     assert closed
     for answer in answers:
         if answer.status == 408:
-            assert json.loads(answer.body)["type"] == "/problems/request-timeout"
+            is_problem(answer, 408, "request-timeout")
+
+
+def test_a_head_without_end_is_refused(service: LiveService) -> None:
+    head = HEAD[:40] + b"x: " + b"y" * (2 * MAX_HEAD)
+    (answer,), closed = exchange(service.port, Wire("", [head], None))
+    is_problem(answer, 431, "head-too-large")
+    assert closed
+
+
+def is_problem(answer: Any, status: int, slug: str) -> None:
+    assert answer.status == status
+    assert json.loads(answer.body)["type"] == f"/problems/{slug}"
 
 
 @pytest.mark.parametrize("beginning", [b"", HEAD[:40], HEAD % 1000], ids=["lines", "head", "body"])

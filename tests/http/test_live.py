@@ -185,6 +185,7 @@ def test_the_log_is_json_with_request_ids_and_no_payload(live: LiveService) -> N
     (entry,) = [entry for entry in entries if entry.get("request_id") == "find-me"]
     assert entry["message"].startswith("POST /relations 422 ")
     assert entry.pop("latency_ms") > 0
+    assert entry.pop("process") == live.process.pid
     assert {name: entry[name] for name in entry if name not in {"time", "message"}} == {
         "level": "info",
         "logger": "app.access",

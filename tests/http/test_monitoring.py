@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -218,7 +219,9 @@ async def test_a_request_is_one_line(
         await client.get("/nowhere?key=secret")
     first, second = lines(caplog)
     assert first.pop("latency_ms") >= first.pop("compute_ms") > 0
+    assert first.pop("queue_ms") >= 0
     for line in (first, second):
+        assert line.pop("process") == os.getpid()
         assert line.pop("time")
         assert line.pop("message")
     assert first == {

@@ -38,7 +38,7 @@ async def test_jobs_run_in_order_each_with_its_result(queue: WorkQueue) -> None:
         order.append(number)
         return number * number
 
-    jobs = [queue.run(lambda k=k: job(k), ENDLESS, kind="q", size=1) for k in range(20)]
+    jobs = [queue.run(lambda _, k=k: job(k), ENDLESS, kind="q", size=1) for k in range(20)]
     assert [done.result for done in await asyncio.gather(*jobs)] == [k * k for k in range(20)]
     assert order == list(range(20))
 
@@ -49,21 +49,21 @@ async def test_what_arrives_in_one_tick_is_computed_in_the_next(queue: WorkQueue
 
     async def ask(name: str) -> None:
         order.append(f"{name} queued")
-        await queue.run(lambda: order.append(f"{name} computed"), ENDLESS, kind="q", size=1)
+        await queue.run(lambda _: order.append(f"{name} computed"), ENDLESS, kind="q", size=1)
 
     await asyncio.gather(ask("first"), ask("second"))
     assert order == ["first queued", "second queued", "first computed", "second computed"]
 
 
 async def test_one_failure_is_one_request_s(queue: WorkQueue) -> None:
-    def broken() -> None:
+    def broken(_: object) -> None:
         raise ZeroDivisionError
 
     results: list[Any] = await asyncio.gather(
         queue.run(broken, ENDLESS, kind="q", size=1),
-        queue.run(lambda: "fine", ENDLESS, kind="q", size=1),
+        queue.run(lambda _: "fine", ENDLESS, kind="q", size=1),
         queue.run(broken, ENDLESS, kind="q", size=1, costly=True),
-        queue.run(lambda: "fine", ENDLESS, kind="q", size=1, costly=True),
+        queue.run(lambda _: "fine", ENDLESS, kind="q", size=1, costly=True),
         return_exceptions=True,
     )
     assert isinstance(results[0], ZeroDivisionError)
@@ -87,10 +87,10 @@ async def test_work_whose_deadline_has_passed_is_never_begun(
     begun: list[int] = []
     with pytest.raises(DeadlinePassedError):
         await queue.run(
-            lambda: begun.append(1), Ticket(monotonic()), kind="q", size=1, costly=costly
+            lambda _: begun.append(1), Ticket(monotonic()), kind="q", size=1, costly=costly
         )
     # What comes after it is computed all the same.
-    assert (await queue.run(lambda: 2, ENDLESS, kind="q", size=1, costly=costly)).result == 2
+    assert (await queue.run(lambda _: 2, ENDLESS, kind="q", size=1, costly=costly)).result == 2
     assert not begun
 
 
@@ -99,7 +99,7 @@ async def test_nobody_waits_past_the_deadline_for_costly_work(queue: WorkQueue) 
     release, begun = threading.Event(), threading.Event()
     behind: list[int] = []
 
-    def slow() -> None:
+    def slow(_: object) -> None:
         begun.set()
         release.wait(30)
 
@@ -108,22 +108,22 @@ async def test_nobody_waits_past_the_deadline_for_costly_work(queue: WorkQueue) 
     )
     assert await asyncio.to_thread(begun.wait, 30)
     second = queue.run(
-        lambda: behind.append(1), Ticket(monotonic() + 0.2), kind="q", size=1, costly=True
+        lambda _: behind.append(1), Ticket(monotonic() + 0.2), kind="q", size=1, costly=True
     )
     results = await asyncio.gather(first, second, return_exceptions=True)
     assert all(isinstance(result, DeadlinePassedError) for result in results)
     release.set()
-    assert (await queue.run(lambda: 3, ENDLESS, kind="q", size=1, costly=True)).result == 3
+    assert (await queue.run(lambda _: 3, ENDLESS, kind="q", size=1, costly=True)).result == 3
     assert not behind
 
 
 async def test_the_event_loop_goes_on_beside_costly_work(queue: WorkQueue) -> None:
     release = threading.Event()
     costly = asyncio.ensure_future(
-        queue.run(lambda: release.wait(30), ENDLESS, kind="draw", size=1, costly=True)
+        queue.run(lambda _: release.wait(30), ENDLESS, kind="draw", size=1, costly=True)
     )
     # Cheap jobs are answered while the costly one is under way: only they can end it.
-    assert (await queue.run(lambda: "answered", ENDLESS, kind="q", size=1)).result == "answered"
+    assert (await queue.run(lambda _: "answered", ENDLESS, kind="q", size=1)).result == "answered"
     release.set()
     assert (await costly).result
 
@@ -144,9 +144,9 @@ async def test_a_kind_that_turns_out_costly_moves_to_the_thread(
     here = threading.current_thread().name
     for size in (1, 100, 1, 100):
         seconds = size * CHEAP / 10
-        await queue.run(lambda s=seconds: job(s), ENDLESS, kind="q", size=size)
+        await queue.run(lambda _, s=seconds: job(s), ENDLESS, kind="q", size=size)
     assert [name == here for name in where] == [True, False, True, False]
-    await queue.run(lambda: job(0), ENDLESS, kind="another", size=100)
+    await queue.run(lambda _: job(0), ENDLESS, kind="another", size=100)
     assert where[-1] == here
 
 
@@ -154,7 +154,7 @@ async def test_a_long_queue_lets_others_have_their_turn(queue: WorkQueue) -> Non
     turns: list[int] = []
     computed = 0
 
-    def job() -> None:
+    def job(_: object) -> None:
         nonlocal computed
         computed += 1
         sleep(5e-4)
@@ -177,7 +177,7 @@ async def test_costly_work_of_those_who_have_gone_is_dropped(queue: WorkQueue) -
 
     with pytest.raises(DisconnectedError):
         await queue.run(
-            lambda: begun.append(1), Ticket(math.inf, gone), kind="q", size=1, costly=True
+            lambda _: begun.append(1), Ticket(math.inf, gone), kind="q", size=1, costly=True
         )
     assert not begun
 
@@ -189,7 +189,7 @@ async def test_waiting_and_computing_are_told_apart(
     now = 0.0
     monkeypatch.setattr("app.serving.queue.monotonic", lambda: now)
 
-    def job() -> None:
+    def job(_: object) -> None:
         nonlocal now
         now += 2.0
 
@@ -202,8 +202,8 @@ async def test_waiting_and_computing_are_told_apart(
 
 async def test_a_request_that_is_cancelled_leaves_the_queue_in_order(queue: WorkQueue) -> None:
     begun: list[int] = []
-    waiting = asyncio.ensure_future(queue.run(lambda: begun.append(1), ENDLESS, kind="q", size=1))
+    waiting = asyncio.ensure_future(queue.run(lambda _: begun.append(1), ENDLESS, kind="q", size=1))
     await asyncio.sleep(0)
     waiting.cancel()
-    assert (await queue.run(lambda: 2, ENDLESS, kind="q", size=1)).result == 2
+    assert (await queue.run(lambda _: 2, ENDLESS, kind="q", size=1)).result == 2
     assert not begun
