@@ -14,14 +14,17 @@ from fastapi import APIRouter, FastAPI
 
 from app.api import middleware, problems
 from app.api.body import JSONRoute
+from app.api.connections import guarded
 from app.api.dependencies import RequestId
 from app.schemas import (
     Because,
+    Detection,
     Health,
     MissingAnswer,
     MissingObject,
     MissingRequest,
     ModelReference,
+    ObservedRelation,
     Outlier,
     OutliersAnswer,
     OutliersRequest,
@@ -35,6 +38,9 @@ from app.serving.logs import log_config
 from app.serving.metrics import Metrics, Unmeasured
 from app.settings import Settings
 
+# So many relations a posed object are derived in the rooms that are asked about.
+_DERIVED = 3
+
 _MODEL = ModelReference(name="echo", version="1.0.0", variant="triway", digest="0" * 64)
 
 router = APIRouter(route_class=JSONRoute)
@@ -46,12 +52,23 @@ def _names(request: SceneRequest) -> list[str]:
     ]
 
 
+def _derived(request: SceneRequest) -> list[ObservedRelation] | None:
+    names = [entry.id or "" for entry in request.objects if isinstance(entry, Detection)]
+    if not names:
+        return None
+    return [
+        ObservedRelation(names[k % len(names)], "left", names[-1 - k % len(names)])
+        for k in range(_DERIVED * len(names))
+    ]
+
+
 def _envelope(request: SceneRequest, request_id: str) -> dict[str, Any]:
     return {
         "model": _MODEL,
         "request_id": request_id,
         "frame_id": request.frame_id,
         "stamp": request.stamp,
+        "observed_relations": _derived(request),
     }
 
 
@@ -120,7 +137,7 @@ async def outliers(request: OutliersRequest, request_id: RequestId) -> OutliersA
                 object=relation.object,
                 probability=0.123456789,
             )
-            for relation in request.relations or ()
+            for relation in request.relations or _derived(request) or ()
         ],
     )
 
@@ -145,6 +162,8 @@ if __name__ == "__main__":
     uvicorn.run(
         build(settings),
         port=int(sys.argv[1]),
+        http=guarded(settings.client_timeout),
+        ws="none",
         log_config=log_config(settings.log_level, settings.log_format),
         access_log=False,
         server_header=False,

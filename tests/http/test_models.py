@@ -316,7 +316,10 @@ async def test_a_request_keeps_the_models_it_started_with(store: Path) -> None:
         publish(store, "home", "2.0.0", seed=2, alias="default")
         await runtime.refresh("y")
         assert session.models.resolve("default").reference.version == "1.0.0"
-        assert runtime.session("z", Ticket(math.inf)).models.resolve("default").reference.version == "2.0.0"
+        assert (
+            runtime.session("z", Ticket(math.inf)).models.resolve("default").reference.version
+            == "2.0.0"
+        )
 
 
 async def test_replaced_models_are_freed(store: Path, admin: dict[str, str]) -> None:
