@@ -51,8 +51,9 @@ format: $(EVERYTHING)  ## rewrite the sources in the house format
 	$(BIN)/python -m ruff check --fix-only --quiet .
 	$(BIN)/python -m ruff format .
 
-bench: $(EVERYTHING)  ## run the benchmarks
+bench: $(EVERYTHING)  ## run the benchmarks, then the service under load beside an echo of it
 	$(BIN)/python -m benchmarks $(ARGS)
+	$(if $(ARGS),,$(BIN)/python -m benchmarks.load)
 
 lock: $(BIN)/python  ## resolve pyproject.toml anew into requirements*.lock
 	$(BIN)/python scripts/lock.py $(INDEX) $(ARGS)

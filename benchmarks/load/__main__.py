@@ -13,15 +13,18 @@ from typing import Annotated, Any
 import httpx
 import matplotlib as mpl
 import typer
+import uvloop
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.load import servers
 from benchmarks.load.measure import Comparison, compare, concurrency, rate
-from benchmarks.load.questions import KINDS, ROUTES, requests
+from benchmarks.load.questions import KINDS, ROUTES, drawings, requests
+from benchmarks.load.windows import at_concurrency
 from benchmarks.report import describe_machine
 
 _MANY = 32
+_DRAWN = 8
 _QUANTILES = (0.5, 0.9, 0.99, 0.999)
 # At a rate that leaves the service air: half of what the echo answers at 32 connections.
 _SHARE = 0.5
@@ -74,6 +77,10 @@ def main(
         for comparison in _all(service.port, echo.port, kind or KINDS, labels, seconds):
             found.append(comparison)
             console.print(_line(comparison), highlight=False)
+        drawn = uvloop.run(at_concurrency(service.port, drawings(labels, _DRAWN), 1, 4 * seconds))
+        facts[f"/generate of {_DRAWN} scenes, p99 at one connection, ms"] = 1e3 * drawn.quantile(
+            0.99
+        )
         facts["resident memory, MB"] = service.memory / 1e6
     console.print(_table(found))
     for name, value in facts.items():

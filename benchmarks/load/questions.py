@@ -32,6 +32,22 @@ def requests(kind: str, route: str, labels: Sequence[str]) -> list[bytes]:
     return [prepared(route, body) for body in bodies(kind, labels)]
 
 
+def drawings(labels: Sequence[str], count: int, seed: int = 0) -> list[bytes]:
+    """Requests for so many scenes each that hold three objects, as they go over the wire."""
+    rng = np.random.default_rng(seed)
+    return [
+        prepared(
+            "/generate",
+            {
+                "objects": [labels[k] for k in rng.choice(len(labels), 3, replace=False)],
+                "count": count,
+                "seed": number,
+            },
+        )
+        for number in range(SCENES)
+    ]
+
+
 def _body(kind: str, labels: Sequence[str], rng: np.random.Generator) -> dict[str, Any]:
     chosen = [labels[k] for k in rng.choice(len(labels), _OBJECTS, replace=False)]
     if kind == "12 labels":
