@@ -30,16 +30,16 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     scene = _scene(artifact.vocabulary)
     bare = replace(scene, relations=None)
     seen = observe(bare, typical_sizes=artifact.vocabulary.sizes)
-    relations = [
-        entry for one in (scene, bare, seen) for entry in reasoning.relations(artifact, one)
-    ]
-    missing = [entry for one in (scene, bare, seen) for entry in reasoning.missing(artifact, one)]
+    # Kernels of tensors are warm after one scene; compiled loops are told apart by what is given.
+    scenes = (scene, bare, seen) if artifact.closed_form is not None else (scene,)
+    relations = [entry for one in scenes for entry in reasoning.relations(artifact, one)]
+    missing = [entry for one in scenes for entry in reasoning.missing(artifact, one)]
     if len(scene.objects) > 1:
-        for one in (scene, bare):
+        for one in scenes[:2]:
             reasoning.missing(artifact, one, at=("on-top", 0))
             reasoning.missing(artifact, one, at=("under", 0))
     outliers, misplaced = reasoning.outliers(artifact, scene)
-    for one in (bare, seen):
+    for one in scenes[1:]:
         outliers += reasoning.outliers(artifact, one)[0]
     generated = reasoning.generate(artifact, scene, count=2, seed=0, steps=STEPS)
     numbers = [entry.probability for entry in relations]

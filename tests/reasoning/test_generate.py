@@ -71,6 +71,24 @@ def test_the_seed_decides_and_the_count_does_not(name):
     assert generate(artifact, scene, count=16, seed=6, steps=6)[:8] != many[8:16]
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_drawing_stops_when_told_to(name):
+    """Nobody waits any more: what was drawn so far is as it would have been."""
+    artifact, scene = ARTIFACTS[name], scene_of([0, 1], [(2, 1, 0)])
+    whole = generate(artifact, scene, count=32, seed=5, steps=6)
+    asked = 0
+
+    def stop():
+        nonlocal asked
+        asked += 1
+        return asked > 2
+
+    part = generate(artifact, scene, count=32, seed=5, steps=6, stop=stop)
+    assert 0 < len(part) < 32
+    assert part == whole[: len(part)]
+    assert generate(artifact, scene, count=32, seed=5, stop=lambda: True) == ()
+
+
 def test_what_was_seen_not_to_hold_stays_off():
     """Two boxes a metre apart, side by side: nothing but left holds of them."""
     plain = scene_of([0, 1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from time import monotonic, sleep
 from typing import Any
@@ -115,6 +115,33 @@ async def test_nobody_waits_past_the_deadline_for_costly_work(queue: WorkQueue) 
     release.set()
     assert (await queue.run(lambda _: 3, ENDLESS, kind="q", size=1, costly=True)).result == 3
     assert not behind
+
+
+async def test_costly_work_hears_that_it_was_given_up(queue: WorkQueue) -> None:
+    """By the deadline, or by a client that leaves while it is under way."""
+    heard = threading.Event()
+    here = True
+
+    def endless(given_up: Callable[[], bool]) -> None:
+        while not given_up():
+            sleep(0.001)
+        heard.set()
+
+    async def gone() -> bool:
+        return not here
+
+    with pytest.raises(DeadlinePassedError):
+        await queue.run(endless, Ticket(monotonic() + 0.1), kind="q", size=1, costly=True)
+    assert await asyncio.to_thread(heard.wait, 30)
+    heard.clear()
+    leaving = asyncio.ensure_future(
+        queue.run(endless, Ticket(math.inf, gone), kind="q", size=1, costly=True)
+    )
+    await asyncio.sleep(0.05)
+    here = False
+    with pytest.raises(DisconnectedError):
+        await leaving
+    assert await asyncio.to_thread(heard.wait, 30)
 
 
 async def test_the_event_loop_goes_on_beside_costly_work(queue: WorkQueue) -> None:
