@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from time import monotonic
+from time import monotonic, thread_time
 from typing import Any, Final, Generic, TypeVar
 
 from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
@@ -165,11 +165,11 @@ class WorkQueue:
         came = monotonic()
 
         def measured(given_up: Callable[[], bool]) -> Done[T]:
-            began = monotonic()
+            began, at_work = monotonic(), thread_time()
             result = call(given_up)
-            seconds = monotonic() - began
-            cost.learn(seconds, size)
-            return Done(result, began - came, seconds)
+            # What the job itself took: in the worker thread it also waits for the interpreter.
+            cost.learn(thread_time() - at_work, size)
+            return Done(result, began - came, monotonic() - began)
 
         if costly or cost.expected(size) > CHEAP:
             return await self._in_thread(measured, ticket)

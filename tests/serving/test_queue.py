@@ -161,7 +161,7 @@ async def test_a_kind_that_turns_out_costly_moves_to_the_thread(
     """In proportion to its size, and back again for small ones."""
     where: list[str] = []
     now = 0.0
-    monkeypatch.setattr("app.serving.queue.monotonic", lambda: now)
+    monkeypatch.setattr("app.serving.queue.thread_time", lambda: now)
 
     def job(seconds: float) -> None:
         nonlocal now
