@@ -13,7 +13,7 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
+import subprocess  # nosec B404: the workers are processes of our own program
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -227,7 +227,8 @@ class Supervisor:
         if self._metrics is not None:
             environment[_METRICS] = self._metrics
         # Started anew and not forked: a copy of a process with threads may hang in its locks.
-        return subprocess.Popen(  # noqa: S603  our own command
+        # Our own command, with numbers for arguments.
+        return subprocess.Popen(  # noqa: S603  # nosec B603
             [*self._command, *map(str, descriptors)], pass_fds=descriptors, env=environment
         )
 
