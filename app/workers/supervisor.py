@@ -13,7 +13,7 @@ import os
 import shutil
 import signal
 import socket
-import subprocess  # nosec B404: the workers are processes of our own program
+import subprocess  # nosec B404
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
