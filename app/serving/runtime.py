@@ -138,9 +138,7 @@ class Runtime:
 
         Raises:
             NotReadyError: nothing has been loaded yet.
-            DrainingError: nothing new is taken.
         """
-        self._check_open()
         record = record or RequestRecord()
         return Session(self.models, self._limits, request_id, ticket, self.metrics, record)
 
@@ -150,12 +148,9 @@ class Runtime:
         Raises:
             NotReadyError, DrainingError: they cannot.
         """
-        self._check_open()
-        self.models.resolve(DEFAULT)
-
-    def _check_open(self) -> None:
         if self.draining:
             raise DrainingError("The service finishes what it has begun, and then ends.")
+        self.models.resolve(DEFAULT)
 
     def drain(self) -> None:
         """Take nothing new from now on, and say so to those who ask whether it is ready."""
