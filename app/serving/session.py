@@ -104,15 +104,23 @@ class Session:
         costly: bool = False,
     ) -> T:
         queue, reference = model.queue, model.reference
-        with queue.holding(0 if self.holding else rows):
-            self.metrics.pending(reference, queue.rows)
+        with self._room(model, 0 if self.holding else rows):
             done = await queue.run(call, self.ticket, kind=name, size=size, costly=costly)
-        self.metrics.pending(reference, queue.rows)
         self.metrics.waited(reference, done.waited)
         self.metrics.computed(reference, name, rows, done.computed)
         self.record.waited(done.waited)
         self.record.computed(done.computed)
         return done.result
+
+    @contextmanager
+    def _room(self, model: ServedModel, rows: int) -> Iterator[None]:
+        """Rows of a model's queue, counted as they come and go, however the work ends."""
+        try:
+            with model.queue.holding(rows):
+                self.metrics.pending(model.reference, model.queue.rows)
+                yield
+        finally:
+            self.metrics.pending(model.reference, model.queue.rows)
 
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Session]:
@@ -130,7 +138,7 @@ class Session:
                     model = self.models.resolve(reference)
                 except ServingError:
                     continue
-                held.enter_context(model.queue.holding(rows))
+                held.enter_context(self._room(model, rows))
             yield replace(self, holding=True)
 
     def envelope(

@@ -131,6 +131,30 @@ async def test_batches_give_their_rows_back(shared_store: Path) -> None:
 
 
 @pytest.mark.anyio
+async def test_nothing_is_told_to_wait_once_it_has_ended(
+    shared_store: Path, hold: Callable[[], threading.Event]
+) -> None:
+    """After a batch, and after work that was given up, the gauge is back at 0."""
+    async with serve(shared_store) as client:
+
+        async def pending() -> set[float]:
+            text = (await client.get("/metrics")).text
+            return {float(line.split()[-1]) for line in text.splitlines()
+                    if line.startswith("scene_pending_rows{")}  # fmt: skip
+
+        await client.post("/missing/batch", json={"scenes": [SCENE] * 5})
+        assert await pending() == {0.0}
+        hold()
+        drawing = asyncio.ensure_future(
+            client.post("/generate", json=SCENE, headers={"X-Request-Timeout-Ms": "400"})
+        )
+        await asyncio.sleep(0.1)
+        assert await pending() == {0.0, 1.0}
+        problem(await drawing, 504, "deadline-passed")
+        assert await pending() == {0.0}
+
+
+@pytest.mark.anyio
 async def test_a_batch_stops_where_its_deadline_passes(
     shared_store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
