@@ -1,6 +1,6 @@
 """``python -m app.compile``: compile all loops for this machine, ahead of the first start.
 
-The service does so by itself where it finds nothing compiled, and starts half a minute or so later.
+The service does so by itself where it finds nothing compiled, and starts a minute or so later.
 """
 
 from __future__ import annotations

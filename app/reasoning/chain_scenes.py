@@ -12,9 +12,9 @@ from app.boltzmann.scene_chains import ConditionedChains, Conditions, Drawn
 from app.reasoning.answers import GeneratedScene
 from app.reasoning.chains import held_units
 from app.reasoning.exclusion import Triple, staying
+from app.reasoning.given import given_relations
 from app.reasoning.present import Present, present
 from app.registry.artifact import Artifact
-from app.scene.evidence import class_evidence
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
 
@@ -56,16 +56,14 @@ def chain_scenes(
 def _conditions(
     scene: Scene, classes: Present, relations: int, held: NDArray[np.int64]
 ) -> Conditions:
+    given = given_relations(scene, classes, relations)
     a = i = j = np.zeros(0, dtype=np.int64)
     r = np.zeros(0, dtype=np.bool_)
-    if scene.relations or scene.relations_complete or scene.poses:
-        found = class_evidence(scene)
-        # A machine may know fewer relations than there are.
-        a, i, j = np.nonzero(found.observed[:relations])
-        r = found.holds[a, i, j]
+    if given is not None:
+        a, i, j, r = given.a, given.i, given.j, given.r > 0
     return Conditions(
         classes=classes.classes,
-        log_counts=np.log(classes.counts).astype(np.float32),
+        log_counts=classes.log_counts,
         a=a,
         i=i,
         j=j,
