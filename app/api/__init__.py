@@ -47,7 +47,13 @@ def build(
     app.state.settings = settings
     app.state.runtime = runtime
     problems.install(app)
-    middleware.install(app, settings, runtime.metrics, lambda: runtime.draining)
+    middleware.install(
+        app,
+        settings,
+        runtime.metrics,
+        backlog=lambda: runtime.backlog,
+        is_draining=lambda: runtime.draining,
+    )
     for router in (
         questions.router,
         batches.router,

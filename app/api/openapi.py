@@ -9,8 +9,8 @@ from fastapi.routing import APIRoute
 
 from app.api import catalogue, examples, keys
 from app.api.catalogue import ProblemType
+from app.api.middleware.turnstile import MAX_TIMEOUT_MS, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE, ProblemError
-from app.api.turnstile import MAX_TIMEOUT_MS, TIMEOUT_HEADER
 from app.schemas import MAX_SEED, FieldError, Problem
 
 Responses = dict[int | str, dict[str, Any]]

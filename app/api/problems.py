@@ -236,7 +236,7 @@ def install(app: FastAPI) -> None:
 
     Defects are not among them: the framework raises them again after its handler has answered, and
     the server then drops a connection that the client has just been told it may use again.
-    `middleware.Defects` answers them.
+    `middleware.defects.Defects` answers them.
     """
     for kind in (HTTPException, RequestValidationError, ServingError):
         app.add_exception_handler(kind, _handle)

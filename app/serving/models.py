@@ -101,6 +101,11 @@ class ServedModels:
         aliases = MappingProxyType({**self.store.aliases, alias: target})
         return replace(self, store=replace(self.store, aliases=aliases))
 
+    @property
+    def backlog(self) -> int:
+        """How many cheap jobs wait for the event loop."""
+        return sum([model.queue.backlog for model in self.served.values()])
+
     @cached_property
     def failures(self) -> Mapping[str, Failure]:
         """Everything that cannot be used, by subject: versions, aliases, the store itself."""

@@ -124,6 +124,11 @@ class WorkQueue:
     _draining: bool = False
     _costs: dict[str, _Cost] = field(default_factory=dict)
 
+    @property
+    def backlog(self) -> int:
+        """How many cheap jobs wait for the event loop."""
+        return len(self._waiting)
+
     @contextmanager
     def holding(self, rows: int) -> Iterator[None]:
         """Room for so many rows.
@@ -180,6 +185,8 @@ class WorkQueue:
             self._draining = True
             loop.call_soon(self._drain)
         found: Done[T] = await job.future
+        # Others may have had their turns meanwhile.
+        ticket.check()
         return found
 
     def _drain(self) -> None:

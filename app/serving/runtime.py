@@ -142,6 +142,11 @@ class Runtime:
         record = record or RequestRecord()
         return Session(self.models, self._limits, request_id, ticket, self.metrics, record)
 
+    @property
+    def backlog(self) -> int:
+        """How many cheap jobs wait for the event loop."""
+        return 0 if self._models is None else self._models.backlog
+
     def check_ready(self) -> None:
         """Return if requests that name no model can be answered.
 

@@ -6,6 +6,7 @@ import asyncio
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +16,7 @@ import httpx
 import pytest
 
 from app import reasoning
-from app.api.turnstile import PACE, Turnstile
+from app.api.middleware.turnstile import PACE, REFUSALS, Turnstile
 from app.serving.queue import WorkQueue
 from tests.http.conftest import launch, serve
 from tests.http.test_problems import problem
@@ -202,12 +203,12 @@ class _App:
             retry_after = 1
 
 
-def _turnstile(begun: list[str], limit: int) -> Turnstile:
+def _turnstile(begun: list[str], limit: int, backlog: Callable[[], int] = lambda: 0) -> Turnstile:
     async def answer(scope: Any, receive: Any, send: Any) -> None:
         begun.append(scope["path"])
         await send({"type": "http.response.start", "status": 200, "headers": []})
 
-    return Turnstile(answer, limit=limit, timeout=10.0)
+    return Turnstile(answer, limit=limit, timeout=10.0, backlog=backlog)
 
 
 @pytest.mark.anyio
@@ -239,6 +240,45 @@ async def test_too_many_at_once_are_refused_and_health_passes_by() -> None:
     statuses = await asyncio.gather(*(_call(turnstile, path) for path in paths))
     assert statuses == [200] * (PACE + 10) + [429] * 5 + [200]
     assert begun.index("/health/live") == PACE
+
+
+@pytest.mark.anyio
+async def test_no_more_is_begun_than_the_models_keep_up_with() -> None:
+    begun: list[str] = []
+    done = 0
+    turnstile = _turnstile(begun, limit=1000, backlog=lambda: len(begun) - done)
+    waiting: list[int] = []
+
+    async def work() -> None:
+        nonlocal done
+        while done < 300:
+            waiting.append(len(begun) - done)
+            done = min(done + 3, len(begun))
+            await asyncio.sleep(0)
+
+    *statuses, _ = await asyncio.gather(*(_call(turnstile) for _ in range(300)), work())
+    assert statuses == [200] * 300
+    assert max(waiting) == PACE
+
+
+@pytest.mark.anyio
+async def test_refusals_hold_up_no_tick_either() -> None:
+    turnstile = _turnstile([], limit=1)
+    statuses: list[int] = []
+    ticks: list[int] = []
+
+    async def call() -> None:
+        statuses.append(await _call(turnstile))
+
+    async def clock() -> None:
+        while len(statuses) < PACE + 200:
+            ticks.append(statuses.count(429))
+            await asyncio.sleep(0)
+
+    await asyncio.gather(*(call() for _ in range(PACE + 200)), clock())
+    assert Counter(statuses) == {200: PACE + 1, 429: 199}
+    steps = [after - before for before, after in pairwise(ticks)]
+    assert max(steps) == REFUSALS
 
 
 @pytest.mark.anyio
