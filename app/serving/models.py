@@ -103,7 +103,7 @@ class ServedModels:
 
     @property
     def backlog(self) -> int:
-        """How many cheap jobs wait for the event loop."""
+        """How many questions wait or are under way."""
         return sum([model.queue.backlog for model in self.served.values()])
 
     @cached_property

@@ -3,7 +3,8 @@
 What arrives within one tick is computed in the next, each job by itself, so an answer never depends
 on what it waited beside. Cheap jobs run where they stand: a hop to a thread costs as much as most
 of them. A job that is expected to take longer than `CHEAP` goes to the process's one worker thread,
-where compiled loops and tensor kernels let the event loop go on.
+where compiled loops and tensor kernels let the event loop go on. Drawings, which may take seconds,
+have a thread of their own: nobody who asks about a scene waits for them.
 
 A job whose deadline has passed, or whose client has gone, is dropped when its turn comes.
 """
@@ -13,9 +14,10 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from time import monotonic, thread_time
 from typing import Any, Final, Generic, TypeVar
 
@@ -78,16 +80,13 @@ class Done(Generic[T]):
     computed: float
 
 
-_Call = Callable[[Callable[[], bool]], Done[T]]
-
-
-def _never() -> bool:
-    return False
+def _one_thread(name: str) -> Executor:
+    return ThreadPoolExecutor(1, thread_name_prefix=name)
 
 
 @dataclass(slots=True, eq=False)
 class _Job:
-    call: _Call[Any]
+    call: Callable[[], Done[Any]]
     ticket: Ticket
     future: asyncio.Future[Any]
 
@@ -107,27 +106,42 @@ class _Cost:
         self.per_unit = known + _NEWEST * (measured - known)
 
 
+@dataclass(frozen=True, slots=True)
+class Threads:
+    """The worker threads of a process, shared by the queues of all its models.
+
+    Attributes:
+        costly: for questions that would hold up the event loop.
+        drawing: for drawings.
+    """
+
+    costly: Executor = field(default_factory=partial(_one_thread, "costly work"))
+    drawing: Executor = field(default_factory=partial(_one_thread, "drawing"))
+
+    def stop(self) -> None:
+        """Let go of them; what they have not begun is dropped."""
+        for executor in (self.costly, self.drawing):
+            executor.shutdown(wait=False, cancel_futures=True)
+
+
 @dataclass(eq=False)
 class WorkQueue:
     """Jobs of one model.
 
     Attributes:
         limit: most rows (scenes, or drawn scenes) that may wait or be under way.
-        executor: the worker thread, shared by all queues of the process.
+        threads: for work that is not cheap.
         rows: how many there are now.
+        backlog: how many questions wait or are under way; drawings are not counted.
     """
 
     limit: int
-    executor: Executor
+    threads: Threads
     rows: int = 0
+    backlog: int = 0
     _waiting: deque[_Job] = field(default_factory=deque)
     _draining: bool = False
     _costs: dict[str, _Cost] = field(default_factory=dict)
-
-    @property
-    def backlog(self) -> int:
-        """How many cheap jobs wait for the event loop."""
-        return len(self._waiting)
 
     @contextmanager
     def holding(self, rows: int) -> Iterator[None]:
@@ -145,21 +159,13 @@ class WorkQueue:
             self.rows -= rows
 
     async def run(
-        self,
-        call: Callable[[Callable[[], bool]], T],
-        ticket: Ticket,
-        *,
-        kind: str,
-        size: float,
-        costly: bool = False,
+        self, call: Callable[[], T], ticket: Ticket, *, kind: str, size: float
     ) -> Done[T]:
-        """Let a job be done.
+        """Let a question be answered.
 
         Args:
-            call: the work; it may run in another thread. What it is given says whether the result
-                has been given up, which long work asks from time to time.
+            call: the work; it may run in another thread.
             kind: jobs of one kind cost alike, in proportion to ``size``.
-            costly: always for the worker thread.
 
         Raises:
             DeadlinePassedError: the deadline passed first; the work is dropped, or its result.
@@ -167,19 +173,37 @@ class WorkQueue:
             Exception: whatever the job raises.
         """
         cost = self._costs.setdefault(kind, _Cost())
-        came = monotonic()
 
-        def measured(given_up: Callable[[], bool]) -> Done[T]:
-            began, at_work = monotonic(), thread_time()
-            result = call(given_up)
+        def learnt() -> T:
+            began = thread_time()
+            result = call()
             # What the job itself took: in the worker thread it also waits for the interpreter.
-            cost.learn(thread_time() - at_work, size)
-            return Done(result, began - came, monotonic() - began)
+            cost.learn(thread_time() - began, size)
+            return result
 
-        if costly or cost.expected(size) > CHEAP:
-            return await self._in_thread(measured, ticket)
+        self.backlog += 1
+        try:
+            if cost.expected(size) > CHEAP:
+                return await _in_thread(lambda _: learnt(), ticket, self.threads.costly)
+            return await self._in_tick(_measured(learnt), ticket)
+        finally:
+            self.backlog -= 1
+
+    async def draw(self, call: Callable[[Callable[[], bool]], T], ticket: Ticket) -> Done[T]:
+        """Let scenes be drawn.
+
+        Args:
+            call: the work, for the drawing thread. What it is given says whether the result has
+                been given up, which long work asks from time to time.
+
+        Raises:
+            DeadlinePassedError, DisconnectedError, Exception: see `run`.
+        """
+        return await _in_thread(call, ticket, self.threads.drawing)
+
+    async def _in_tick(self, call: Callable[[], Done[T]], ticket: Ticket) -> Done[T]:
         loop = asyncio.get_running_loop()
-        job = _Job(measured, ticket, loop.create_future())
+        job = _Job(call, ticket, loop.create_future())
         self._waiting.append(job)
         if not self._draining:
             self._draining = True
@@ -200,36 +224,50 @@ class WorkQueue:
                 return
         self._draining = False
 
-    async def _in_thread(self, call: _Call[T], ticket: Ticket) -> Done[T]:
-        ticket.check()
-        await ticket.check_there()
-        given_up = False
 
-        def unless_given_up() -> Done[T]:
-            # The thread's own queue holds what is given up until its turn, and no longer.
-            if given_up:
-                raise DeadlinePassedError("given up")
-            return call(lambda: given_up)
+async def _in_thread(
+    call: Callable[[Callable[[], bool]], T], ticket: Ticket, executor: Executor
+) -> Done[T]:
+    ticket.check()
+    await ticket.check_there()
+    given_up = False
 
-        loop = asyncio.get_running_loop()
-        future = loop.run_in_executor(self.executor, unless_given_up)
-        try:
-            while True:
-                left = ticket.deadline - monotonic()
-                await asyncio.wait([future], timeout=min(left, _LOOK))
-                if future.done():
-                    return future.result()
-                if left <= _LOOK:
-                    raise DeadlinePassedError("The deadline passed before the answer was there.")
-                await ticket.check_there()
-        finally:
-            given_up = True
-            future.cancel()
+    def unless_given_up() -> T:
+        # The thread's own queue holds what is given up until its turn, and no longer.
+        if given_up:
+            raise DeadlinePassedError("given up")
+        return call(lambda: given_up)
+
+    future = asyncio.get_running_loop().run_in_executor(executor, _measured(unless_given_up))
+    try:
+        while True:
+            left = ticket.deadline - monotonic()
+            await asyncio.wait([future], timeout=min(left, _LOOK))
+            if future.done():
+                return future.result()
+            if left <= _LOOK:
+                raise DeadlinePassedError("The deadline passed before the answer was there.")
+            await ticket.check_there()
+    finally:
+        given_up = True
+        future.cancel()
+
+
+def _measured(call: Callable[[], T]) -> Callable[[], Done[T]]:
+    """The work with what it waited and took."""
+    came = monotonic()
+
+    def measured() -> Done[T]:
+        began = monotonic()
+        result = call()
+        return Done(result, began - came, monotonic() - began)
+
+    return measured
 
 
 def _settle(job: _Job) -> None:
     try:
         job.ticket.check()
-        job.future.set_result(job.call(_never))
+        job.future.set_result(job.call())
     except Exception as error:  # noqa: BLE001 - it belongs to the request, which raises it
         job.future.set_exception(error)

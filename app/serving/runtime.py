@@ -8,7 +8,6 @@ import gc
 import logging
 import sys
 from collections.abc import Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
 from pathlib import Path
 from typing import Concatenate, Literal, ParamSpec, TypeVar
@@ -37,7 +36,7 @@ from app.serving.metrics import Change as Counted
 from app.serving.metrics import Metrics
 from app.serving.models import DEFAULT, ServedModels, prepare
 from app.serving.peers import Alone, Change, Peers
-from app.serving.queue import Ticket, WorkQueue
+from app.serving.queue import Threads, Ticket, WorkQueue
 from app.serving.reading import Limits
 from app.serving.record import RequestRecord
 from app.serving.session import Session
@@ -111,7 +110,7 @@ class Runtime:
         self._store = Store(store, lock_timeout=_LOCK_TIMEOUT)
         self._limits = limits
         self._queue_rows = queue_rows
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="costly work")
+        self._threads = Threads()
         self._peers = peers or Alone()
         self._models: ServedModels | None = None
         self._candidate: ServedModels | None = None
@@ -144,7 +143,7 @@ class Runtime:
 
     @property
     def backlog(self) -> int:
-        """How many cheap jobs wait for the event loop."""
+        """How many questions wait or are under way."""
         return 0 if self._models is None else self._models.backlog
 
     def check_ready(self) -> None:
@@ -176,8 +175,8 @@ class Runtime:
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
 
     def stop(self) -> None:
-        """Let go of the worker thread; what it has not begun is dropped."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        """Let go of the worker threads; what they have not begun is dropped."""
+        self._threads.stop()
 
     @_counted("refresh")
     async def refresh(self, request_id: str) -> RefreshAnswer:
@@ -282,7 +281,7 @@ class Runtime:
         return prepare(load_model_set(self._store, known), self._new_queue, previous)
 
     def _new_queue(self) -> WorkQueue:
-        return WorkQueue(self._queue_rows, self._executor)
+        return WorkQueue(self._queue_rows, self._threads)
 
     def _target(self, reference: str) -> AliasTarget:
         try:

@@ -14,7 +14,7 @@ from app.schemas import SceneRequest
 from app.serving.errors import ServingError
 from app.serving.metrics import Metrics
 from app.serving.models import ServedModel, ServedModels
-from app.serving.queue import Ticket
+from app.serving.queue import Done, Ticket
 from app.serving.reading import Limits, Reading, read_scene
 from app.serving.record import RequestRecord
 
@@ -73,11 +73,15 @@ class Session:
         """
         # Pairs of objects are what the relation part is computed for, stated relations or not.
         size = (1 + len(scene.objects)) ** 2
-
-        def call(_: Callable[[], bool]) -> T:
-            return question(model.artifact, scene, *args, **kwargs)
-
-        return await self._run(model, call, question.__name__, size)
+        name = question.__name__
+        with self._room(model, 0 if self.holding else 1):
+            done = await model.queue.run(
+                lambda: question(model.artifact, scene, *args, **kwargs),
+                self.ticket,
+                kind=name,
+                size=size,
+            )
+        return self._noted(model, name, 1, done)
 
     async def draw(
         self, rows: int, model: ServedModel, name: str, draw: Callable[[Callable[[], bool]], T]
@@ -91,23 +95,13 @@ class Session:
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
-        return await self._run(model, draw, name, rows, rows=rows, costly=True)
-
-    async def _run(
-        self,
-        model: ServedModel,
-        call: Callable[[Callable[[], bool]], T],
-        name: str,
-        size: float,
-        *,
-        rows: int = 1,
-        costly: bool = False,
-    ) -> T:
-        queue, reference = model.queue, model.reference
         with self._room(model, 0 if self.holding else rows):
-            done = await queue.run(call, self.ticket, kind=name, size=size, costly=costly)
-        self.metrics.waited(reference, done.waited)
-        self.metrics.computed(reference, name, rows, done.computed)
+            done = await model.queue.draw(draw, self.ticket)
+        return self._noted(model, name, rows, done)
+
+    def _noted(self, model: ServedModel, name: str, rows: int, done: Done[T]) -> T:
+        self.metrics.waited(model.reference, done.waited)
+        self.metrics.computed(model.reference, name, rows, done.computed)
         self.record.waited(done.waited)
         self.record.computed(done.computed)
         return done.result

@@ -262,6 +262,52 @@ async def test_no_more_is_begun_than_the_models_keep_up_with() -> None:
 
 
 @pytest.mark.anyio
+async def test_who_would_spend_the_time_in_the_line_is_refused_at_once() -> None:
+    begun: list[str] = []
+    held = PACE
+    turnstile = _turnstile(begun, limit=100, backlog=lambda: held)
+    first = asyncio.ensure_future(_call(turnstile, "/first"))
+    await asyncio.sleep(0.02)
+    hurried = [(b"x-request-timeout-ms", b"30")]
+    assert await _call(turnstile, "/hurried", hurried) == 429
+    patient = asyncio.ensure_future(_call(turnstile, "/patient"))
+    await asyncio.sleep(0)
+    held = 0
+    assert await first == await patient == 200
+    assert begun == ["/first", "/patient"]
+
+
+@pytest.mark.anyio
+async def test_the_pace_of_the_line_is_learnt_and_decides_how_long_it_gets() -> None:
+    """At 2 ms each, who has 200 ms may stand behind some 25 others, and not behind 100."""
+    begun: list[str] = []
+    done = 0
+    ended = False
+    turnstile = _turnstile(begun, limit=1000, backlog=lambda: len(begun) - done)
+
+    async def work() -> None:
+        nonlocal done
+        while not ended:
+            await asyncio.sleep(0.002)
+            done = min(done + 1, len(begun))
+
+    worker = asyncio.ensure_future(work())
+    learning = [_call(turnstile) for _ in range(PACE + 30)]
+    assert set(await asyncio.gather(*learning)) == {200}
+    while done < len(begun):  # noqa: ASYNC110 - what is waited for is counted, and no event
+        await asyncio.sleep(0.001)
+    hurried = [(b"x-request-timeout-ms", b"200")]
+    statuses = await asyncio.gather(
+        *(_call(turnstile, "/relations", hurried) for _ in range(PACE + 100))
+    )
+    ended = True
+    await worker
+    counts = Counter(statuses)
+    assert set(counts) == {200, 429}
+    assert PACE < counts[200] < PACE + 50
+
+
+@pytest.mark.anyio
 async def test_refusals_hold_up_no_tick_either() -> None:
     turnstile = _turnstile([], limit=1)
     statuses: list[int] = []

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from app.registry import AliasTarget, Artifact, Store, load_model_set
 from app.serving.metrics import SHARED_DIRECTORY, Metrics, Unmeasured
 from app.serving.models import ServedModel, ServedModels
-from app.serving.queue import WorkQueue
+from app.serving.queue import Threads, WorkQueue
 from tests.http.stores import make_store
 
 
@@ -29,7 +28,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> ServedModels:
 def unwarmed(root: Path) -> ServedModels:
     store = load_model_set(Store(root))
     served = {
-        key: ServedModel(artifact, {}, WorkQueue(limit=8, executor=ThreadPoolExecutor(1)))
+        key: ServedModel(artifact, {}, WorkQueue(limit=8, threads=Threads()))
         for key, artifact in store.entries.items()
         if isinstance(artifact, Artifact)
     }

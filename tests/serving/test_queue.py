@@ -5,15 +5,14 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from time import monotonic, sleep
+from collections.abc import Callable, Coroutine, Iterator
+from time import monotonic, sleep, thread_time
 from typing import Any
 
 import pytest
 
 from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
-from app.serving.queue import CHEAP, Ticket, WorkQueue
+from app.serving.queue import CHEAP, Done, Threads, Ticket, WorkQueue
 
 pytestmark = pytest.mark.anyio
 
@@ -21,14 +20,47 @@ ENDLESS = Ticket(math.inf)
 
 
 @pytest.fixture
-def executor() -> Iterator[ThreadPoolExecutor]:
-    with ThreadPoolExecutor(1) as pool:
-        yield pool
+def threads() -> Iterator[Threads]:
+    threads = Threads()
+    yield threads
+    threads.stop()
 
 
 @pytest.fixture
-def queue(executor: ThreadPoolExecutor) -> WorkQueue:
-    return WorkQueue(limit=8, executor=executor)
+async def queue(threads: Threads) -> WorkQueue:
+    queue = WorkQueue(limit=8, threads=threads)
+
+    def busy() -> None:
+        end = thread_time() + 10 * CHEAP
+        while thread_time() < end:
+            pass
+
+    # From now on this kind is known to be costly.
+    await queue.run(busy, ENDLESS, kind="costly", size=1)
+    return queue
+
+
+Call = Callable[[], Any]
+
+
+def in_tick(
+    queue: WorkQueue, call: Call, ticket: Ticket = ENDLESS
+) -> Coroutine[Any, Any, Done[Any]]:
+    return queue.run(call, ticket, kind="cheap", size=1)
+
+
+def in_thread(
+    queue: WorkQueue, call: Call, ticket: Ticket = ENDLESS
+) -> Coroutine[Any, Any, Done[Any]]:
+    return queue.run(call, ticket, kind="costly", size=1)
+
+
+def drawn(queue: WorkQueue, call: Call, ticket: Ticket = ENDLESS) -> Coroutine[Any, Any, Done[Any]]:
+    return queue.draw(lambda _: call(), ticket)
+
+
+WAYS = (in_tick, in_thread, drawn)
+IN_THREADS = (in_thread, drawn)
 
 
 async def test_jobs_run_in_order_each_with_its_result(queue: WorkQueue) -> None:
@@ -38,7 +70,7 @@ async def test_jobs_run_in_order_each_with_its_result(queue: WorkQueue) -> None:
         order.append(number)
         return number * number
 
-    jobs = [queue.run(lambda _, k=k: job(k), ENDLESS, kind="q", size=1) for k in range(20)]
+    jobs = [queue.run(lambda k=k: job(k), ENDLESS, kind="q", size=1) for k in range(20)]
     assert [done.result for done in await asyncio.gather(*jobs)] == [k * k for k in range(20)]
     assert order == list(range(20))
 
@@ -49,29 +81,52 @@ async def test_what_arrives_in_one_tick_is_computed_in_the_next(queue: WorkQueue
 
     async def ask(name: str) -> None:
         order.append(f"{name} queued")
-        await queue.run(lambda _: order.append(f"{name} computed"), ENDLESS, kind="q", size=1)
+        await queue.run(lambda: order.append(f"{name} computed"), ENDLESS, kind="q", size=1)
 
     await asyncio.gather(ask("first"), ask("second"))
     assert order == ["first queued", "second queued", "first computed", "second computed"]
 
 
-async def test_one_failure_is_one_request_s(queue: WorkQueue) -> None:
-    def broken(_: object) -> None:
+@pytest.mark.parametrize("ask", WAYS)
+async def test_one_failure_is_one_request_s(queue: WorkQueue, ask: Any) -> None:
+    def broken() -> None:
         raise ZeroDivisionError
 
     results: list[Any] = await asyncio.gather(
-        queue.run(broken, ENDLESS, kind="q", size=1),
-        queue.run(lambda _: "fine", ENDLESS, kind="q", size=1),
-        queue.run(broken, ENDLESS, kind="q", size=1, costly=True),
-        queue.run(lambda _: "fine", ENDLESS, kind="q", size=1, costly=True),
-        return_exceptions=True,
+        ask(queue, broken), ask(queue, lambda: "fine"), return_exceptions=True
     )
     assert isinstance(results[0], ZeroDivisionError)
-    assert isinstance(results[2], ZeroDivisionError)
-    assert results[1].result == results[3].result == "fine"
+    assert results[1].result == "fine"
+    assert queue.backlog == 0
 
 
-def test_rows_are_bounded_and_given_back(queue: WorkQueue) -> None:
+async def test_questions_are_counted_until_they_are_answered_and_drawings_are_not(
+    queue: WorkQueue,
+) -> None:
+    release = threading.Event()
+    waiting = [
+        asyncio.ensure_future(ask(queue, lambda: release.wait(30)))
+        for ask in IN_THREADS
+        for _ in "ab"
+    ]
+    await asyncio.sleep(0)
+    assert queue.backlog == 2
+    release.set()
+    await asyncio.gather(*waiting)
+    assert queue.backlog == 0
+
+
+async def test_nobody_who_asks_waits_for_a_drawing(queue: WorkQueue) -> None:
+    release = threading.Event()
+    drawing = asyncio.ensure_future(drawn(queue, lambda: release.wait(30)))
+    # Only their answers let it end.
+    assert (await in_tick(queue, lambda: "cheap")).result == "cheap"
+    assert (await in_thread(queue, lambda: "costly")).result == "costly"
+    release.set()
+    assert (await drawing).result
+
+
+async def test_rows_are_bounded_and_given_back(queue: WorkQueue) -> None:
     with queue.holding(8), pytest.raises(QueueFullError), queue.holding(1):
         pass
     assert queue.rows == 0
@@ -80,44 +135,45 @@ def test_rows_are_bounded_and_given_back(queue: WorkQueue) -> None:
     assert queue.rows == 0
 
 
-@pytest.mark.parametrize("costly", [False, True])
-async def test_work_whose_deadline_has_passed_is_never_begun(
-    queue: WorkQueue, costly: bool
-) -> None:
+@pytest.mark.parametrize("ask", WAYS)
+async def test_work_whose_deadline_has_passed_is_never_begun(queue: WorkQueue, ask: Any) -> None:
     begun: list[int] = []
     with pytest.raises(DeadlinePassedError):
-        await queue.run(
-            lambda _: begun.append(1), Ticket(monotonic()), kind="q", size=1, costly=costly
-        )
+        await ask(queue, lambda: begun.append(1), Ticket(monotonic()))
     # What comes after it is computed all the same.
-    assert (await queue.run(lambda _: 2, ENDLESS, kind="q", size=1, costly=costly)).result == 2
+    assert (await ask(queue, lambda: 2)).result == 2
     assert not begun
 
 
-async def test_nobody_waits_past_the_deadline_for_costly_work(queue: WorkQueue) -> None:
+async def test_what_others_made_late_is_no_answer_any_more(queue: WorkQueue) -> None:
+    """Computed in time, by a loop that then had others to serve."""
+    late = asyncio.ensure_future(in_tick(queue, lambda: 1, Ticket(monotonic() + 0.05)))
+    await asyncio.gather(asyncio.sleep(0), in_tick(queue, lambda: sleep(0.1)))
+    with pytest.raises(DeadlinePassedError):
+        await late
+
+
+@pytest.mark.parametrize("ask", IN_THREADS)
+async def test_nobody_waits_past_the_deadline_for_costly_work(queue: WorkQueue, ask: Any) -> None:
     """The one under way is given up; the one behind it is dropped without being begun."""
     release, begun = threading.Event(), threading.Event()
     behind: list[int] = []
 
-    def slow(_: object) -> None:
+    def slow() -> None:
         begun.set()
         release.wait(30)
 
-    first = asyncio.ensure_future(
-        queue.run(slow, Ticket(monotonic() + 1), kind="q", size=1, costly=True)
-    )
+    first = asyncio.ensure_future(ask(queue, slow, Ticket(monotonic() + 1)))
     assert await asyncio.to_thread(begun.wait, 30)
-    second = queue.run(
-        lambda _: behind.append(1), Ticket(monotonic() + 0.2), kind="q", size=1, costly=True
-    )
+    second = ask(queue, lambda: behind.append(1), Ticket(monotonic() + 0.2))
     results = await asyncio.gather(first, second, return_exceptions=True)
     assert all(isinstance(result, DeadlinePassedError) for result in results)
     release.set()
-    assert (await queue.run(lambda _: 3, ENDLESS, kind="q", size=1, costly=True)).result == 3
+    assert (await ask(queue, lambda: 3)).result == 3
     assert not behind
 
 
-async def test_costly_work_hears_that_it_was_given_up(queue: WorkQueue) -> None:
+async def test_a_drawing_hears_that_it_was_given_up(queue: WorkQueue) -> None:
     """By the deadline, or by a client that leaves while it is under way."""
     heard = threading.Event()
     here = True
@@ -131,28 +187,15 @@ async def test_costly_work_hears_that_it_was_given_up(queue: WorkQueue) -> None:
         return not here
 
     with pytest.raises(DeadlinePassedError):
-        await queue.run(endless, Ticket(monotonic() + 0.1), kind="q", size=1, costly=True)
+        await queue.draw(endless, Ticket(monotonic() + 0.1))
     assert await asyncio.to_thread(heard.wait, 30)
     heard.clear()
-    leaving = asyncio.ensure_future(
-        queue.run(endless, Ticket(math.inf, gone), kind="q", size=1, costly=True)
-    )
+    leaving = asyncio.ensure_future(queue.draw(endless, Ticket(math.inf, gone)))
     await asyncio.sleep(0.05)
     here = False
     with pytest.raises(DisconnectedError):
         await leaving
     assert await asyncio.to_thread(heard.wait, 30)
-
-
-async def test_the_event_loop_goes_on_beside_costly_work(queue: WorkQueue) -> None:
-    release = threading.Event()
-    costly = asyncio.ensure_future(
-        queue.run(lambda _: release.wait(30), ENDLESS, kind="draw", size=1, costly=True)
-    )
-    # Cheap jobs are answered while the costly one is under way: only they can end it.
-    assert (await queue.run(lambda _: "answered", ENDLESS, kind="q", size=1)).result == "answered"
-    release.set()
-    assert (await costly).result
 
 
 async def test_a_kind_that_turns_out_costly_moves_to_the_thread(
@@ -171,9 +214,9 @@ async def test_a_kind_that_turns_out_costly_moves_to_the_thread(
     here = threading.current_thread().name
     for size in (1, 100, 1, 100):
         seconds = size * CHEAP / 10
-        await queue.run(lambda _, s=seconds: job(s), ENDLESS, kind="q", size=size)
+        await queue.run(lambda s=seconds: job(s), ENDLESS, kind="q", size=size)
     assert [name == here for name in where] == [True, False, True, False]
-    await queue.run(lambda _: job(0), ENDLESS, kind="another", size=100)
+    await queue.run(lambda: job(0), ENDLESS, kind="another", size=100)
     assert where[-1] == here
 
 
@@ -181,7 +224,7 @@ async def test_a_long_queue_lets_others_have_their_turn(queue: WorkQueue) -> Non
     turns: list[int] = []
     computed = 0
 
-    def job(_: object) -> None:
+    def job() -> None:
         nonlocal computed
         computed += 1
         sleep(5e-4)
@@ -196,41 +239,39 @@ async def test_a_long_queue_lets_others_have_their_turn(queue: WorkQueue) -> Non
     assert len({count for count in turns if 0 < count < 40}) > 3
 
 
-async def test_costly_work_of_those_who_have_gone_is_dropped(queue: WorkQueue) -> None:
+@pytest.mark.parametrize("ask", IN_THREADS)
+async def test_costly_work_of_those_who_have_gone_is_dropped(queue: WorkQueue, ask: Any) -> None:
     begun: list[int] = []
 
     async def gone() -> bool:
         return True
 
     with pytest.raises(DisconnectedError):
-        await queue.run(
-            lambda _: begun.append(1), Ticket(math.inf, gone), kind="q", size=1, costly=True
-        )
+        await ask(queue, lambda: begun.append(1), Ticket(math.inf, gone))
     assert not begun
 
 
-@pytest.mark.parametrize("costly", [False, True])
+@pytest.mark.parametrize("ask", WAYS)
 async def test_waiting_and_computing_are_told_apart(
-    queue: WorkQueue, monkeypatch: pytest.MonkeyPatch, costly: bool
+    queue: WorkQueue, monkeypatch: pytest.MonkeyPatch, ask: Any
 ) -> None:
     now = 0.0
     monkeypatch.setattr("app.serving.queue.monotonic", lambda: now)
 
-    def job(_: object) -> None:
+    def job() -> None:
         nonlocal now
         now += 2.0
 
     # Two in one tick: the second waits while the first is computed.
-    jobs = [queue.run(job, ENDLESS, kind=str(k), size=1, costly=costly) for k in range(2)]
-    first, second = await asyncio.gather(*jobs)
+    first, second = await asyncio.gather(ask(queue, job), ask(queue, job))
     assert (first.waited, first.computed, second.computed) == (0.0, 2.0, 2.0)
-    assert second.waited == 2.0 or costly
+    assert second.waited == 2.0 or ask is not in_tick
 
 
 async def test_a_request_that_is_cancelled_leaves_the_queue_in_order(queue: WorkQueue) -> None:
     begun: list[int] = []
-    waiting = asyncio.ensure_future(queue.run(lambda _: begun.append(1), ENDLESS, kind="q", size=1))
+    waiting = asyncio.ensure_future(queue.run(lambda: begun.append(1), ENDLESS, kind="q", size=1))
     await asyncio.sleep(0)
     waiting.cancel()
-    assert (await queue.run(lambda _: 2, ENDLESS, kind="q", size=1)).result == 2
+    assert (await queue.run(lambda: 2, ENDLESS, kind="q", size=1)).result == 2
     assert not begun

@@ -30,7 +30,7 @@ def install(
     """Add all of it to an application, from the inside out.
 
     Args:
-        backlog: how many of the requests begun wait for their work to be done.
+        backlog: how many of the requests begun are still worked for.
         is_draining: whether nothing new is to be begun.
     """
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, patience=settings.client_timeout)

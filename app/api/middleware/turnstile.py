@@ -4,8 +4,9 @@ Reading and answering a request takes a fraction of a millisecond, and so does r
 hundreds that arrive at once all begun or refused at once, the event loop would be away for a tenth
 of a second: every answer as late as the last, and health checks with them. So a few are begun in
 each tick, in the order of their arrival, and no more than the models keep up with; health checks
-pass by. What is too much is refused before any of it has been read, a few in each tick, and what
-waited longer than its deadline too.
+pass by. What is too much is refused before any of it has been read, a few in each tick: when the
+line is full, and when it moves so slowly that a request would spend much of its time in it. What
+waited longer than its deadline is refused too.
 """
 
 from __future__ import annotations
@@ -34,7 +35,16 @@ TIMEOUT_HEADER: Final = "X-Request-Timeout-Ms"
 MAX_TIMEOUT_MS: Final = 600_000
 
 _TIMEOUT: Final = re.compile(r"[1-9][0-9]{0,5}")
-_Line = deque[asyncio.Future[None]]
+# Seconds between two looks at whether the models have caught up.
+_PAUSE: Final = 5e-3
+# Of its time, what a request may expect to spend in the line: a pace that drops to a third must not
+# make those late who stand in it already.
+_PATIENCE: Final = 0.25
+# Share of the newest measurement in the pace at which the line moves.
+_NEWEST: Final = 0.1
+
+# When somebody joined it, and who.
+_Line = deque[tuple[float, asyncio.Future[None]]]
 
 # By their ends, whatever prefix a proxy has left on; a path that only ends so is no route.
 _PASSING: Final = ("/health/live", "/health/ready", "/metrics")
@@ -46,7 +56,7 @@ class Turnstile:
     Args:
         limit: most requests that wait.
         timeout: seconds that a request has that sends no header of its own.
-        backlog: how many of those begun wait for their work to be done.
+        backlog: how many of those begun are still worked for.
         is_draining: whether nothing new is to be begun.
     """
 
@@ -66,6 +76,8 @@ class Turnstile:
         self.is_draining = is_draining
         self._ticking = False
         self._places = 0
+        self._interval = 0.0
+        self._moved_at: float | None = None
         self._waiting: _Line = deque()
         self._too_many: _Line = deque()
 
@@ -79,9 +91,10 @@ class Turnstile:
                 detail = "The service finishes what it has begun, and then ends."
                 # Without the header a client would send its next request here as well.
                 raise ProblemError(catalogue.DRAINING, detail, headers={"Connection": "close"})
-            deadline = monotonic() + self._timeout(scope)
+            allowed = self._timeout(scope)
+            deadline = monotonic() + allowed
             scope.setdefault("state", {})["deadline"] = deadline
-            await self._turn(deadline)
+            await self._turn(allowed, deadline)
         except ProblemError as problem:
             await respond(Request(scope), problem)(scope, receive, send)
             return
@@ -99,13 +112,14 @@ class Turnstile:
             )
         return int(given) / 1e3
 
-    async def _turn(self, deadline: float) -> None:
+    async def _turn(self, allowed: float, deadline: float) -> None:
         """Wait until the request may begin."""
         if not self._ticking:
             self._begin_tick()
-        if len(self._waiting) >= self.limit:
+        if self._is_full(allowed):
+            count = len(self._waiting)
             await _wait(self._too_many)
-            raise ProblemError(catalogue.QUEUE_FULL, f"{self.limit} requests wait already.")
+            raise ProblemError(catalogue.QUEUE_FULL, f"{count} requests wait already.")
         if self._waiting or not self._places:
             await _wait(self._waiting)
             if monotonic() >= deadline:
@@ -114,19 +128,43 @@ class Turnstile:
         else:
             self._places -= 1
 
+    def _is_full(self, allowed: float) -> bool:
+        if not self._waiting:
+            return False
+        # What the first has waited is about what the last will have to, once the line is long.
+        wait = max(monotonic() - self._waiting[0][0], len(self._waiting) * self._interval)
+        return len(self._waiting) >= self.limit or wait > _PATIENCE * allowed
+
     def _begin_tick(self) -> None:
         self._places = max(0, PACE - self.backlog())
-        self._places -= _let_go(self._waiting, self._places)
-        refused = _let_go(self._too_many, REFUSALS)
+        begun = _let_go(self._waiting, self._places)
+        self._places -= begun
+        self._learn(begun)
+        _let_go(self._too_many, REFUSALS)
+        loop = asyncio.get_running_loop()
         # One more after the last: whoever comes in this tick is counted in it.
-        self._ticking = not self._ticking or self._places < PACE or refused > 0
-        if self._ticking:
-            asyncio.get_running_loop().call_soon(self._begin_tick)
+        if begun or not self._ticking:
+            self._ticking = True
+            loop.call_soon(self._begin_tick)
+        elif self._waiting or self._too_many:
+            # The models are behind: looking all the time would only hold them up.
+            loop.call_later(_PAUSE, self._begin_tick)
+        else:
+            self._ticking = False
+
+
+    def _learn(self, begun: int) -> None:
+        """How long the line takes to move on by one, as far as there is one."""
+        now = monotonic()
+        if begun and self._moved_at is not None:
+            self._interval += _NEWEST * ((now - self._moved_at) / begun - self._interval)
+        if begun or not self._waiting:
+            self._moved_at = now if self._waiting else None
 
 
 async def _wait(line: _Line) -> None:
     turn = asyncio.get_running_loop().create_future()
-    line.append(turn)
+    line.append((monotonic(), turn))
     await turn
 
 
@@ -134,7 +172,7 @@ def _let_go(line: _Line, most: int) -> int:
     """Let the first of a line go on; how many there were that had not gone by themselves."""
     count = 0
     while line and count < most:
-        turn = line.popleft()
+        _, turn = line.popleft()
         if not turn.done():
             turn.set_result(None)
             count += 1
