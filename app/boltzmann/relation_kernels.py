@@ -217,8 +217,14 @@ def _whole_blocks(pairs):
 
 
 @compiled
-def relation_log_odds(y, w, classes, log_counts, shift):
-    """Log-odds of E[sigmoid(ℓ_e + shift_e)] between the classes of a scene, (A, n, n)."""
+def relation_log_odds(y, w, classes, log_counts, slopes, shift):
+    """Log-odds of E[sigmoid(ℓ_e + shift_e)] between the classes of a scene, (A, n, n).
+
+    Args:
+        slopes: (A, n, n) or empty; what a unit itself adds to y is taken out to first order,
+            ℓ_e(m) changing by slope σ_e².
+        shift: (A, n, n) or empty.
+    """
     A, n = len(w.g), len(classes)
     subjects, objects = np.empty(n * n, np.int64), np.empty(n * n, np.int64)
     log_subjects, log_objects = np.empty(n * n, np.float32), np.empty(n * n, np.float32)
@@ -232,6 +238,11 @@ def relation_log_odds(y, w, classes, log_counts, shift):
     through, C = _moments(means(y).reshape(1, -1), w, 0, A)
     functions = _rows(through[0], C[0], w, 0, A)
     _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread)
+    if len(slopes):
+        own = slopes.reshape(A, -1)
+        for a in range(A):
+            for e in range(n * n):
+                mean[a, e] -= own[a, e] * spread[a, e] * spread[a, e] / np.float32(3.0)
     if len(shift):
         shifts = shift.reshape(A, -1)
         for a in range(A):

@@ -149,3 +149,21 @@ def test_reasons_cost_what_the_posterior_says():
     assert posterior(ARTIFACT, complete).unit_count == 4 * 3 * 2
     for name, scene, units in (("triway-local", complete, 36), ("triway-seed", bare, 36)):
         assert posterior(larger_artifact(name), scene).unit_count == units
+
+
+def test_what_a_given_relation_says_of_itself_is_taken_out_to_first_order(pair, monkeypatch):
+    """Where it says little: against taking it out of every hidden unit."""
+    closed = pair[0]
+    found = sigmoid(closed.relation_log_odds())
+    monkeypatch.setattr("app.boltzmann.closed_form._GENTLE", 0.0)
+    exact = sigmoid(closed.relation_log_odds())
+    assert np.abs(found - exact).max() < 0.001
+    # Left in, it would be seen.
+    monkeypatch.setattr("app.boltzmann.closed_form._GENTLE", np.inf)
+    slopes = closed._context.slopes
+    object.__setattr__(closed._context, "slopes", np.zeros_like(slopes))
+    left_in = sigmoid(closed.relation_log_odds())
+    gentle = np.zeros_like(exact, dtype=bool)
+    given = closed._context.given
+    gentle[given.a, given.i, given.j] = (np.abs(slopes) > 0.1) & (np.abs(slopes) < 0.5)
+    assert not gentle.any() or np.abs(left_in - exact)[gentle].max() > 0.002
