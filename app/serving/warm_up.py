@@ -12,8 +12,8 @@ from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 
-STEPS = 4
-"""Gibbs sweeps of the drawing; a full one takes half a second and warms nothing further."""
+STEPS = 1
+"""Gibbs sweeps of the drawing: more take their time and warm nothing further."""
 
 
 def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...]]:
@@ -31,11 +31,12 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     bare = replace(scene, relations=None)
     seen = observe(bare, typical_sizes=artifact.vocabulary.sizes)
     # Kernels of tensors are warm after one scene; compiled loops are told apart by what is given.
-    scenes = (scene, bare, seen) if artifact.closed_form is not None else (scene,)
+    is_compiled = artifact.closed_form is not None
+    scenes = (scene, bare, seen) if is_compiled else (scene,)
     relations = [entry for one in scenes for entry in reasoning.relations(artifact, one)]
     missing = [entry for one in scenes for entry in reasoning.missing(artifact, one)]
-    if len(scene.objects) > 1:
-        for one in scenes[:2]:
+    if is_compiled and len(scene.objects) > 1:
+        for one in (scene, bare):
             reasoning.missing(artifact, one, at=("on-top", 0))
             reasoning.missing(artifact, one, at=("under", 0))
     outliers, misplaced = reasoning.outliers(artifact, scene)
