@@ -1,7 +1,7 @@
-"""``python -m app.compile``: compile all loops for this machine, and the sources, before they run.
+"""``python -m app.compile``: compile loops for this machine, and sources, before they are run.
 
-The service does so by itself where it finds nothing compiled, and starts a minute or so later. Where
-it must not write, it would do so at every start.
+The service does so by itself where it finds nothing compiled, and starts a minute or so later;
+where it must not write, at every start.
 """
 
 from __future__ import annotations

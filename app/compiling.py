@@ -40,7 +40,8 @@ def inlined(function: Function) -> Function:
 
 
 def _compile(function: Function, options: dict[str, Any]) -> Function:
-    options = {"nogil": True, "error_model": "numpy", **options}
+    # Nobody calls them from C.
+    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
     try:
         found: Function = njit(cache=True, **options)(function)
     except RuntimeError:  # no directory for the cache

@@ -8,7 +8,7 @@ import gc
 import logging
 import sys
 from collections.abc import Awaitable, Callable
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 
@@ -250,11 +250,11 @@ class Runtime:
         """See `Participant.prepare`."""
         previous = self._models or self._candidate
         if generation is None:
-            self._candidate = await asyncio.to_thread(self._load, previous)
+            make = partial(self._load, previous)
         else:
-            self._candidate = await asyncio.to_thread(
-                restore, generation, self._store, self._new_queue, previous
-            )
+            make = partial(restore, generation, self._store, self._new_queue, previous)
+        # At the start nobody is served yet, and a thread of its own costs time and memory.
+        self._candidate = make() if self._models is None else await asyncio.to_thread(make)
         return Generation.of(self._candidate)
 
     def commit(self) -> None:
@@ -331,11 +331,14 @@ def _settle_memory() -> None:
     """Take what is long-lived out of the collector's sight.
 
     With torch imported a full collection stops the world for some 90 ms. What a replaced snapshot
-    left frozen must be thawed first, or its cycles would never be freed. Pages that loading has
-    left empty go back to the system, where the C library can do that: some 30 MB.
+    left frozen must be thawed first, or its cycles would never be freed. At the start, which the
+    collector sits out, there is none. Pages that loading has left empty go back to the system,
+    where the C library can do that: some 30 MB.
     """
     gc.unfreeze()
-    gc.collect()
+    if gc.isenabled():
+        gc.collect()
     if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
         trim(0)
     gc.freeze()
+    gc.enable()
