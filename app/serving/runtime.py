@@ -253,8 +253,10 @@ class Runtime:
             make = partial(self._load, previous)
         else:
             make = partial(restore, generation, self._store, self._new_queue, previous)
-        # At the start nobody is served yet, and a thread of its own costs time and memory.
-        self._candidate = make() if self._models is None else await asyncio.to_thread(make)
+        # At the start of one that has no peers nobody waits to be served or heard, and a thread of
+        # its own costs time and memory.
+        nobody_waits = self._models is None and isinstance(self._peers, Alone)
+        self._candidate = make() if nobody_waits else await asyncio.to_thread(make)
         return Generation.of(self._candidate)
 
     def commit(self) -> None:
