@@ -91,19 +91,28 @@ class _Job:
     future: asyncio.Future[Any]
 
 
-@dataclass(slots=True)
-class _Cost:
-    """Seconds per unit of size of one kind of question, as measured so far."""
+class _Costs:
+    """Seconds that questions took so far, per unit of size, by kind and order of size.
 
-    per_unit: float = 0.0
+    Small scenes cost more a unit than large ones, and must not make these look costly.
+    """
 
-    def expected(self, size: float) -> float:
-        return self.per_unit * size
+    def __init__(self) -> None:
+        self._per_unit: dict[tuple[str, int], float] = {}
 
-    def learn(self, seconds: float, size: float) -> None:
-        measured = seconds / size
-        known = self.per_unit or measured
-        self.per_unit = known + _NEWEST * (measured - known)
+    def expected(self, kind: str, size: int) -> float:
+        """Seconds; where none of this order has been measured, as the largest below; else 0."""
+        for order in range(size.bit_length(), 0, -1):
+            known = self._per_unit.get((kind, order))
+            if known is not None:
+                return known * size
+        return 0.0
+
+    def learn(self, kind: str, size: int, seconds: float) -> None:
+        key, measured = (kind, size.bit_length()), seconds / size
+        known = self._per_unit.get(key, measured)
+        # One that was held up by something else must not send its like to the thread.
+        self._per_unit[key] = known + _NEWEST * (min(measured, 2 * known) - known)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +150,7 @@ class WorkQueue:
     backlog: int = 0
     _waiting: deque[_Job] = field(default_factory=deque)
     _draining: bool = False
-    _costs: dict[str, _Cost] = field(default_factory=dict)
+    _costs: _Costs = field(default_factory=_Costs)
 
     @contextmanager
     def holding(self, rows: int) -> Iterator[None]:
@@ -158,32 +167,29 @@ class WorkQueue:
         finally:
             self.rows -= rows
 
-    async def run(
-        self, call: Callable[[], T], ticket: Ticket, *, kind: str, size: float
-    ) -> Done[T]:
+    async def run(self, call: Callable[[], T], ticket: Ticket, *, kind: str, size: int) -> Done[T]:
         """Let a question be answered.
 
         Args:
             call: the work; it may run in another thread.
-            kind: jobs of one kind cost alike, in proportion to ``size``.
+            kind: jobs of one kind and about one size, at least 1, cost alike.
 
         Raises:
             DeadlinePassedError: the deadline passed first; the work is dropped, or its result.
             DisconnectedError: nobody waits for the answer any more.
             Exception: whatever the job raises.
         """
-        cost = self._costs.setdefault(kind, _Cost())
 
         def learnt() -> T:
             began = thread_time()
             result = call()
             # What the job itself took: in the worker thread it also waits for the interpreter.
-            cost.learn(thread_time() - began, size)
+            self._costs.learn(kind, size, thread_time() - began)
             return result
 
         self.backlog += 1
         try:
-            if cost.expected(size) > CHEAP:
+            if self._costs.expected(kind, size) > CHEAP:
                 return await _in_thread(lambda _: learnt(), ticket, self.threads.costly)
             return await self._in_tick(_measured(learnt), ticket)
         finally:

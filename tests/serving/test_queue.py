@@ -198,26 +198,49 @@ async def test_a_drawing_hears_that_it_was_given_up(queue: WorkQueue) -> None:
     assert await asyncio.to_thread(heard.wait, 30)
 
 
-async def test_a_kind_that_turns_out_costly_moves_to_the_thread(
-    queue: WorkQueue, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In proportion to its size, and back again for small ones."""
-    where: list[str] = []
+@pytest.fixture
+def took(queue: WorkQueue, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Ask a question that takes so long; whether the event loop was held up by it."""
     now = 0.0
     monkeypatch.setattr("app.serving.queue.thread_time", lambda: now)
 
-    def job(seconds: float) -> None:
-        nonlocal now
-        where.append(threading.current_thread().name)
-        now += seconds
+    async def took(seconds: float, *, size: int, kind: str = "q") -> bool:
+        def job() -> str:
+            nonlocal now
+            now += seconds
+            return threading.current_thread().name
 
-    here = threading.current_thread().name
-    for size in (1, 100, 1, 100):
-        seconds = size * CHEAP / 10
-        await queue.run(lambda s=seconds: job(s), ENDLESS, kind="q", size=size)
-    assert [name == here for name in where] == [True, False, True, False]
-    await queue.run(lambda: job(0), ENDLESS, kind="another", size=100)
-    assert where[-1] == here
+        there = await queue.run(job, ENDLESS, kind=kind, size=size)
+        return there.result == threading.current_thread().name
+
+    return took
+
+
+async def test_a_kind_that_turns_out_costly_moves_to_the_thread(took: Any) -> None:
+    """In proportion to its size where that is new, and back again for small ones."""
+    assert await took(CHEAP / 10, size=1)
+    assert not await took(CHEAP * 10, size=100)
+    assert await took(CHEAP / 10, size=1)
+    assert not await took(CHEAP * 10, size=100)
+    assert await took(0, size=100, kind="another")
+
+
+async def test_small_questions_do_not_make_large_ones_look_costly(took: Any) -> None:
+    """What every question costs is much a unit for the small ones."""
+    for _ in range(20):
+        await took(CHEAP / 4, size=4)
+        await took(CHEAP / 3, size=169)
+    assert await took(CHEAP / 4, size=4)
+    assert await took(CHEAP / 3, size=169)
+
+
+async def test_one_that_was_held_up_sends_none_to_the_thread(took: Any) -> None:
+    for seconds in (CHEAP / 3, CHEAP / 3, 100 * CHEAP, CHEAP / 3):
+        assert await took(seconds, size=100)
+    # What stays so is believed.
+    for _ in range(20):
+        await took(3 * CHEAP, size=100)
+    assert not await took(3 * CHEAP, size=100)
 
 
 async def test_a_long_queue_lets_others_have_their_turn(queue: WorkQueue) -> None:

@@ -152,7 +152,6 @@ class Turnstile:
         else:
             self._ticking = False
 
-
     def _learn(self, begun: int) -> None:
         """How long the line takes to move on by one, as far as there is one."""
         now = monotonic()
