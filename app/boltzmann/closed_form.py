@@ -12,7 +12,8 @@ with g_e the presence of both ends. So in either case
     relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))],  ℓ_e(h1) = ℓ_e(m) + sum_k U_ek (h1_k - m_k)
 
 What is judged is taken out of y first: its own slope for a given relation, and W_i with the slopes
-of all its relations for an object that is present, the other slopes held.
+of all its relations for an object that is present, the other slopes held. A slope that is small
+is taken out to first order: ℓ_e(m) changes by slope_e σ_e², with σ_e² as below.
 
 The logit is a sum of many small independent terms, taken as normal with variance
 
@@ -47,8 +48,8 @@ LEAST_UNITS = 64
 
 # Of the variance of the logits, how much the directions F_a leave out.
 _LEFT_OUT = 1e-3
-# Slopes up to which what a given relation says of itself is taken out to first order, which changes
-# its probability by .00013 at most (scripts/estimators.py, scenes of the shipped models).
+# Slopes up to which what a given relation says of itself is taken out to first order
+# (docs/decisions/compiled-loops.md).
 _GENTLE = 0.5
 _NOTHING = np.zeros((0, 0, 0), dtype=np.float32)
 _NONE = np.zeros((0, 0), dtype=np.bool_)

@@ -2,7 +2,7 @@
 
 What arrives within one tick is computed in the next, each job by itself, so an answer never depends
 on what it waited beside. Cheap jobs run where they stand: a hop to a thread costs as much as most
-of them. A job that is expected to take longer than `CHEAP` goes to the process's one worker thread,
+of them. A job that is expected to take longer than `CHEAP` goes to a worker thread of the process,
 where compiled loops and tensor kernels let the event loop go on. Drawings, which may take seconds,
 have a thread of their own: nobody who asks about a scene waits for them.
 
