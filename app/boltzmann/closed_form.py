@@ -294,18 +294,15 @@ class ClosedForm:
             *object_kernels.without_each(context.y, self.W, classes, share, self._group)
         )
 
-    def without_pairs(self, context: Context, each: WithoutEach, rows: Places) -> Floats:
-        """The gain of the classes in `rows` (N,) where one further class is left out, (N, n).
-
-        Its diagonal means nothing.
-        """
+    def reasons(self, context: Context, each: WithoutEach, rows: Places) -> Floats:
+        """How the gain of the classes in `rows` (N,) changes by each other class, (N, n)."""
         common, filled = _NOTHING, _NONE
         if context.given is not None:
             common, filled = given_kernels.common_growth(
                 *(self._weights, context.classes, context.log_counts),
                 *(*_lists(context.given), context.slopes, rows),
             )
-        found: Floats = object_kernels.without_pairs(*each[1:], rows, common, filled, self._group)
+        found: Floats = object_kernels.reasons(*each, rows, common, filled, self._group)
         return found
 
 

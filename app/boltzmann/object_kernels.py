@@ -50,7 +50,7 @@ def without_each(y, W, classes, share, group):
     """The gain of each class, its share (n, H1) of y taken out.
 
     Returns:
-        (n,) the gains, and what `without_pairs` needs, in whole blocks of lanes: sigmoid(-y); of
+        (n,) the gains, and what `reasons` needs, in whole blocks of lanes: sigmoid(-y); of
         each class, sigmoid(y) e^-share, e^-share and e^W.
     """
     n, H1 = share.shape
@@ -79,15 +79,15 @@ def without_each(y, W, classes, share, group):
 
 
 @compiled
-def without_pairs(off, rest, fall, growth, rows, common, filled, group):
-    """The gain of the classes in rows (N,) where one further class is left out, (N, n).
+def reasons(gain, off, rest, fall, growth, rows, common, filled, group):
+    """How the gain of the classes in rows (N,) changes by each other class, (N, n); 0 by itself.
 
     Args:
-        off, rest, fall, growth: see `without_each`.
+        gain, off, rest, fall, growth: see `without_each`.
         common, filled: see `given_kernels.common_growth`; empty where nothing is given.
     """
     n, size = fall.shape
-    both, gains = np.zeros(size, np.float32), np.zeros((len(rows), n), np.float32)
+    both, change = np.zeros(size, np.float32), np.zeros((len(rows), n), np.float32)
     product, total = np.empty(_LANES, np.float32), np.empty(_LANES, np.float32)
     for c in range(len(rows)):
         i = rows[c]
@@ -102,5 +102,5 @@ def without_pairs(off, rest, fall, growth, rows, common, filled, group):
                     twice = common[c, j]
                     for k in range(len(twice)):
                         both[k] *= twice[k]
-                gains[c, j] = _gain(off, both, growth[i], group, product, total)
-    return gains
+                change[c, j] = gain[i] - _gain(off, both, growth[i], group, product, total)
+    return change

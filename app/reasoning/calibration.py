@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -67,10 +68,10 @@ def placed_scores(calibration: Calibration, log_odds: Floats, log_p: Floats) -> 
     return placed + calibration.placed_relation_weight * log_p
 
 
-def intruder_log_odds(calibration: Calibration, log_odds: Floats, classes: int) -> Floats:
-    """Log-odds of being an intruder in a scene of so many distinct classes."""
+def intruder_line(calibration: Calibration, classes: int) -> tuple[float, float]:
+    """Intercept and slope of the log-odds of being an intruder among so many distinct classes."""
     entry = calibration.outlier
-    return entry.intercept + entry.slope * log_odds + entry.log_count * float(np.log(classes))
+    return entry.intercept + entry.log_count * math.log(classes), entry.slope
 
 
 def false_log_odds(calibration: Calibration, log_odds: Floats) -> Floats:

@@ -65,10 +65,7 @@ class ClosedPosterior:
 
     def reasons(self, rows: Places) -> Floats:
         """Exact where no relation is given."""
-        each = self._without_each
-        change = each.gain[rows, None] - self._closed.without_pairs(self._context, each, rows)
-        change[np.arange(len(rows)), rows] = 0.0
-        return change
+        return self._closed.reasons(self._context, self._without_each, rows)
 
     @cached_property
     def _without_each(self) -> WithoutEach:

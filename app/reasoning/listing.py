@@ -116,6 +116,25 @@ def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposit
 
 
 @compiled
+def least_fitting(intercept, slope, log_odds, row):
+    """Objects by how badly they fit, ties by place, (N,); and the probability of each class, (n,).
+
+    Args:
+        intercept, slope: from log-odds of presence to those of being an intruder.
+        log_odds: (n,) of the classes.
+        row: (N,) the class of each object.
+    """
+    intruder, p = np.empty(len(log_odds), np.float64), np.empty(len(log_odds), np.float64)
+    for i in range(len(log_odds)):
+        intruder[i] = intercept + slope * log_odds[i]
+        p[i] = 1.0 / (1.0 + np.exp(-intruder[i]))
+    judged = np.empty(len(row), np.float64)
+    for k in range(len(row)):
+        judged[k] = intruder[row[k]]
+    return best(judged, np.ones(len(row), np.bool_), len(row)), p
+
+
+@compiled
 def strongest(change, rows, count):
     """For each class in rows (N,) the places of the largest changes (N, n), and these; not its own.
 

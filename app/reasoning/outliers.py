@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from app.reasoning.answers import Because, MisplacedAnswer, OutlierAnswer
-from app.reasoning.calibration import false_log_odds, intruder_log_odds, sigmoid
-from app.reasoning.listing import strongest
+from app.reasoning.calibration import false_log_odds, intruder_line, sigmoid
+from app.reasoning.listing import least_fitting, strongest
 from app.reasoning.posterior import Posterior, posterior
-from app.reasoning.ranking import best
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
@@ -48,13 +47,12 @@ def outliers(
         return (), ()
     given = posterior(artifact, scene)
     log_odds = given.log_odds_given_rest()
-    intruder = intruder_log_odds(calibration, log_odds, len(log_odds))
-    row = given.present.row
-    judged = intruder[row]
-    order = best(judged, np.ones(len(row), dtype=np.bool_), len(row)).tolist()
-    rows, values = row.tolist(), log_odds.tolist()
-    reasons = _reasons(given, list(dict.fromkeys([rows[k] for k in order[: _affordable(given)]])))
-    probability = sigmoid(intruder).tolist()
+    order, p = least_fitting(
+        *intruder_line(calibration, len(log_odds)), log_odds, given.present.row
+    )
+    places, probability = order.tolist(), p.tolist()
+    rows, values = given.present.row.tolist(), log_odds.tolist()
+    reasons = _reasons(given, list(dict.fromkeys([rows[k] for k in places[: _affordable(given)]])))
     labels = artifact.vocabulary.labels
     classes = given.present.classes.tolist()
     found = tuple(
@@ -67,7 +65,7 @@ def outliers(
                 is_outlier=probability[row] >= threshold,
                 because=reasons.get(row, ()),
             )
-            for position in order
+            for position in places
         ]
     )
     return found, _misplaced(artifact, given, scene)
