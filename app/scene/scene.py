@@ -13,9 +13,10 @@ from app.scene.relations import CANONICAL, contradiction
 Point = tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
+# Frozen it would take four times as long to make, which is felt where there are dozens.
+@dataclass(slots=True, unsafe_hash=True)
 class SceneObject:
-    """One thing in a scene.
+    """One thing in a scene, made once and never changed.
 
     Attributes:
         id: its name in this scene.
