@@ -164,9 +164,9 @@ QUEUE_FULL: Final = ProblemType(
     "queue-full",
     429,
     "Too much is waiting already",
-    "More requests are waiting than the service holds (SCENE_QUEUE_REQUESTS), or more scenes for "
-    "this model (SCENE_QUEUE_ROWS). Nothing of this one was computed. Retry-After says when to ask "
-    "again.",
+    "More requests are waiting than the service holds (SCENE_QUEUE_REQUESTS), or than leave this "
+    "one enough of its time, or more scenes for this model (SCENE_QUEUE_ROWS). Nothing of this one "
+    "was computed. Retry-After says when to ask again.",
 )
 DEADLINE_PASSED: Final = ProblemType(
     "deadline-passed",

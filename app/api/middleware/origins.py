@@ -9,6 +9,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from app.api import catalogue, keys
+from app.api.middleware.turnstile import TIMEOUT_HEADER
 from app.api.problems import ProblemError, respond
 
 
@@ -31,7 +32,7 @@ class CrossOrigin(CORSMiddleware):
                 "Content-Type",
                 keys.API_KEY,
                 "X-Request-Id",
-                "X-Request-Timeout-Ms",
+                TIMEOUT_HEADER,
             ),
             expose_headers=("Retry-After", "X-Request-Id"),
         )
