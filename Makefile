@@ -20,7 +20,7 @@ SERVICE := $(VENV)/.installed-service
 EVERYTHING := $(VENV)/.installed-everything
 
 .DEFAULT_GOAL := help
-.PHONY: help run test chaos soak audit setup format bench lock clean
+.PHONY: help run test docs chaos soak audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -30,11 +30,17 @@ run: $(SERVICE)  ## serve the shipped models on 127.0.0.1 (PORT=8000)
 	SCENE_HOST=127.0.0.1 SCENE_PORT=$(PORT) exec $(BIN)/python -m app
 
 test: $(EVERYTHING)  ## lint, format, types, import rules, then the tests
-	$(BIN)/python -m ruff check --quiet .
-	$(BIN)/python -m ruff format --quiet --check .
-	$(BIN)/python -m mypy --no-error-summary
-	$(BIN)/lint-imports --no-logo
+	@# Compiled once, beside the checks, and not by every process of the tests.
+	@set -e; $(BIN)/python -m app.compile & compiling=$$!; trap 'kill $$compiling 2>/dev/null || :' EXIT; set -x; \
+	$(BIN)/python -m ruff check --quiet .; \
+	$(BIN)/python -m ruff format --quiet --check .; \
+	$(BIN)/python -m mypy --no-error-summary; \
+	$(BIN)/lint-imports --no-logo; \
+	wait $$compiling
 	$(BIN)/python -m pytest --numprocesses auto --dist loadscope $(ARGS)
+
+docs: $(EVERYTHING)  ## the documentation as a site that works without internet (build/site)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 audit: $(EVERYTHING)  ## known vulnerabilities, risky code, bills of materials (build/)
 	$(BIN)/python scripts/audit.py $(ARGS)
@@ -51,9 +57,10 @@ format: $(EVERYTHING)  ## rewrite the sources in the house format
 	$(BIN)/python -m ruff check --fix-only --quiet .
 	$(BIN)/python -m ruff format .
 
-bench: $(EVERYTHING)  ## run the benchmarks, then the service under load beside an echo of it
+bench: $(EVERYTHING)  ## run the benchmarks, then the service under load beside an echo, then a stream
 	$(BIN)/python -m benchmarks $(ARGS)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.load)
+	$(if $(ARGS),,$(BIN)/python -m benchmarks.stream)
 
 lock: $(BIN)/python  ## resolve pyproject.toml anew into requirements*.lock
 	$(BIN)/python scripts/lock.py $(INDEX) $(ARGS)
@@ -65,6 +72,7 @@ clean:  ## remove the environment and every cache
 $(SERVICE): requirements.lock pyproject.toml | $(BIN)/python
 	@echo "Installing the service's packages into $(VENV) ..."
 	@$(PIP) install -qq $(INDEX) -r requirements.lock
+	@$(PIP) install -qq --no-deps --editable .
 	@echo "Compiling loops for this machine ..."
 	@$(BIN)/python -m app.compile
 	@touch $@
@@ -72,6 +80,7 @@ $(SERVICE): requirements.lock pyproject.toml | $(BIN)/python
 $(EVERYTHING): requirements-dev.lock pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
 	@$(PIP) install -qq $(INDEX) -r requirements-dev.lock
+	@$(PIP) install -qq --no-deps --editable .
 	@touch $(SERVICE) $@
 
 # Order-only above: an environment is made once and then kept, whatever its own time stamp says.

@@ -60,9 +60,9 @@ def with_markers(locked: dict[str, str], requirements: list[str]) -> list[str]:
 def main(pip_arguments: list[str]) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = project["optional-dependencies"]
-    runtime = project["dependencies"]
+    runtime = project["dependencies"] + extras["service"]
     training = runtime + extras["training"]
-    development = training + extras["telemetry"] + extras["dev"]
+    development = training + extras["telemetry"] + extras["docs"] + extras["dev"]
 
     with tempfile.TemporaryDirectory() as scratch:
         pins = Path(scratch) / "constraints.txt"
