@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from app.boltzmann import BoltzmannMachine
-from app.registry import Artifact, Calibration
+from app.registry import Artifact, Calibration, Offsets
 from app.scene import Vocabulary
 
 
@@ -21,7 +21,10 @@ def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
 
 
 def draft_artifact(
-    machine: BoltzmannMachine, vocabulary: Vocabulary, calibration: Calibration | None = None
+    machine: BoltzmannMachine,
+    vocabulary: Vocabulary,
+    calibration: Calibration | None = None,
+    offsets: Offsets | None = None,
 ) -> Artifact:
     """An artifact in memory alone, with the neutral calibration unless one is given."""
     return Artifact(
@@ -32,4 +35,5 @@ def draft_artifact(
         digest="",
         card="",
         path=Path(),
+        offsets=offsets,
     )

@@ -12,7 +12,7 @@ import torch
 
 from app.scene import CANONICAL, Vocabulary
 from training.batches import SceneTensors, scene_tensors
-from training.config import Config, ConfigError, DataConfig
+from training.config import DATA, Config, ConfigError, DataConfig, is_file, source_name
 from training.datasets import (
     AnnotatedScene,
     EncodedScene,
@@ -21,6 +21,7 @@ from training.datasets import (
     generate_rooms,
     indoor_vocabulary,
     read_scenes,
+    read_vocabulary,
     rooms_vocabulary,
     shuffle_objects,
     source_vocabulary,
@@ -80,6 +81,7 @@ class SplitScenes:
             structure=torch.from_numpy(self.vocabulary.structure.copy()),
             relations=len(CANONICAL),
             room_types=len(self.vocabulary.room_types),
+            digest=self.digest,
         )
 
     def shuffled(self, seed: int) -> SplitScenes:
@@ -96,7 +98,7 @@ class SplitScenes:
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
-    """The scenes of every source, named by its file `<source>.jsonl.gz` under `root`.
+    """The scenes of every source under its name: of a file, or of `<source>.jsonl.gz` in `root`.
 
     Raises:
         ConfigError: there is no such file.
@@ -104,22 +106,25 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     """
     scenes: dict[str, list[AnnotatedScene]] = {}
     for source in data.sources:
+        name = source_name(source)
         if source == "rooms":
             found = generate_rooms(data.rooms, seed=data.split_seed)
         else:
-            path = root / f"{source}.jsonl.gz"
+            path = root / (source if is_file(source) else f"{source}.jsonl.gz")
             if not path.is_file():
-                raise ConfigError(f"there is no {path.name} in {root}: name its folder with --data")
-            found = [replace(scene, source=source) for scene in read_scenes(path)]
-        scenes[source] = found[: data.limit]
+                raise ConfigError(
+                    f"there is no {path.name} in {path.parent}: name its folder with --data"
+                )
+            found = [replace(scene, source=name) for scene in read_scenes(path)]
+        scenes[name] = found[: data.limit]
     return scenes
 
 
-def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene]) -> Vocabulary:
+def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
     """The vocabulary a configuration names, with the typical sizes of its scenes.
 
     Raises:
-        ConfigError: an unknown name.
+        ConfigError: an unknown name, or a file in `root` that holds no vocabulary.
     """
     if data.vocabulary == "indoor":
         vocabulary = indoor_vocabulary()
@@ -127,23 +132,42 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene]) -> Vocabula
         vocabulary = source_vocabulary(scenes)
     elif data.vocabulary == "rooms":
         vocabulary = rooms_vocabulary()
+    elif data.vocabulary.endswith(".json"):
+        vocabulary = _read_vocabulary(root / data.vocabulary)
     else:
-        raise ConfigError(f"unknown vocabulary {data.vocabulary!r}: indoor, source or rooms")
+        raise ConfigError(
+            f"unknown vocabulary {data.vocabulary!r}: indoor, source, rooms, or a file that ends "
+            "in .json"
+        )
     return with_typical_sizes(vocabulary, scenes)
 
 
+def _read_vocabulary(path: Path) -> Vocabulary:
+    try:
+        return read_vocabulary(path)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"data.vocabulary: {path} cannot be used: {error}") from error
+
+
 def split_and_encode(
-    data: DataConfig, scenes: dict[str, list[AnnotatedScene]], vocabulary: Vocabulary | None = None
+    data: DataConfig,
+    scenes: dict[str, list[AnnotatedScene]],
+    vocabulary: Vocabulary | None = None,
+    root: Path = DATA,
 ) -> SplitScenes:
     """Split all sources together (groups are shared between them) and encode each part.
 
     Args:
         vocabulary: that of a published model; by default the configuration's.
+        root: where the file of the configuration's vocabulary is.
+
+    Raises:
+        ConfigError: see `build_vocabulary`.
     """
     everything = [scene for source in scenes.values() for scene in source]
     parts = split(everything, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
-        vocabulary = build_vocabulary(data, list(parts["train"]))
+        vocabulary = build_vocabulary(data, list(parts["train"]), root)
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,
@@ -163,4 +187,4 @@ def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
 
 def prepare(config: Config, root: Path) -> SplitScenes:
     """Read, split and encode what a configuration names."""
-    return split_and_encode(config.data, read_sources(config.data, root))
+    return split_and_encode(config.data, read_sources(config.data, root), root=root)

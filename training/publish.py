@@ -13,15 +13,19 @@ from app.registry import (
     DataSource,
     Description,
     Metric,
+    Offsets,
     Store,
     VocabularyEntry,
 )
+from app.scene import Vocabulary
+from training.batches import SceneTensors
 from training.calibrate import calibrate
 from training.draft import as_stored, draft_artifact
 from training.evaluation.report import Row, evaluate
+from training.offsets import fit_offsets
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
-from training.terms import TERMS
+from training.terms import TERMS, terms_of
 
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
 
@@ -33,22 +37,30 @@ def publish_run(
     version: str,
     *,
     alias: str | None = None,
+    judge: Callable[[Artifact], None] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Artifact:
-    """Calibrate on validation scenes, evaluate on test scenes, and publish.
+    """Calibrate on validation scenes, learn offsets from training scenes, evaluate, and publish.
 
     Weights are stored in half precision; they are calibrated and evaluated as they are stored.
 
+    Args:
+        judge: sees the model as it would be published; whatever it raises keeps it from being so.
+
     Raises:
+        RunError: the run learnt from other scenes.
         StoreError, ArtifactError: see `Store.publish`.
     """
+    run.require(scenes.digest)
     data = scenes.training_data()
     machine = as_stored(run.machine)
     progress("calibrating")
     relations = machine.spec.A
-    draft = draft_artifact(machine, scenes.vocabulary)
-    calibration = calibrate(draft, data.validation, run.config.training.seed)
-    calibrated = draft_artifact(machine, scenes.vocabulary, calibration)
+    offsets = fit_offsets(scenes.parts["train"], len(scenes.vocabulary))
+    calibrated = calibrated_draft(run, scenes.vocabulary, data.validation, offsets)
+    calibration = calibrated.calibration
+    if judge is not None:
+        judge(calibrated)
     rows = evaluate(calibrated, data.test, data.structure, data.train, progress=progress)
     progress("publishing")
     description = Description(
@@ -64,7 +76,23 @@ def publish_run(
         terms=terms(scenes),
         libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
     )
-    return store.publish(description, machine.state_dict(), storage_dtype="float16", alias=alias)
+    tensors = {} if offsets is None else offsets.tensors()
+    state = machine.state_dict() | tensors
+    return store.publish(description, state, storage_dtype="float16", alias=alias)
+
+
+def calibrated_draft(
+    run: FinishedRun,
+    vocabulary: Vocabulary,
+    validation: SceneTensors,
+    offsets: Offsets | None = None,
+) -> Artifact:
+    """A run as it would be published, its weights rounded as they are stored."""
+    machine = as_stored(run.machine)
+    calibration = calibrate(
+        draft_artifact(machine, vocabulary), validation, run.config.training.seed
+    )
+    return draft_artifact(machine, vocabulary, calibration, offsets)
 
 
 def _training(run: FinishedRun) -> dict[str, Any]:
@@ -83,8 +111,8 @@ def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
             source=source,
             scenes=scenes.counts[source],
             digest=scenes.digests[source],
-            terms=TERMS[source].words,
-            research_only=TERMS[source].research_only,
+            terms=terms_of(source, scenes.data).words,
+            research_only=terms_of(source, scenes.data).research_only,
         )
         for source in scenes.counts
     )
@@ -108,7 +136,13 @@ def metrics(rows: list[Row]) -> tuple[Metric, ...]:
 
 def terms(scenes: SplitScenes) -> str:
     """One sentence on what the weights may be used for."""
-    research = [source for source in scenes.counts if TERMS[source].research_only]
+    every = {source: terms_of(source, scenes.data) for source in scenes.counts}
+    research = [source for source, found in every.items() if found.research_only]
     if research:
         return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."
+    own = {source: found.words for source, found in every.items() if source not in TERMS}
+    if own:
+        return " ".join(
+            f"Trained on {source}: {words.rstrip('.')}." for source, words in own.items()
+        )
     return "No restriction from the training data beyond its attribution."

@@ -145,6 +145,19 @@ class WithoutEach(NamedTuple):
     growth: Floats
 
 
+class Between(NamedTuple):
+    """What the relations that are given say of those between the n classes; empty where none is.
+
+    Attributes:
+        slopes: (A, n, n), 0 where nothing is given.
+        shift: (A, n, n) what they imply for each; apart: without those of the pair itself.
+    """
+
+    slopes: Floats
+    shift: Floats
+    apart: Floats
+
+
 class ClosedForm:
     """What a machine of that kind says of scenes.
 
@@ -163,7 +176,7 @@ class ClosedForm:
         self._group = group_size(machine.W)
         names = ("W", "b", "c1", "Q")
         self.W, self.b, self.c1, self.Q = (_array(getattr(machine, name)) for name in names)
-        self._weights = _weights(machine)
+        self._weights, self._F = _weights(machine)
         self._gamma = self._B = None
         if machine.spec.G:
             self._gamma, self._B = _array(machine.gamma), _array(machine.B)
@@ -203,20 +216,39 @@ class ClosedForm:
         )
         return Context(classes, presence, log_counts, x, y, given, slopes)
 
-    def relation_log_odds(self, context: Context) -> Floats:
+    def between(self, context: Context) -> Between:
+        """What `relation_log_odds` and `log_odds_apart` need."""
+        given = context.given
+        if given is None:
+            return Between(_NOTHING, _NOTHING, _NOTHING)
+        n = len(context.classes)
+        slopes = np.zeros((len(self._weights.g), n, n), dtype=np.float32)
+        slopes[given.a, given.i, given.j] = context.slopes
+        return Between(slopes, *self._implied(context))
+
+    def relation_log_odds(self, context: Context, between: Between | None = None) -> Floats:
         """Log-odds of all relations between the classes, each without itself, (A, n, n)."""
-        shift, given, slopes = self._implied(context), context.given, _NOTHING
-        if given is not None:
-            n = len(context.classes)
-            slopes = np.zeros((len(self._weights.g), n, n), dtype=np.float32)
-            slopes[given.a, given.i, given.j] = context.slopes
+        slopes, shift, _ = self.between(context) if between is None else between
         found: Floats = relation_kernels.relation_log_odds(
             context.y, self._weights, context.classes, context.log_counts, slopes, shift
         )
+        given = context.given
         if given is not None:
             steep = np.flatnonzero(np.abs(context.slopes) > _GENTLE)
             a, i, j = given.a[steep], given.i[steep], given.j[steep]
             found[a, i, j] = self._without_itself(context, a, i, j, context.slopes[steep], shift)
+        return found
+
+    def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
+        """The same of pairs of classes, without all that is given of the pair, (2, A, P).
+
+        Args:
+            i, j: (P,) places; the relations from i to j come first, then those back.
+        """
+        found: Floats = relation_kernels.log_odds_apart(
+            *(context.y, self._weights, self._F, context.classes, context.log_counts),
+            *(between.slopes, between.apart, i, j),
+        )
         return found
 
     def unit_log_odds(self, context: Context, a: Places, i: Places, j: Places) -> Floats:
@@ -227,7 +259,8 @@ class ClosedForm:
         else:
             size = len(context.classes), len(self._weights.g)
             slopes = given_kernels.find_slopes(*size, *_lists(given), context.slopes, a, i, j)
-        return self._without_itself(context, a, i, j, slopes, self._implied(context))
+        shift, _ = self._implied(context)
+        return self._without_itself(context, a, i, j, slopes, shift)
 
     def _without_itself(
         self, context: Context, a: Places, i: Places, j: Places, slopes: Floats, shift: Floats
@@ -238,14 +271,14 @@ class ClosedForm:
         )
         return found
 
-    def _implied(self, context: Context) -> Floats:
+    def _implied(self, context: Context) -> tuple[Floats, Floats]:
         given = context.given
         if given is None or self._gamma is None or self._B is None:
-            return _NOTHING
-        found: Floats = given_kernels.implied(
+            return _NOTHING, _NOTHING
+        shift, apart = given_kernels.implied(
             self._gamma, self._B, context.x, len(context.classes), *_lists(given), given.r
         )
-        return found
+        return shift, apart
 
     def placement_log_odds(
         self, context: Context, candidates: Places, anchors: Places
@@ -282,7 +315,16 @@ class ClosedForm:
 
     def without_each(self, context: Context) -> WithoutEach:
         """What the rest of a scene does for the log-odds of each of its classes."""
-        classes, share = context.classes, None
+        return WithoutEach(
+            *object_kernels.without_each(
+                context.y, self.W, context.classes, self._shares(context), self._group
+            )
+        )
+
+    def _shares(self, context: Context) -> Floats:
+        """What each class and its relations add to y, (n, H1)."""
+        classes = context.classes
+        share: Floats
         if context.given is None:
             share = context.presence[:, None] * self.W[classes]
         else:
@@ -290,9 +332,7 @@ class ClosedForm:
                 *(self._weights, self.W, classes, context.presence, context.log_counts),
                 *(*_lists(context.given), context.slopes),
             )
-        return WithoutEach(
-            *object_kernels.without_each(context.y, self.W, classes, share, self._group)
-        )
+        return share
 
     def reasons(self, context: Context, each: WithoutEach, rows: Places) -> Floats:
         """How the gain of the classes in `rows` (N,) changes by each other class, (N, n)."""
@@ -305,6 +345,13 @@ class ClosedForm:
         found: Floats = object_kernels.reasons(*each, rows, common, filled, self._group)
         return found
 
+    def reasons_for_absent(self, context: Context, candidates: Places) -> Floats:
+        """The same of absent classes (N,): what each present one does for them, (N, n)."""
+        found: Floats = object_kernels.reasons_for_absent(
+            context.y, self.W, candidates, self._shares(context), self._group
+        )
+        return found
+
 
 def _lists(given: Given) -> tuple[Places, Places, Places]:
     return given.a, given.i, given.j
@@ -314,7 +361,8 @@ def _array(tensor: Any) -> NDArray[Any]:
     return np.array(tensor.detach().numpy(), order="C")
 
 
-def _weights(machine: Triway) -> Weights:
+def _weights(machine: Triway) -> tuple[Weights, Floats]:
+    """The weights, and the directions of all relations as rows, filled up too."""
     A, V = machine.spec.A, machine.spec.V
     F, Y = _directions(machine)
     r = F.shape[1]
@@ -329,7 +377,7 @@ def _weights(machine: Triway) -> Weights:
     residual = np.zeros((len(pairs) + 1, A), dtype=np.float32)
     place = row[np.searchsorted(pairs, triples % (V * V))]
     residual[place, triples // (V * V)] = _array(machine.residual)
-    return Weights(
+    weights = Weights(
         S=_array(machine.S),
         O=_array(machine.O),
         s=_array(machine.s.T),
@@ -344,6 +392,7 @@ def _weights(machine: Triway) -> Weights:
         Y0=np.ascontiguousarray(Y[:, :, 0]),
         Y=np.ascontiguousarray(Y[:, :, 1:]),
     )
+    return weights, _filled(F.reshape(1, A * r, -1))[0]
 
 
 def _filled(rows: Floats) -> Floats:

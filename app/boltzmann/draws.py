@@ -48,12 +48,14 @@ class HiddenDraws:
         """(B,) effective number of draws, 1 / sum w²."""
         return (-(2 * self.log_weight).logsumexp(0)).exp()
 
-    def implied(self, machine: BoltzmannMachine, edges: Edges, given: Tensor) -> Tensor:
+    def implied(
+        self, machine: BoltzmannMachine, edges: Edges, given: Tensor, *, apart: bool = False
+    ) -> Tensor:
         """What the given relations (B, E), 1 where on, imply for the others, (B, E).
 
         How strictly is for the objects to say: the context is taken at its mean without relations.
         """
-        return machine.implied(edges, given, self.field.x.sigmoid())
+        return machine.implied(edges, given, self.field.x.sigmoid(), apart=apart)
 
     def mean(self, values: Tensor) -> Tensor:
         """Expectation of values (M, B, ...) over the draws, (B, ...)."""

@@ -240,7 +240,9 @@ def common_growth(w, classes, log_counts, a, i, j, slopes, rows):
 
 @compiled
 def implied(gamma, B, x, n, a, i, j, r):
-    """What the given relations that hold imply for all others, (A, n, n); see `implications`.
+    """What the given relations that hold imply for all others, (2, A, n, n); see `implications`.
+
+    First all they do; then without what those of a pair imply for each other.
 
     Args:
         gamma: (1 + G, A, F).  B: (G, H1).
@@ -274,18 +276,18 @@ def implied(gamma, B, x, n, a, i, j, r):
                 ends[c, x_, y_ // _WORD] |= np.uint64(1) << np.uint64(y_ % _WORD)
     shift = np.zeros((n, n, A), np.float32)
     _add_degrees(both, weight[steps + steps * steps :], shift)
-    for c in range(steps):
-        for x_ in range(n):
-            for y_ in range(n):
-                if both[c, x_, y_]:
-                    for b in range(A):
-                        shift[x_, y_, b] += weight[c, b]
     _add_paths(both, ends, weight[steps:], shift)
-    found = np.empty((A, n, n), np.float32)
+    found = np.empty((2, A, n, n), np.float32)
     for x_ in range(n):
         for y_ in range(n):
             for b in range(A):
-                found[b, x_, y_] = shift[x_, y_, b]
+                found[1, b, x_, y_] = shift[x_, y_, b]
+            for c in range(steps):
+                if both[c, x_, y_]:
+                    for b in range(A):
+                        shift[x_, y_, b] += weight[c, b]
+            for b in range(A):
+                found[0, b, x_, y_] = shift[x_, y_, b]
     return found
 
 

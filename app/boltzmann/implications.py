@@ -52,7 +52,7 @@ def implication_features(given: Tensor) -> Tensor:
     return torch.cat([both, paths, degrees], 1)
 
 
-def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor) -> Tensor:
+def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
     """x, (B, A, n, n).
 
     Args:
@@ -60,10 +60,14 @@ def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor) -> Tensor:
         B: (G, H1).
         given: (B, A, n, n), 1 where a relation is given as holding, else 0.
         h1: (B, H1), means of the context given the objects.
+        apart: without what the relations of a pair imply for each other.
     """
     A = given.shape[1]
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool, device=gamma.device)
     itself[:, :A].fill_diagonal_(True)
+    if apart:
+        # Paths and neighbours are those of other classes as they are.
+        itself[:, : 2 * A] = True
     gamma = gamma.masked_fill(itself, 0.0)
     weight = gamma[0] + torch.einsum("bq,qaf->baf", h1 @ B.T, gamma[1:])
     features = implication_features(given)

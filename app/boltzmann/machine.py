@@ -123,7 +123,7 @@ class BoltzmannMachine(nn.Module, ABC):
         bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 
-    def implied(self, edges: Edges, given: Tensor, h1: Tensor) -> Tensor:
+    def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
         """What given relations add to the logits of the others, (B, E); see `implications`.
 
         Nothing but in a machine that has weights for it.
@@ -131,8 +131,9 @@ class BoltzmannMachine(nn.Module, ABC):
         Args:
             given: (B, E), 1 where a unit is given as on.
             h1: (B, H1) means given the objects.
+            apart: without what the relations of two classes imply for each other.
         """
-        del edges, h1
+        del edges, h1, apart
         return torch.zeros_like(given)
 
     @abstractmethod

@@ -79,6 +79,64 @@ def without_each(y, W, classes, share, group):
 
 
 @compiled
+def reasons_for_absent(y, W, candidates, share, group):
+    """How the gain of absent classes (N,) changes by each class that is there, (N, n).
+
+    Args:
+        share: (n, H1) what each adds to y.
+    """
+    (n, H1), N = share.shape, len(candidates)
+    blocks = -(-H1 // _LANES)
+    size = blocks * _LANES
+    off, on = np.ones(size, np.float32), np.zeros(size, np.float32)
+    growth, rest = np.ones((N, size), np.float32), np.empty(H1, np.float32)
+    for c in range(N):
+        weight, up = W[candidates[c]], growth[c]
+        for k in range(H1):
+            up[k] = exp(weight[k])
+    # Blocks by number: some thousand slices would take as long as what is computed.
+    off_of, on_of = off.reshape(blocks, _LANES), on.reshape(blocks, _LANES)
+    growth_of = growth.reshape(N, blocks, _LANES)
+    product, total = np.empty(_LANES, np.float32), np.empty(_LANES, np.float32)
+    with_all, change = np.empty(N, np.float32), np.empty((N, n), np.float32)
+    for j in range(-1, n):
+        rest[:] = y
+        if j >= 0:
+            added = share[j]
+            for k in range(H1):
+                rest[k] -= added[k]
+        # sigmoid(-rest) and sigmoid(rest) from one exponential, and neither as a difference.
+        for k in range(H1):
+            rest[k] = exp(-rest[k])
+        for k in range(H1):
+            on[k] = np.float32(1.0) / (np.float32(1.0) + rest[k])
+        for k in range(H1):
+            off[k] = rest[k] * on[k]
+        for c in range(N):
+            up_of, left = growth_of[c], group
+            for lane in range(_LANES):
+                product[lane], total[lane] = np.float32(1.0), np.float32(0.0)
+            for block in range(blocks):
+                for lane in range(_LANES):
+                    product[lane] *= off_of[block, lane] + on_of[block, lane] * up_of[block, lane]
+                left -= 1
+                if left == 0 or block == blocks - 1:
+                    left = group
+                    for lane in range(_LANES):
+                        total[lane] += log(product[lane])
+                    for lane in range(_LANES):
+                        product[lane] = np.float32(1.0)
+            gain = np.float32(0.0)
+            for lane in range(_LANES):
+                gain += total[lane]
+            if j < 0:
+                with_all[c] = gain
+            else:
+                change[c, j] = with_all[c] - gain
+    return change
+
+
+@compiled
 def reasons(gain, off, rest, fall, growth, rows, common, filled, group):
     """How the gain of the classes in rows (N,) changes by each other class, (N, n); 0 by itself.
 

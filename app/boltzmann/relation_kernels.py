@@ -253,6 +253,107 @@ def relation_log_odds(y, w, classes, log_counts, slopes, shift):
 
 
 @compiled
+def log_odds_apart(y, w, F, classes, log_counts, slopes, shift, i, j):
+    """All relations between two classes, without anything given of the two, (2, A, P).
+
+    What is given of a pair is taken out of y to first order: ℓ_e(m) changes by
+
+        sum_e' slope_e' cov(ℓ_e, ℓ_e'),   cov = sum_k U_ek U_e'k m_k (1 - m_k)
+
+    over the units e' of the pair, both ways.
+
+    Args:
+        F: (A r up to whole rows, H1) the directions of all relations.
+        slopes: (A, n, n) or empty.
+        shift: (A, n, n) or empty, what other pairs imply.
+        i, j: (P,) places of the classes; the relations from i to j come first.
+    """
+    A, P = len(w.g), len(i)
+    subjects, objects = np.empty(2 * P, np.int64), np.empty(2 * P, np.int64)
+    log_subjects, log_objects = np.empty(2 * P, np.float32), np.empty(2 * P, np.float32)
+    for p in range(P):
+        for way in range(2):
+            one, other = (i[p], j[p]) if way == 0 else (j[p], i[p])
+            e = way * P + p
+            subjects[e], objects[e] = classes[one], classes[other]
+            log_subjects[e], log_objects[e] = log_counts[one], log_counts[other]
+    size = _whole_blocks(2 * P)
+    mean, spread = np.zeros((A, size), np.float32), np.empty((A, size), np.float32)
+    on = means(y)
+    through, C = _moments(on.reshape(1, -1), w, 0, A)
+    functions = _rows(through[0], C[0], w, 0, A)
+    _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread)
+    if len(slopes):
+        own = np.empty((P, 2, A), np.float32)
+        for p in range(P):
+            for a in range(A):
+                own[p, 0, a] = slopes[a, i[p], j[p]]
+                # Of a class with itself the two ways are one.
+                own[p, 1, a] = slopes[a, j[p], i[p]] if i[p] != j[p] else np.float32(0.0)
+        _take_out(_covariances(F, on), w, subjects, objects, own, mean)
+    if len(shift):
+        for a in range(A):
+            for p in range(P):
+                mean[a, p] += shift[a, i[p], j[p]]
+                mean[a, P + p] += shift[a, j[p], i[p]]
+    to_log_odds(mean.reshape(-1), spread.reshape(-1))
+    found = np.empty((2, A, P), np.float32)
+    for way in range(2):
+        for a in range(A):
+            for p in range(P):
+                found[way, a, p] = mean[a, way * P + p]
+    return found
+
+
+@compiled_in_any_order
+def _covariances(F, mean):
+    """F diag(m (1 - m)) F'."""
+    spread = np.empty(F.shape, np.float32)
+    for q in range(len(F)):
+        row, into = F[q], spread[q]
+        for h in range(len(mean)):
+            into[h] = row[h] * (mean[h] * (np.float32(1.0) - mean[h]))
+    found = np.zeros((len(F), len(F)), np.float32)
+    add_products(F, spread, found)
+    return found
+
+
+@compiled_in_any_order
+def _take_out(covariances, w, subjects, objects, slopes, mean):
+    """mean (A, 2P) -= what the units of each pair add to each other, for their slopes (P, 2, A)."""
+    S, O, Y0, Y = w.S, w.O, w.Y0, w.Y  # noqa: E741
+    (A, r, K), P = Y.shape, len(slopes)
+    z, q = np.empty(K, np.float32), np.empty((2, A * r), np.float32)
+    pull, back = np.empty(A * r, np.float32), np.empty(A * r, np.float32)
+    for p in range(P):
+        pull[:] = np.float32(0.0)
+        for way in range(2):
+            e, q_way = way * P + p, q[way]
+            S_i, O_j = S[subjects[e]], O[objects[e]]
+            for k in range(K):
+                z[k] = S_i[k] * O_j[k]
+            for a in range(A):
+                slope = slopes[p, way, a]
+                for t in range(r):
+                    row, total = Y[a, t], Y0[a, t]
+                    for k in range(K):
+                        total += row[k] * z[k]
+                    q_way[a * r + t] = total
+                    pull[a * r + t] += slope * total
+        for s in range(A * r):
+            row, total = covariances[s], np.float32(0.0)
+            for t in range(A * r):
+                total += row[t] * pull[t]
+            back[s] = total
+        for way in range(2):
+            for a in range(A):
+                total = np.float32(0.0)
+                for t in range(r):
+                    total += q[way, a * r + t] * back[a * r + t]
+                mean[a, way * P + p] -= total
+
+
+@compiled
 def placement_log_odds(y, W, w, candidates, anchors, log_counts):
     """Relations of absent candidates to anchors and back, (N, A, m) both, were they there."""
     A, N, m = len(w.g), len(candidates), len(anchors)

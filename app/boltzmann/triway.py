@@ -100,12 +100,12 @@ class Triway(BoltzmannMachine):
         position, found = find_triples(self.triple_keys, keys)
         return pairs.unflatten(self.residual[position] * found)
 
-    def implied(self, edges: Edges, given: Tensor, h1: Tensor) -> Tensor:
+    def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
         """By gamma and B; zero without them."""
         if not self.spec.G:
             return super().implied(edges, given, h1)
         grid = _pairs(edges).unflatten(given)
-        return implied(self.gamma, self.B, grid, h1).flatten(-3)
+        return implied(self.gamma, self.B, grid, h1, apart=apart).flatten(-3)
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
         """sum_e weight_e U_e through the factors, without forming U."""

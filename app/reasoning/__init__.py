@@ -14,9 +14,11 @@ from __future__ import annotations
 from app.reasoning.answers import (
     Because,
     ContextUnit,
+    Disagreement,
     GeneratedScene,
     MisplacedAnswer,
     MissingAnswer,
+    Offset,
     OutlierAnswer,
     Placement,
     RelationAnswer,
@@ -30,9 +32,11 @@ from app.reasoning.relations import relations
 __all__ = [
     "Because",
     "ContextUnit",
+    "Disagreement",
     "GeneratedScene",
     "MisplacedAnswer",
     "MissingAnswer",
+    "Offset",
     "OutlierAnswer",
     "Placement",
     "RelationAnswer",

@@ -18,12 +18,45 @@ class RelationAnswer(NamedTuple):
     probability: float
 
 
+class Offset(NamedTuple):
+    """From the centre of an anchor to that of a missing thing, in metres.
+
+    Attributes:
+        mean, std: along x, y and z.
+        scenes: training scenes that showed the two classes so.
+    """
+
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    scenes: int
+
+
+class Disagreement(NamedTuple):
+    """Two objects that stand otherwise than the rest of the scene makes one expect.
+
+    Attributes:
+        subject, object: which two.
+        observed: relations of the one to the other that were stated or observed.
+        expected: the likeliest relation, judged without all that is known of the pair.
+        probability: of it, as that of a `RelationAnswer`.
+        observed_probability: of the likeliest observed one.
+    """
+
+    subject: int
+    object: int
+    observed: tuple[str, ...]
+    expected: str
+    probability: float
+    observed_probability: float
+
+
 class Placement(NamedTuple):
-    """A missing thing would stand in `relation` to `object`."""
+    """A missing thing would stand in `relation` to `object`, at `offset` from it where known."""
 
     relation: str
     object: int
     probability: float
+    offset: Offset | None = None
 
 
 class MissingAnswer(NamedTuple):
@@ -35,12 +68,14 @@ class MissingAnswer(NamedTuple):
             place: given that it stood there).
         log_odds: of its presence against its absence.
         placements: where it would stand, likeliest first.
+        because: the objects that change its log-odds most, strongest first.
     """
 
     label: str
     probability: float
     log_odds: float
     placements: tuple[Placement, ...]
+    because: tuple[Because, ...]
 
 
 class Because(NamedTuple):
@@ -101,10 +136,15 @@ class ContextUnit:
 
     Attributes:
         unit: its number in the layer.
+        name: for people to read.
         objects: (label, weight) of the objects it favours most.
+        relations: ((subject, relation, object), weight) of the relations it favours most, beyond
+            the mean over the layer.
         room_types: (room type, weight) of the room types that favour it most.
     """
 
     unit: int
+    name: str
     objects: tuple[tuple[str, float], ...]
+    relations: tuple[tuple[tuple[str, str, str], float], ...]
     room_types: tuple[tuple[str, float], ...]

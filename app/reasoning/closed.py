@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from app.boltzmann.closed_form import ClosedForm, WithoutEach
+from app.boltzmann.closed_form import Between, ClosedForm, WithoutEach
 from app.reasoning.given import given_relations
 from app.reasoning.present import present
 from app.registry.artifact import Artifact
@@ -40,11 +40,16 @@ class ClosedPosterior:
 
     def relation_log_odds(self) -> Floats:
         """Normal logits."""
-        return self._closed.relation_log_odds(self._context)
+        return self._closed.relation_log_odds(self._context, self._between)
 
     def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
         """Normal logits."""
         return self._closed.unit_log_odds(self._context, relation, subject, object_)
+
+    def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
+        """Normal logits; what is known of the pair is taken out to first order."""
+        forward, backward = self._closed.log_odds_apart(self._context, self._between, one, other)
+        return forward, backward
 
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
         """Normal logits."""
@@ -66,6 +71,14 @@ class ClosedPosterior:
     def reasons(self, rows: Places) -> Floats:
         """Exact where no relation is given."""
         return self._closed.reasons(self._context, self._without_each, rows)
+
+    def reasons_for_absent(self, candidates: Places) -> Floats:
+        """Exact where no relation is given."""
+        return self._closed.reasons_for_absent(self._context, candidates)
+
+    @cached_property
+    def _between(self) -> Between:
+        return self._closed.between(self._context)
 
     @cached_property
     def _without_each(self) -> WithoutEach:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from app.boltzmann.log_odds import object_log_odds
 from app.boltzmann.mean_field import Evidence
 from app.reasoning.evidence import DRAWS, draw_context, observe
 from app.reasoning.present import Present
-from app.reasoning.units import NO_UNIT, mean_log_p, units_between
+from app.reasoning.units import NO_UNIT, Units, mean_log_p, units_between
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 
@@ -26,6 +27,22 @@ Places = NDArray[np.int64]
 
 # Rows and candidates are taken in blocks of about so many relation units times draws.
 _BLOCK = 1 << 22
+
+
+class _Between(NamedTuple):
+    """The units between the classes of a scene.
+
+    Attributes:
+        units: E of them.
+        logits: (M, E), one row a draw.
+        said: (M, E) what takes an observation out of the log-weights of the draws; or 0.
+        holds: (1, E), 1 where observed as on; None where nothing is observed.
+    """
+
+    units: Units
+    logits: Tensor
+    said: Tensor
+    holds: Tensor | None
 
 
 class DrawnPosterior:
@@ -70,22 +87,55 @@ class DrawnPosterior:
         observed. An observed unit is taken out of the evidence by reweighting them:
         w ← w / p(r_e | v, h1). A relation without a unit has log-odds `NO_UNIT`.
         """
-        observation, draws = self.observation, self.draws
+        between = self._between
+        weight = torch.softmax(self.draws.log_weight + between.said, dim=0)
+        on, off = mean_log_p(weight, between.logits + self._implied(apart=False))
+        return _numpy(between.units.grid((on - off).clamp(min=NO_UNIT), NO_UNIT))
+
+    @torch.inference_mode()
+    def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
+        """Over the same draws, reweighted by all units of the pair at once, both ways."""
+        units, said = self._between.units, self._between.said
+        logits = self._between.logits + self._implied(apart=True)
+        ends = torch.from_numpy(one), torch.from_numpy(other)
+        ways = units.of_pairs(*ends), units.of_pairs(*ends[::-1])
+        log_weight = self.draws.log_weight
+        if said.dim():
+            forward, backward = (way.grid(said, 0.0).sum(1) for way in ways)
+            # Of a class with itself the two ways are one.
+            log_weight = log_weight + forward + backward * (ends[0] != ends[1])
+        weight = torch.softmax(log_weight, dim=0).unsqueeze(1)
+        found = []
+        for way in ways:
+            on, off = mean_log_p(weight, way.grid(logits, NO_UNIT))
+            log_odds = (on - off).clamp(min=NO_UNIT)
+            found.append(_numpy(torch.where(way.exists, log_odds, NO_UNIT)))
+        return found[0], found[1]
+
+    @cached_property
+    def _between(self) -> _Between:
+        observation = self.observation
         machine, evidence = observation.machine, observation.evidence
         classes, counts = observation.classes, observation.counts
         units = units_between(machine, classes, classes, counts, counts)
-        logits = machine.relation_logits(units.edges, evidence.v, draws.h1).squeeze(1)
-        log_weight, implied = draws.log_weight, logits.new_zeros(())
-        if bool(observation.observed.any()):
-            observed = units.flat(observation.observed)
-            r = units.flat(observation.holds).to(logits.dtype)
-            gate = machine.gate(units.edges, evidence.v)
-            unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
-            log_weight = log_weight + unseen - machine.relation_term(logits, gate, r, observed)
-            # Where e is not observed, the difference is zero and the weights stay as they are.
-            implied = draws.implied(machine, units.edges, (r * observed).unsqueeze(0)).squeeze(0)
-        on, off = mean_log_p(torch.softmax(log_weight, dim=0), logits + implied)
-        return _numpy(units.grid((on - off).clamp(min=NO_UNIT), NO_UNIT))
+        logits = machine.relation_logits(units.edges, evidence.v, self.draws.h1).squeeze(1)
+        if not bool(observation.observed.any()):
+            return _Between(units, logits, logits.new_zeros(()), None)
+        observed = units.flat(observation.observed)
+        r = units.flat(observation.holds).to(logits.dtype)
+        gate = machine.gate(units.edges, evidence.v)
+        unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
+        # Where e is not observed, the difference is zero and the weights stay as they are.
+        said = unseen - machine.relation_term(logits, gate, r, observed)
+        return _Between(units, logits, said, (r * observed).unsqueeze(0))
+
+    def _implied(self, *, apart: bool) -> Tensor:
+        """What the observed relations imply for each unit, (E,)."""
+        between = self._between
+        if between.holds is None:
+            return between.logits.new_zeros(())
+        machine, edges = self.observation.machine, between.units.edges
+        return self.draws.implied(machine, edges, between.holds, apart=apart).squeeze(0)
 
     def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
         """Among all of them."""
@@ -178,6 +228,23 @@ class DrawnPosterior:
         change = without.gather(1, places.unsqueeze(1)) - without
         change[torch.arange(len(places)), places] = 0.0
         return _numpy(change)
+
+    @torch.inference_mode()
+    def reasons_for_absent(self, candidates: Places) -> Floats:
+        """With the context at its mean field on both sides, as for `reasons`."""
+        observation = self.observation
+        machine, n = observation.machine, len(observation.classes)
+        where = torch.from_numpy(np.asarray(candidates, dtype=np.int64)).unsqueeze(0)
+        # The first row is the scene as it is.
+        removed = torch.eye(n + 1, dtype=torch.bool)[:, 1:]
+        size = observation.unit_count + where.shape[1] * max(1, machine.spec.H1)
+        log_odds = torch.cat(
+            [
+                object_log_odds(machine, observation.without(part), candidates=where)
+                for part in removed.split(_rows(size))
+            ]
+        )
+        return _numpy((log_odds[0] - log_odds[1:]).T)
 
 
 def _rows(size: int) -> int:

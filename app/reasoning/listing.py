@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from app.boltzmann.relation_kernels import NO_UNIT
 from app.compiling import compiled
 from app.reasoning.calibration import exclusive, relation_probability
 from app.reasoning.ranking import best
@@ -35,7 +36,7 @@ def likeliest_classes(scores, chosen, count):
 
 
 @compiled
-def likeliest_places(slopes, forward, backward, log_counts, classes, count):
+def likeliest_places(slopes, forward, backward, log_counts, classes, count, first):
     """The best places of each candidate, (N, k): numbers of them, and their probabilities.
 
     Args:
@@ -43,6 +44,7 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count):
         forward, backward: (N, A, m) log-odds of relations to the anchors, and of those back.
         log_counts: (m,).
         classes: how many distinct ones there are with the candidate.
+        first: the place that is listed before all others, however likely; -1 for none.
 
     Returns:
         Place (d A + a) m + j is relation a, back if d = 1, of anchor j.
@@ -52,15 +54,19 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count):
     to = relation_probability(slopes, forward.reshape(N, A, 1, m), counts, classes)
     back = relation_probability(slopes, backward.reshape(N, A, 1, m), counts, classes)
     p, usable = np.empty(2 * size, forward.dtype), np.ones(2 * size, np.bool_)
-    kept = min(count, 2 * size)
+    kept, begin = min(count, 2 * size), 0
+    if first >= 0:
+        usable[first], begin = False, 1
     places, probabilities = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
     for c in range(N):
         one, other = to[c].reshape(-1), back[c].reshape(-1)
         for e in range(size):
             p[e], p[size + e] = exclusive(one[e], other[e])
-        where = best(p, usable, kept)
-        for k in range(kept):
-            places[c, k], probabilities[c, k] = where[k], p[where[k]]
+        if first >= 0:
+            places[c, 0], probabilities[c, 0] = first, p[first]
+        where = best(p, usable, kept - begin)
+        for k in range(begin, kept):
+            places[c, k], probabilities[c, k] = where[k - begin], p[where[k - begin]]
     return places, probabilities
 
 
@@ -116,6 +122,87 @@ def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposit
 
 
 @compiled
+def observed_pairs(triples, row, asked, classes, relations):
+    """Pairs of objects between which something holds, (P,) each of what follows.
+
+    Relations are numbers, a from subject to object and A + a back, and a set of them is their bits.
+
+    Args:
+        triples: (T, 3) relation, subject and object.
+        row: (N,) the class of each object.
+        asked: (N, N) ordered pairs; a pair asked either way counts.
+        classes, relations: how many there are, n and A.
+
+    Returns:
+        Subject and object; what holds from the one to the other, and what between any two
+        instances of their classes.
+    """
+    size = len(row)
+    holds, of_classes = np.zeros((size, size), np.int64), np.zeros((classes, classes), np.int64)
+    for t in range(len(triples)):
+        a, x, y = triples[t, 0], triples[t, 1], triples[t, 2]
+        holds[x, y] |= 1 << a
+        holds[y, x] |= 1 << (relations + a)
+        of_classes[row[x], row[y]] |= 1 << a
+        of_classes[row[y], row[x]] |= 1 << (relations + a)
+    found = np.empty((4, min(len(triples), size * size)), np.int64)
+    pairs, forward = 0, (1 << relations) - 1
+    for x in range(size):
+        for y in range(x + 1, size):
+            if holds[x, y] and (asked[x, y] or asked[y, x]):
+                # Whose relation comes first: the lowest bit of what holds from x, and from y.
+                one, other = holds[x, y] & forward, holds[y, x] & forward
+                swapped = one == 0 or (other != 0 and (other & -other) < (one & -one))
+                subject, object_ = (y, x) if swapped else (x, y)
+                found[0, pairs], found[1, pairs] = subject, object_
+                found[2, pairs] = holds[subject, object_]
+                found[3, pairs] = of_classes[row[subject], row[object_]]
+                pairs += 1
+    return found[0, :pairs], found[1, :pairs], found[2, :pairs], found[3, :pairs]
+
+
+@compiled
+def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classes, least, count):
+    """The `count` pairs whose likeliest relation exceeds those observed by the largest ratio.
+
+    Args:
+        slopes: (A, 4), see `RelationSlopes`.
+        forward, backward: (A, P) log-odds from subject to object, and back.
+        log_counts: (P,) log of the instance pairs of both classes.
+        classes: how many distinct ones the scene has.
+        holds, of_classes: (P,) see `observed_pairs`; what either has is not expected.
+        least: leave out what is expected with less.
+
+    Returns:
+        (k,) places, numbers of the expected relations, their probabilities, and those of the
+        likeliest relations that hold.
+    """
+    A, P = forward.shape
+    counts = log_counts.reshape(1, P)
+    to = relation_probability(slopes, forward.reshape(1, A, 1, P), counts, classes)
+    back = relation_probability(slopes, backward.reshape(1, A, 1, P), counts, classes)
+    expected, ratio = np.empty(P, np.int64), np.empty(P, np.float64)
+    likely, usable = np.empty((2, P), np.float64), np.zeros(P, np.bool_)
+    p = np.empty(2 * A, forward.dtype)
+    for k in range(P):
+        for a in range(A):
+            p[a], p[A + a] = exclusive(to[0, a, 0, k], back[0, a, 0, k])
+        top, observed = -1, np.float64(0.0)
+        for name in range(2 * A):
+            log_odds = forward[name, k] if name < A else backward[name - A, k]
+            if log_odds > NO_UNIT and (top < 0 or p[name] > p[top]):
+                top = name
+            if holds[k] >> name & 1:
+                observed = max(observed, np.float64(p[name]))
+        if top >= 0 and not of_classes[k] >> top & 1 and p[top] > observed and p[top] >= least:
+            usable[k], expected[k] = True, top
+            likely[0, k], likely[1, k] = p[top], observed
+            ratio[k] = likely[0, k] / observed
+    where = best(ratio, usable, count)
+    return where, expected[where], likely[0][where], likely[1][where]
+
+
+@compiled
 def least_fitting(intercept, slope, log_odds, row):
     """Objects by how badly they fit, ties by place, (N,); and the probability of each class, (n,).
 
@@ -136,18 +223,23 @@ def least_fitting(intercept, slope, log_odds, row):
 
 @compiled
 def strongest(change, rows, count):
-    """For each class in rows (N,) the places of the largest changes (N, n), and these; not its own.
+    """The places of the largest changes, of either sign, and these, (N, k) both.
 
-    Of either sign, (N, k) both.
+    Args:
+        change: (N, n).
+        rows: (N,) the place of what is explained, which is no reason for itself; empty where
+            nothing of it is among the n.
     """
-    n = change.shape[1]
-    kept = min(count, n - 1)
-    places, values = np.empty((len(rows), kept), np.int64), np.empty((len(rows), kept), np.float64)
+    N, n = change.shape
+    kept = min(count, n - (len(rows) > 0))
+    places, values = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
     usable = np.ones(n, np.bool_)
-    for c in range(len(rows)):
-        usable[rows[c]] = False
+    for c in range(N):
+        if len(rows):
+            usable[rows[c]] = False
         where = best(np.abs(change[c]), usable, kept)
-        usable[rows[c]] = True
+        if len(rows):
+            usable[rows[c]] = True
         for k in range(kept):
             places[c, k], values[c, k] = where[k], change[c, where[k]]
     return places, values

@@ -7,14 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning.answers import MissingAnswer
+from app.reasoning.answers import Because, MissingAnswer
 from app.reasoning.calibration import missing_scores, placed_scores
 from app.reasoning.listing import absent_things, likeliest_classes
 from app.reasoning.placements import placements
-from app.reasoning.posterior import posterior
+from app.reasoning.posterior import Posterior, posterior
+from app.reasoning.reasons import EXPLAINED, strongest_reasons
 from app.registry.artifact import Artifact
+from app.scene.frames import Axes, viewer_axes
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene
+
+_VIEWER = viewer_axes()
 
 
 def missing(
@@ -24,6 +28,7 @@ def missing(
     top_k: int = 10,
     candidates: Sequence[int] | None = None,
     at: tuple[str, int] | None = None,
+    axes: Axes | None = _VIEWER,
 ) -> tuple[MissingAnswer, ...]:
     """Absent classes by the probability that they were taken away, likeliest first.
 
@@ -35,6 +40,8 @@ def missing(
         candidates: class indices to choose from; present classes and structure among them are
             passed over.
         at: (relation, position of an object): the missing thing stood so to that object.
+        axes: the viewer's, in the frame that offsets are answered in (`viewer_axes`); None where
+            nobody knows where the viewer looks.
 
     Raises:
         ValueError: top_k below 1, a candidate outside the vocabulary, an unknown relation, or an
@@ -62,16 +69,26 @@ def missing(
     labels = artifact.vocabulary.labels
     return tuple(
         [
-            MissingAnswer(labels[index], probability, value, standing)
-            for index, probability, value, standing in zip(
+            MissingAnswer(labels[index], probability, value, standing, because)
+            for index, probability, value, standing, because in zip(
                 found.tolist(),
                 probabilities.tolist(),
                 log_odds[where].tolist(),
-                placements(artifact, given, found),
+                placements(artifact, given, found, axes, place),
+                _reasons(given, found),
                 strict=True,
             )
         ]
     )
+
+
+def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, ...]]:
+    """The classes that are there and change the log-odds of what was found most."""
+    if not len(given.present.classes):
+        return [()] * len(found)
+    explained = found[:EXPLAINED]
+    reasons = strongest_reasons(given.present, given.reasons_for_absent(explained))
+    return reasons + [()] * (len(found) - len(explained))
 
 
 def _place(

@@ -6,20 +6,15 @@ import numpy as np
 
 from app.reasoning.answers import Because, MisplacedAnswer, OutlierAnswer
 from app.reasoning.calibration import false_log_odds, intruder_line, sigmoid
-from app.reasoning.listing import least_fitting, strongest
+from app.reasoning.listing import least_fitting
 from app.reasoning.posterior import Posterior, posterior
+from app.reasoning.reasons import EXPLAINED, strongest_reasons
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
 
-REASONS = 3
-"""How many other objects an answer names as reasons."""
-
-EXPLAINED = 32
-"""Reasons are given for so many objects at most, the least fitting ones: each costs n rows."""
-
-# Where a scene shows very many relations, reasons are given for fewer objects, so that their rows
-# hold about so many relation units in all.
+# Reasons for one object cost n rows. Where a scene shows very many relations, they are given for
+# fewer objects, so that their rows hold about so many relation units in all.
 _REASON_UNITS = 1 << 22
 
 
@@ -86,18 +81,11 @@ def _affordable(given: Posterior) -> int:
 
 def _reasons(given: Posterior, explained: list[int]) -> dict[int, tuple[Because, ...]]:
     """For each explained class, the other classes that change its log-odds most."""
-    classes = len(given.present.classes)
-    if classes < 2:
+    if len(given.present.classes) < 2:
         return dict.fromkeys(explained, ())
     rows = np.array(explained, dtype=np.int64)
-    places, values = strongest(given.reasons(rows), rows, REASONS)
-    first = given.present.first.tolist()
-    return {
-        row: tuple(
-            [Because(first[place], value) for place, value in zip(some, their_values, strict=True)]
-        )
-        for row, some, their_values in zip(explained, places.tolist(), values.tolist(), strict=True)
-    }
+    found = strongest_reasons(given.present, given.reasons(rows), rows)
+    return dict(zip(explained, found, strict=True))
 
 
 def _misplaced(artifact: Artifact, given: Posterior, scene: Scene) -> tuple[MisplacedAnswer, ...]:

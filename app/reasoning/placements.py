@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning.answers import Placement
+from app.reasoning.answers import Offset, Placement
 from app.reasoning.listing import likeliest_places
+from app.reasoning.offsets import offsets_of
 from app.reasoning.posterior import Posterior
 from app.registry.artifact import Artifact
+from app.scene.frames import Axes
 from app.scene.relations import RELATIONS, opposite
 
 PLACES = 3
@@ -18,7 +20,11 @@ _SEEN_FROM_ANCHORS = tuple(map(opposite, RELATIONS))
 
 
 def placements(
-    artifact: Artifact, given: Posterior, candidates: NDArray[np.int64]
+    artifact: Artifact,
+    given: Posterior,
+    candidates: NDArray[np.int64],
+    axes: Axes | None,
+    at: tuple[int, int, bool] | None = None,
 ) -> list[tuple[Placement, ...]]:
     """The likeliest relations of each candidate to what is present, best first.
 
@@ -27,25 +33,40 @@ def placements(
 
     Args:
         candidates: (N,) absent classes.
+        axes: what offsets are answered in, see `offsets_of`.
+        at: canonical relation, object, and whether the missing thing is its subject: the place that
+            was asked about comes first, spoken of by that object. Structure is no place of its own.
     """
     present = given.present
     anchors = np.flatnonzero(~artifact.vocabulary.structure[present.classes])
     if not len(anchors):
         return [()] * len(candidates)
     forward, backward = given.placement_log_odds(candidates, anchors)
-    A = forward.shape[1]
+    A, first, asked = forward.shape[1], present.first[anchors].tolist(), -1
+    if at is not None:
+        relation, object_, outgoing = at
+        (found,) = np.nonzero(anchors == present.row[object_])
+        if len(found):
+            asked = ((0 if outgoing else A) + relation) * len(first) + int(found[0])
+            first[found[0]] = object_
     places, probabilities = likeliest_places(
         *(artifact.relation_slopes.placement, forward, backward, present.log_counts[anchors]),
-        *(len(present.classes) + 1, PLACES),
+        *(len(present.classes) + 1, PLACES, asked),
     )
-    first = present.first[anchors].tolist()
     names = RELATIONS[:A] + _SEEN_FROM_ANCHORS[:A]
-    return [
-        tuple(
-            [
-                Placement(names[place // len(first)], first[place % len(first)], probability)
-                for place, probability in zip(some, values, strict=True)
-            ]
+    flat = places.reshape(-1)
+    name, anchor = np.divmod(flat, len(first))
+    offsets: list[Offset | None] = [None] * len(flat)
+    if artifact.offsets is not None:
+        missing = np.repeat(candidates, places.shape[1])
+        classes = present.classes[anchors[anchor]]
+        offsets = offsets_of(artifact.offsets, name % A, missing, classes, name < A, axes)
+    listed = [
+        Placement(names[which], first[where], probability, offset)
+        for which, where, probability, offset in zip(
+            *(name.tolist(), anchor.tolist(), probabilities.reshape(-1).tolist(), offsets),
+            strict=True,
         )
-        for some, values in zip(places.tolist(), probabilities.tolist(), strict=True)
     ]
+    each = places.shape[1]
+    return [tuple(listed[k : k + each]) for k in range(0, len(listed), each)]

@@ -46,6 +46,16 @@ class Posterior(Protocol):
     def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
         """The same of some relations (E,), from and to places in `present.classes`, (E,)."""
 
+    def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
+        """Relations of pairs of classes (P,) without all that is known of how the two stand.
+
+        Args:
+            one, other: places in `present.classes`.
+
+        Returns:
+            (A, P) of the one to the other, and of the other to the one.
+        """
+
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
         """Relations of absent classes (N,), were they there, to places (m,) in `present.classes`.
 
@@ -76,6 +86,13 @@ class Posterior(Protocol):
 
         Args:
             rows: (N,) places in `present.classes`.
+        """
+
+    def reasons_for_absent(self, candidates: Places) -> Floats:
+        """How the log-odds of absent classes (N,) change by each class that is there, (N, n).
+
+        With the class, minus without it and its relations; with the context at its mean field on
+        both sides.
         """
 
 

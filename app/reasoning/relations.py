@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning.answers import RelationAnswer
+from app.reasoning.answers import Disagreement, RelationAnswer
+from app.reasoning.disagreements import disagreements
 from app.reasoning.listing import likeliest_relations, pairs_of_things
 from app.reasoning.posterior import posterior, relations_given
 from app.reasoning.present import Present
@@ -24,15 +25,18 @@ def relations(
     min_probability: float = 0.0,
     pairs: Sequence[tuple[int, int]] | None = None,
     include_opposites: bool = False,
-) -> tuple[RelationAnswer, ...]:
+) -> tuple[tuple[RelationAnswer, ...], tuple[Disagreement, ...]]:
     """The likeliest relations between the objects of a scene, best first, ties by position.
+
+    And where they were observed to stand otherwise than the rest of the scene makes one expect: see
+    `disagreements`.
 
     Relations that the scene states are evidence for the others; each is judged without itself.
     Structure (floor, wall) stands in no relation unless `pairs` asks for it.
 
     Args:
-        top_k: at most so many.
-        min_probability: leave out what is less likely.
+        top_k: at most so many of both.
+        min_probability: leave out what is less likely, or expected with less.
         pairs: only answers with this (subject, object), positions in `scene.objects`. The order of
             the two counts: the pair says nothing of how its object stands to its subject, but for
             the opposite relations.
@@ -46,7 +50,7 @@ def relations(
     if not 0 <= min_probability <= 1:
         raise ValueError(f"min_probability must be in [0, 1], not {min_probability}")
     if not scene.objects:
-        return ()
+        return (), ()
     given = posterior(artifact, scene)
     present, slopes = given.present, artifact.relation_slopes
     asked = _asked(artifact, present, pairs)
@@ -59,11 +63,14 @@ def relations(
     names = CANONICAL[: len(log_odds)]
     names += tuple([OPPOSITES[name] for name in names])
     subjects, objects, kinds, probabilities = (values.tolist() for values in found)
-    return tuple(
+    answers = tuple(
         [
             RelationAnswer(x, names[a], y, probability)
             for x, y, a, probability in zip(subjects, objects, kinds, probabilities, strict=True)
         ]
+    )
+    return answers, disagreements(
+        artifact, scene, given, asked, top_k=top_k, min_probability=min_probability
     )
 
 

@@ -24,7 +24,7 @@ class Units:
 
     Attributes:
         edges: (1, E) the machine's layout.
-        place: (A, n, m) int64, the place in `edges` of each unit.
+        place: (A, n, m) int64, the place in `edges` of each unit; or (A, P), see `of_pairs`.
         exists: (A, n, m) bool; place is arbitrary where False.
     """
 
@@ -37,6 +37,11 @@ class Units:
         if not values.shape[-1]:
             return values.new_full((*values.shape[:-1], *self.place.shape), missing)
         return torch.where(self.exists, values[..., self.place], missing)
+
+    def of_pairs(self, subjects: Tensor, objects: Tensor) -> Units:
+        """Those of some pairs, by places (P,) among the classes: `grid` then gives (..., A, P)."""
+        place, exists = (grid[:, subjects, objects] for grid in (self.place, self.exists))
+        return Units(self.edges, place, exists)
 
     def flat(self, grid: Tensor) -> Tensor:
         """(..., A, n, m) as (..., E); what has no unit is lost, other units are 0."""

@@ -14,6 +14,7 @@ from app.registry.description import (
 from app.registry.errors import ArtifactError, RegistryError, StoreError
 from app.registry.manifest import Manifest
 from app.registry.models import ArtifactFailure, ModelSet, StoreFailure, load_model_set
+from app.registry.offsets import Offsets
 from app.registry.references import AliasTarget
 from app.registry.store import Store
 
@@ -29,6 +30,7 @@ __all__ = [
     "Manifest",
     "Metric",
     "ModelSet",
+    "Offsets",
     "PairSlope",
     "RegistryError",
     "Slope",

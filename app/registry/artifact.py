@@ -16,6 +16,7 @@ from app.registry.description import Calibration, Description
 from app.registry.durable import sync_directory, write_file
 from app.registry.errors import ArtifactError
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
+from app.registry.offsets import PREFIX, Offsets
 from app.registry.slopes import RelationSlopes
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.registry.verified import read_verified
@@ -41,6 +42,7 @@ class Artifact:
         digest: SHA-256 of the manifest's bytes, hexadecimal; it changes if any file does.
         card: the model card, Markdown.
         path: the directory it was read from.
+        offsets: how far apart things stand, where training saw poses.
     """
 
     manifest: Manifest
@@ -50,6 +52,7 @@ class Artifact:
     digest: str
     card: str
     path: Path
+    offsets: Offsets | None = None
 
     @cached_property
     def scorer(self) -> ContextScorer:
@@ -97,7 +100,8 @@ def write_artifact(
     Args:
         directory: must not exist; its parent must.
         description: the manifest but for what describes the files.
-        state: the machine's `state_dict()`, or numpy arrays of the same names.
+        state: the machine's `state_dict()`, or numpy arrays of the same names, and
+            `Offsets.tensors()` where there are any.
         storage_dtype: of tensors with two axes or more; see `pack`.
 
     Raises:
@@ -136,14 +140,18 @@ def load_artifact(directory: Path, previous: Artifact | None = None) -> Artifact
     if previous is not None and previous.digest == files.digest:
         return previous
     manifest = files.manifest
+    tensors = unpack(files.weights, manifest.tensors)
+    offsets = {name: tensors.pop(name) for name in list(tensors) if name.startswith(PREFIX)}
+    machine = _machine(manifest, tensors)
     return Artifact(
         manifest=manifest,
-        machine=_machine(manifest, unpack(files.weights, manifest.tensors)),
+        machine=machine,
         vocabulary=manifest.vocabulary.vocabulary(),
         calibration=manifest.calibration,
         digest=files.digest,
         card=files.card,
         path=directory,
+        offsets=Offsets.from_tensors(offsets, machine.spec.A, machine.spec.V) if offsets else None,
     )
 
 

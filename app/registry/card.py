@@ -10,6 +10,7 @@ from math import prod
 
 from app.registry.description import DataSource, Description
 from app.registry.manifest import TensorEntry
+from app.registry.offsets import PREFIX
 
 _RESEARCH_WARNING = """\
 > **Research use.** These weights were learned from {sources}, whose terms allow research use. Do
@@ -37,6 +38,11 @@ how often such answers are true):
   set so that at most 5 % of untouched scenes raise an alarm
 - misplaced: the relation is false, where one was altered in half of the scenes"""
 
+_OFFSETS = """\
+Of the offsets of placements: the share of things that stood inside the ellipse (in the plane) or
+the ellipsoid that mean and standard deviations draw for 80 %, by relation; and how far they stood
+from the mean, beside what the relation alone would have said."""
+
 _LIMITS = """\
 - The model speaks of classes, not of instances: it says whether a class belongs here, not how many
   of it. How many chairs a table wants is outside it.
@@ -44,6 +50,8 @@ _LIMITS = """\
   above without being false, and `/relations` answers what an annotator would list.
 - Left and front are meant in the viewer's axes. Where a source has no viewer, one was chosen in
   training, and these two relations carry that choice.
+- Offsets say where such a thing usually stands, not where there is room for it; they know neither
+  the size nor the heading of what it stands at.
 - Labels outside the vocabulary are not understood. Structure and vague labels (floor, sky, object)
   are accepted and never proposed.
 - Scenes unlike those of the sources above are outside what the figures speak of, and so are scenes
@@ -56,8 +64,10 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
     """The card of a model, Markdown."""
     words, spec = description.vocabulary, description.spec
     proposed = sum(not entry.structure for entry in words.objects)
-    weights = sum(prod(e.shape) for e in tensors.values() if e.dtype.startswith("float"))
-    stored = ", ".join(sorted({entry.dtype for entry in tensors.values()}))
+    machine = {name: e for name, e in tensors.items() if not name.startswith(PREFIX)}
+    weights = sum(prod(e.shape) for e in machine.values() if e.dtype.startswith("float"))
+    stored = ", ".join(sorted({entry.dtype for entry in machine.values()}))
+    pairs = prod(tensors[f"{PREFIX}pair"].shape) if f"{PREFIX}pair" in tensors else 0
     sections = [
         f"# {description.name} {description.version}",
         *_warning(description.data),
@@ -71,6 +81,7 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
                 ("Object classes", f"{len(words.objects)}, of which {proposed} may be proposed"),
                 ("Relations", ", ".join(words.relations)),
                 ("Room types", ", ".join(words.room_types) or "none"),
+                ("Offsets", f"in metres, of {pairs:,} pairs of classes" if pairs else "none"),
                 ("Created", description.created.isoformat()),
             ],
         ),
@@ -110,7 +121,8 @@ def _metrics(description: Description) -> str:
         ("Task", "Metric", *sources),
         [(*name, *(cells.get(source, "") for source in sources)) for name, cells in rows.items()],
     )
-    return f"{_MEASURED}\n\n{table}\n\n{_PROBABILITIES}"
+    where = f"\n\n{_OFFSETS}" if any(m.task == "Offsets" for m in description.metrics) else ""
+    return f"{_MEASURED}\n\n{table}\n\n{_PROBABILITIES}{where}"
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

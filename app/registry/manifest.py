@@ -16,8 +16,11 @@ from pydantic import ValidationError, field_validator
 
 from app.registry.description import Count, Description, Frozen, Sha256, to_json
 from app.registry.errors import ArtifactError
+from app.registry.offsets import PREFIX
 
-FORMAT: Final = 1
+FORMAT: Final = 2
+READABLE: Final = (1, FORMAT)
+"""Format 1 knows no offsets; a version of either may lack them."""
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
 MANIFEST: Final = "manifest.json"
@@ -42,9 +45,14 @@ class FileEntry(Frozen):
 class Manifest(Description):
     """A description, the tensors as stored, and the checksum of every other file."""
 
-    format: Literal[1] = FORMAT
+    format: Literal[1, 2] = FORMAT
     tensors: dict[str, TensorEntry]
     files: dict[str, FileEntry]
+
+    @property
+    def weights(self) -> dict[str, TensorEntry]:
+        """The tensors of the machine alone."""
+        return {name: e for name, e in self.tensors.items() if not name.startswith(PREFIX)}
 
     @field_validator("files")
     @classmethod
@@ -73,7 +81,8 @@ class Manifest(Description):
             raise ArtifactError("checksum_mismatch", f"{MANIFEST} does not match its own checksum")
         members = _parse(data, complete=trailer is not None)
         if not _is_known_format(members.get("format")):
-            raise ArtifactError("unknown_format", f"{MANIFEST}: this release reads format {FORMAT}")
+            known = " and ".join(map(str, READABLE))
+            raise ArtifactError("unknown_format", f"{MANIFEST}: this release reads formats {known}")
         if not trailer:
             raise ArtifactError("invalid_manifest", f"{MANIFEST} does not end with its checksum")
         del members["checksum"]
@@ -96,7 +105,7 @@ def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
 
 
 def _is_known_format(value: object) -> bool:
-    return type(value) is int and value == FORMAT
+    return type(value) is int and value in READABLE
 
 
 def _first(error: ValidationError) -> str:

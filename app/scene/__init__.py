@@ -1,7 +1,7 @@
 """Scenes, canonical relations, vocabularies and geometry; knows nothing of models or services."""
 
 from app.scene.evidence import ClassEvidence, class_evidence, pool_instances
-from app.scene.frames import body_pose, is_optical, is_world_fixed
+from app.scene.frames import body_pose, is_optical, is_world_fixed, viewer_axes
 from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
 from app.scene.labels import label_key
 from app.scene.observe import observe
@@ -39,4 +39,5 @@ __all__ = [
     "opposite",
     "pool_instances",
     "to_viewer_frame",
+    "viewer_axes",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 Vector = tuple[float, float, float]
+Axes = tuple[Vector, Vector, Vector]
 Quaternion = tuple[float, float, float, float]
 
 # Frames that are fixed to the world: where the viewer stands in them must be said.
@@ -65,12 +66,38 @@ def body_pose(
     return position, upright, yaw
 
 
-_IDENTITY: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+def viewer_axes(frame_id: str | None = None, yaw: float | None = None) -> Axes | None:
+    """The viewer's axes (x away, y left, z up) as vectors of a frame.
+
+    Args:
+        frame_id: of an optical frame, of one fixed to the world, or of body axes; None = body axes.
+        yaw: where the viewer looks; None = along x.
+
+    Returns:
+        None in a frame fixed to the world where nobody said where the viewer looks.
+    """
+    if frame_id is not None and yaw is None and is_world_fixed(frame_id):
+        return None
+    away, left, up = _IDENTITY
+    if yaw is not None:
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        away, left = (cos, sin, 0.0), (-sin, cos, 0.0)
+    if frame_id is not None and is_optical(frame_id):
+        return _to_optical(away), _to_optical(left), _to_optical(up)
+    return away, left, up
+
+
+_IDENTITY: Axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def _from_optical(vector: Vector) -> Vector:
     x, y, z = vector
     return z, -x, -y
+
+
+def _to_optical(vector: Vector) -> Vector:
+    x, y, z = vector
+    return -y, -z, x
 
 
 def _rotation(quaternion: Quaternion) -> tuple[Vector, ...]:

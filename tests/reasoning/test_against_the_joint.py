@@ -14,6 +14,8 @@ from tests.enumeration.implied import relation_by_definition
 from tests.enumeration.small_machines import Joint, enumerate_joint
 from tests.reasoning.artifacts import EXACT, LABELS, exact_artifact, scene_of
 
+pytestmark = pytest.mark.usefixtures("the_likeliest_is_expected")
+
 # Estimates use 2^15 fixed draws here. Of independent draws a probability would have a standard
 # error below .003; log-odds get five times the room, for their slope at the ends.
 DRAWS = 1 << 15
@@ -44,8 +46,8 @@ class Exact:
         place = self.place(triple)
         return None if place is None else self.joint.r[:, place] > 0
 
-    def given(self, present, absent, observed=()):
-        """(N,) bool: states with these classes on and off, and these triples on."""
+    def given(self, present, absent, observed=(), off=()):
+        """(N,) bool: states with these classes on and off, and these triples on and off."""
         where = torch.ones(len(self.joint.v), dtype=torch.bool)
         for i in present:
             where &= self.joint.v[:, i] > 0
@@ -55,6 +57,10 @@ class Exact:
             unit = self.unit(triple)
             if unit is not None:
                 where &= unit
+        for triple in off:
+            unit = self.unit(triple)
+            if unit is not None:
+                where &= ~unit
         return where
 
     def object(self, i, present, observed=()) -> float:
@@ -65,8 +71,8 @@ class Exact:
         kept = [t for t in observed if t not in touching]
         return self.joint.log_odds(self.joint.v[:, i] > 0, self.given(rest, others, kept))
 
-    def relation(self, triple, present, observed=(), *, implied=True) -> float:
-        """p(r_e = 1) given the classes and the other observed relations.
+    def relation(self, triple, present, observed=(), off=(), *, implied=True) -> float:
+        """p(r_e = 1) given the classes and the other observed relations, on and off.
 
         Where relations imply each other that is defined by their logits, not by the joint.
         """
@@ -80,9 +86,10 @@ class Exact:
             on = torch.zeros(spec.A, spec.V, spec.V)
             for t in kept:
                 on[t] = 1.0
-            where = self.given(present, absent, kept)
+            where = self.given(present, absent, kept, off)
             return relation_by_definition(self.joint, self.place(triple), where, on)
-        return 1 / (1 + math.exp(-self.joint.log_odds(unit, self.given(present, absent, kept))))
+        where = self.given(present, absent, kept, off)
+        return 1 / (1 + math.exp(-self.joint.log_odds(unit, where)))
 
 
 @pytest.fixture(scope="module", params=EXACT)
@@ -185,7 +192,7 @@ def test_the_place_counts_by_the_calibration(case):
 def test_relations(case, classes, stated):
     """Each relation given the others, itself left out, made exclusive."""
     artifact, exact = case
-    answers = relations(artifact, scene_of(classes, stated), top_k=100)
+    answers, _ = relations(artifact, scene_of(classes, stated), top_k=100)
     observed = triples(classes, stated)
     n = len(classes)
     assert len(answers) == n * (n - 1) * artifact.machine.spec.A
@@ -195,6 +202,57 @@ def test_relations(case, classes, stated):
         p = exact.relation((a, i, j), classes, observed)
         q = exact.relation((a, j, i), classes, observed)
         assert answer.probability == pytest.approx(p / max(1, p + q), abs=TOLERANCE)
+
+
+@pytest.mark.parametrize("complete", [False, True])
+@pytest.mark.parametrize(
+    ("classes", "stated"), [*SCENES[3:], ([2, 0, 1], [(0, 0, 1), (0, 1, 2), (0, 0, 2)])]
+)
+def test_disagreements(case, classes, stated, complete):
+    """Each pair of which something is stated, judged by the joint without all that is known of it.
+
+    Where two relations are as likely as an estimate can tell, either may be expected.
+    """
+    artifact, exact = case
+    A = artifact.machine.spec.A
+    scene = scene_of(classes, stated, complete=complete)
+    _, found = relations(artifact, scene, top_k=100)
+    answers = {(answer.subject, answer.object): answer for answer in found}
+    on = triples(classes, stated)
+    units = [(a, i, j) for a in range(A) for i in classes for j in classes if i != j]
+    off = [unit for unit in units if unit not in on] if complete else []
+    for _, x, y in stated:
+        i, j = classes[x], classes[y]
+        rest, rest_off = ([t for t in some if {*t[1:]} != {i, j}] for some in (on, off))
+        truth = {}
+        for a in range(A):
+            p, q = (
+                exact.relation((a, *ends), classes, rest, rest_off) for ends in ((i, j), (j, i))
+            )
+            truth[CANONICAL[a]] = p / max(1, p + q)
+            truth[OPPOSITES[CANONICAL[a]]] = q / max(1, p + q)
+        observed = {CANONICAL[a] for a, *ends in stated if ends == [x, y]}
+        likeliest, seen = max(truth.values()), max(truth[name] for name in observed)
+        answer = answers.pop((x, y), None)
+        if answer is None:
+            assert likeliest < seen + 2 * TOLERANCE
+            continue
+        assert set(answer.observed) == observed
+        assert answer.expected not in observed
+        assert answer.probability == pytest.approx(truth[answer.expected], abs=TOLERANCE)
+        assert answer.probability == pytest.approx(likeliest, abs=2 * TOLERANCE)
+        assert answer.observed_probability == pytest.approx(seen, abs=TOLERANCE)
+    assert not answers
+
+
+def test_small_machines_disagree_with_some_scenes_and_not_with_others():
+    """So that the test above sees both."""
+    listed = {
+        (name, k): bool(relations(exact_artifact(name), scene_of(*SCENES[k]))[1])
+        for name in EXACT
+        for k in (3, 4, 5)
+    }
+    assert len(set(listed.values())) == 2
 
 
 @pytest.mark.parametrize(("classes", "stated"), SCENES)
@@ -238,6 +296,25 @@ def test_reasons(name):
             assert because.log_odds_change == pytest.approx(truth[because.object], abs=near)
         sizes = [abs(because.log_odds_change) for because in answer.because]
         assert sizes == sorted(sizes, reverse=True)
+
+
+@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("classes", [[0], [2, 0], [1, 2], [1, 1, 2]])
+def test_reasons_for_what_is_missing(name, classes):
+    """As far as for outliers: what each class adds that is there, which left out is one fewer."""
+    artifact = exact_artifact(name, scale=0.6)
+    exact = Exact(enumerate_joint(artifact.machine))
+    near = 1e-9 if is_exact(artifact, None) else 0.15
+    for answer in missing(artifact, scene_of(classes)):
+        i = LABELS.index(answer.label)
+        truth = {
+            classes.index(j): exact.object(i, classes)
+            - exact.object(i, [c for c in classes if c != j])
+            for j in set(classes)
+        }
+        assert {b.object for b in answer.because} == set(truth)
+        for because in answer.because:
+            assert because.log_odds_change == pytest.approx(truth[because.object], abs=near)
 
 
 @pytest.mark.parametrize("name", [name for name in EXACT if EXACT[name].C])

@@ -202,3 +202,34 @@ def test_other_threads_go_on_while_a_chain_runs(artifact):
         turns += thread.is_alive()
     thread.join()
     assert turns > 5
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_fewer_sweeps_are_the_beginning_of_more(artifact, monkeypatch, name):
+    """Whoever asks with a growing number of sweeps and the same seed sees one chain at work."""
+    scene, options = SCENES[name]
+    states = []
+    sweeps = chain_kernels.sweeps
+
+    def one_by_one(w, bias, given, held, observed, beta, count, on, h1, stream):
+        for _ in range(count):
+            sweeps(w, bias, given, held, observed, beta, 1, on, h1, stream)
+            states.append((on.copy(), h1.copy()))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(chain_kernels, "sweeps", one_by_one)
+        generate(artifact, scene, seed=5, steps=6, **options)
+    assert len(states) == 6
+    assert len({h1.tobytes() for _, h1 in states}) > 1
+    evidence = {thing.label for thing in scene.objects}
+    words = artifact.vocabulary
+    for steps, (on, h1) in enumerate(states, start=1):
+        (drawn,) = generate(artifact, scene, seed=5, steps=steps, **options)
+        present = {words.labels[index] for index in np.flatnonzero(on)}
+        shown = {label for label in present if label in evidence or not is_structure(words, label)}
+        assert set(drawn.objects) == shown
+        assert drawn.context == {"h1": tuple(np.flatnonzero(h1).tolist())}
+
+
+def is_structure(words, label):
+    return bool(words.structure[words.labels.index(label)])

@@ -65,6 +65,14 @@ def test_reasons_are_exact(pair):
         np.testing.assert_allclose(closed.reasons(rows), drawn.reasons(rows), rtol=1e-4, atol=1e-3)
 
 
+def test_reasons_for_absent_classes_are_exact(pair):
+    closed, drawn = pair
+    absent = np.setdiff1d(np.arange(9), closed.present.classes)
+    found = closed.reasons_for_absent(absent)
+    np.testing.assert_allclose(found, drawn.reasons_for_absent(absent), rtol=1e-4, atol=1e-3)
+    np.testing.assert_array_equal(closed.reasons_for_absent(absent[-1:]), found[-1:])
+
+
 def test_relations(pair):
     closed, drawn = pair
     found, expected = sigmoid(closed.relation_log_odds()), sigmoid(drawn.relation_log_odds())

@@ -109,6 +109,73 @@ def test_reasons(pair):
     np.testing.assert_array_equal(closed.reasons(rows[-1:]), closed.reasons(rows)[-1:])
 
 
+def test_reasons_for_absent_classes(pair):
+    found = differences(pair, lambda p: p.reasons_for_absent(absent(p)))
+    assert found.mean() < 0.035
+    assert found.max() < 0.15
+
+
+def test_pairs_without_all_that_is_known_of_them(pair):
+    n = len(pair[0].present.classes)
+    one, other = (ends.ravel() for ends in np.meshgrid(np.arange(n), np.arange(n)))
+    for way in (0, 1):
+        found = differences(pair, lambda p, way=way: sigmoid(p.log_odds_apart(one, other)[way]))
+        assert found.mean() < 0.008
+        assert found.max() < 0.03
+
+
+def with_nothing_known(artifact, scene, i, j):
+    """Log-odds (A, n, n) of a scene, every relation between two classes unobserved."""
+    closed = artifact.closed_form
+    context = posterior(artifact, scene)._context
+    given = context.given
+    kept = ~(((given.i == i) & (given.j == j)) | ((given.i == j) & (given.j == i)))
+    rest = Given(*(getattr(given, name)[kept] for name in ("a", "i", "j", "r", "g")))
+    weights = context.classes, context.presence, context.log_counts
+    return closed.relation_log_odds(closed.context(*weights, scene.room_type, rest))
+
+
+def test_a_pair_is_judged_as_in_the_scene_where_nothing_is_known_of_it(scene):
+    """But that the slopes of the others are held: they settle anew there."""
+    judged = posterior(ARTIFACT, scene)
+    given, inside = judged._context.given, judged.relation_log_odds()
+    differences, left_in = [], []
+    for i, j in {tuple(sorted(ends)) for ends in zip(given.i, given.j, strict=True)}:
+        expected = with_nothing_known(ARTIFACT, scene, i, j)
+        found = judged.log_odds_apart(np.array([i]), np.array([j]))
+        for way, ends in enumerate(((i, j), (j, i))):
+            truth = sigmoid(expected[:, *ends])
+            differences.append(np.abs(sigmoid(found[way][:, 0]) - truth))
+            left_in.append(np.abs(sigmoid(inside[:, *ends]) - truth))
+    assert np.mean(differences) < 0.006
+    assert np.max(differences) < 0.015
+    # What the relations of a pair say of each other would be seen.
+    assert np.max(left_in) > 0.018
+
+
+def test_a_class_with_itself_is_taken_out_once():
+    """Its relations there and back are the same units."""
+    scene = scene_of([2, 2, 4], [(0, 0, 1), (1, 1, 2)])
+    found = posterior(ARTIFACT, scene).log_odds_apart(np.array([0]), np.array([0]))
+    np.testing.assert_array_equal(*found)
+    expected = with_nothing_known(ARTIFACT, scene, 0, 0)[:, 0, 0]
+    np.testing.assert_allclose(sigmoid(found[0][:, 0]), sigmoid(expected), atol=0.003)
+
+
+@pytest.mark.parametrize("name", ["rbm", "gbm", "triway-seed", "triway-local", "triway-wide"])
+def test_the_only_pair_known_is_judged_as_if_nothing_were(name, monkeypatch):
+    """Draws of two different contexts: as near as so many of them come."""
+    monkeypatch.setattr("app.reasoning.evidence.DRAWS", 1 << 14)
+    artifact = ARTIFACT if name == "triway-wide" else larger_artifact(name, scale=0.3)
+    ends = np.array([0]), np.array([1])
+    bare = posterior(artifact, scene_of([0, 3])).log_odds_apart(*ends)
+    for relations_ in ([(2, 0, 1)], [(0, 1, 0), (3, 0, 1)]):
+        for complete in (False, True):
+            scene = scene_of([0, 3], relations_, complete=complete)
+            found = posterior(artifact, scene).log_odds_apart(*ends)
+            np.testing.assert_allclose(sigmoid(np.array(found)), sigmoid(np.array(bare)), atol=0.01)
+
+
 def test_what_relations_imply_is_that_of_the_machine():
     machine, closed = ARTIFACT.machine, ARTIFACT.closed_form
     rng = np.random.default_rng(0)
@@ -124,7 +191,10 @@ def test_what_relations_imply_is_that_of_the_machine():
         mean = torch.from_numpy(context.x).sigmoid().unsqueeze(0)
         told = torch.from_numpy(holds.astype(np.float32)).flatten().unsqueeze(0)
         expected = machine.implied(edges, told, mean)[0].numpy()
-        np.testing.assert_allclose(closed._implied(context).ravel(), expected, rtol=1e-4, atol=1e-4)
+        shift, apart = closed._implied(context)
+        np.testing.assert_allclose(shift.ravel(), expected, rtol=1e-4, atol=1e-4)
+        expected = machine.implied(edges, told, mean, apart=True)[0].numpy()
+        np.testing.assert_allclose(apart.ravel(), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_the_same_scene_gets_the_same_bits(scene):
@@ -162,6 +232,7 @@ def test_what_a_given_relation_says_of_itself_is_taken_out_to_first_order(pair, 
     monkeypatch.setattr("app.boltzmann.closed_form._GENTLE", np.inf)
     slopes = closed._context.slopes
     object.__setattr__(closed._context, "slopes", np.zeros_like(slopes))
+    del closed._between
     left_in = sigmoid(closed.relation_log_odds())
     gentle = np.zeros_like(exact, dtype=bool)
     given = closed._context.given

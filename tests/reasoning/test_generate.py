@@ -288,3 +288,24 @@ def test_bad_input_is_refused(options, message):
 def test_a_machine_without_a_second_layer_has_none_to_hold():
     with pytest.raises(ValueError, match="h2"):
         generate(ARTIFACTS["rbm"], scene_of([0]), seed=0, context={"h2": []})
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if ARTIFACTS[name].scene_chains is None])
+def test_fewer_sweeps_in_blocks_are_the_beginning_of_more(monkeypatch, name):
+    """Whoever asks with a growing number of sweeps and the same seed sees one chain at work."""
+    artifact = ARTIFACTS[name]
+    contexts = []
+
+    def recorded(*arguments, **options):
+        state = gibbs_step(*arguments, **options)
+        contexts.append(tuple(state.h1[0].nonzero().squeeze(1).tolist()))
+        return state
+
+    scene = scene_of([0, 1])
+    with monkeypatch.context() as patched:
+        patched.setattr("app.boltzmann.gibbs.gibbs_step", recorded)
+        generate(artifact, scene, seed=5, steps=6)
+    assert len(contexts) == 5
+    for steps, context in enumerate(contexts, start=1):
+        (drawn,) = generate(artifact, scene, seed=5, steps=steps)
+        assert drawn.context["h1"] == context

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.reasoning import misplaced, missing, outliers, relations
-from app.scene import CANONICAL, OPPOSITES, Scene, contradiction
+from app.scene import CANONICAL, OPPOSITES, RELATIONS, Scene, canonicalise, contradiction
 from tests.reasoning.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
+
+pytestmark = pytest.mark.usefixtures("the_likeliest_is_expected")
 
 NAMES = tuple(LARGER)
 ARTIFACTS = {name: larger_artifact(name) for name in NAMES}
@@ -86,10 +89,49 @@ def test_placements(name, scene):
 
 
 @few
+@given(names, scenes())
+def test_reasons_for_what_is_missing(name, scene):
+    """The strongest three first; one object speaks for its class."""
+    first = {thing.label: k for k, thing in reversed(list(enumerate(scene.objects)))}
+    for answer in missing(ARTIFACTS[name], scene):
+        objects = [because.object for because in answer.because]
+        assert len(objects) == len(set(objects)) == min(3, len(first))
+        assert set(objects) <= set(first.values())
+        sizes = [abs(because.log_odds_change) for because in answer.because]
+        assert sizes == sorted(sizes, reverse=True)
+        assert all(map(math.isfinite, sizes))
+
+
+@few
+@given(st.sampled_from([name for name in NAMES if LARGER[name].form == "local"]), scenes())
+def test_a_reason_is_the_difference_to_the_scene_without_it(name, scene):
+    """Where no relation is given: asked of the smaller scene, whatever else is in it."""
+    artifact = ARTIFACTS[name]
+    bare = Scene(scene.objects)
+    without = {}
+    for answer in missing(artifact, bare):
+        for object_, change in answer.because:
+            label = scene.objects[object_].label
+            if label not in without:
+                rest = tuple(thing for thing in scene.objects if thing.label != label)
+                answers = missing(artifact, Scene(rest), top_k=len(LABELS))
+                without[label] = {a.label: a.log_odds for a in answers}
+            expected = answer.log_odds - without[label][answer.label]
+            assert change == pytest.approx(expected, abs=2e-5, rel=1e-4)
+
+
+def test_reasons_are_given_for_the_first_answers_only(monkeypatch):
+    # By its module: the package has a function of that name.
+    monkeypatch.setattr(sys.modules[missing.__module__], "EXPLAINED", 2)
+    answers = missing(ARTIFACTS["triway-wide"], scene_of([0, 1, 2]))
+    assert [len(answer.because) for answer in answers] == [3, 3, 0, 0, 0]
+
+
+@few
 @given(names, scenes(minimum=2))
 def test_relations(name, scene):
     """Exclusive pairs, no structure, no object to itself, best first with ties by position."""
-    answers = relations(ARTIFACTS[name], scene, top_k=4096)
+    answers, _ = relations(ARTIFACTS[name], scene, top_k=4096)
     things = [k for k, t in enumerate(scene.objects) if t.label not in STRUCTURE]
     assert len(answers) == 4 * len(things) * (len(things) - 1)
     p = {(a.subject, a.relation, a.object): a.probability for a in answers}
@@ -106,16 +148,79 @@ def test_relations(name, scene):
 @few
 @given(names, scenes(minimum=2), st.floats(0, 1), st.integers(1, 30))
 def test_relations_are_cut_by_top_k_and_probability(name, scene, least, top_k):
-    everything = relations(ARTIFACTS[name], scene, top_k=4096)
-    some = relations(ARTIFACTS[name], scene, top_k=top_k, min_probability=least)
+    everything, _ = relations(ARTIFACTS[name], scene, top_k=4096)
+    some, _ = relations(ARTIFACTS[name], scene, top_k=top_k, min_probability=least)
     assert some == tuple(a for a in everything if a.probability >= least)[:top_k]
 
 
 @few
 @given(names, scenes(minimum=2))
+def test_disagreements(name, scene):
+    """A pair once, as it was stated, where something else is likelier than all that was stated of
+    any two instances of these classes; largest ratio first."""
+    _, found = relations(ARTIFACTS[name], scene, top_k=4096)
+    stated = {(CANONICAL[a], x, y) for a, x, y in scene.relations or ()}
+    stated |= {(OPPOSITES[a], y, x) for a, x, y in stated}
+    of_classes = {(a, scene.objects[x].label, scene.objects[y].label) for a, x, y in stated}
+    for d in found:
+        subject, object_ = (scene.objects[k].label for k in (d.subject, d.object))
+        assert set(d.observed) == {a for a, x, y in stated if (x, y) == (d.subject, d.object)}
+        assert len(set(d.observed)) == len(d.observed) > 0
+        # Some relation that was stated leads this way.
+        assert d.observed[0] in CANONICAL
+        assert (d.expected, subject, object_) not in of_classes
+        assert 1 >= d.probability > d.observed_probability > 0
+        assert not {subject, object_} & STRUCTURE
+    assert len({frozenset((d.subject, d.object)) for d in found}) == len(found)
+    ratios = [d.probability / d.observed_probability for d in found]
+    assert ratios == sorted(ratios, reverse=True)
+
+
+@few
+@given(names, scenes(minimum=2), st.floats(0, 1), st.integers(1, 3))
+def test_disagreements_are_cut_by_top_k_and_probability(name, scene, least, top_k):
+    _, everything = relations(ARTIFACTS[name], scene, top_k=4096)
+    _, some = relations(ARTIFACTS[name], scene, top_k=top_k, min_probability=least)
+    assert some == tuple(d for d in everything if d.probability >= least)[:top_k]
+
+
+def test_disagreements_of_chosen_pairs_either_way_round():
+    """Of structure too, where it is asked for."""
+    artifact = ARTIFACTS["triway-wide"]
+    pairs = [(x, y) for x in range(6) for y in range(x)]
+    scene = scene_of([0, 1, 2, 3, 4, 8], [(k % 4, x, y) for k, (x, y) in enumerate(pairs)])
+    everything = relations(artifact, scene, pairs=pairs, top_k=4096)[1]
+    turned = [(y, x) for x, y in pairs]
+    assert relations(artifact, scene, pairs=turned, top_k=4096)[1] == everything
+    assert len(everything) > 3
+    for d in everything:
+        one = [(d.object, d.subject)]
+        assert relations(artifact, scene, pairs=one, top_k=4096)[1] == (d,)
+    things = tuple(d for d in everything if 5 not in (d.subject, d.object))
+    assert len(things) < len(everything)
+    assert relations(artifact, scene, top_k=4096)[1] == things
+
+
+def test_what_one_instance_shows_is_expected_of_the_others():
+    """Two chairs stand otherwise than expected; but one may, where the other stands so."""
+    artifact, seen = ARTIFACTS["triway-wide"], 0
+    for name in RELATIONS:
+        chairs = [canonicalise(0, name, chair) for chair in (1, 2)]
+        _, both = relations(artifact, scene_of([0, 3, 3], chairs))
+        if both:
+            assert [d.expected for d in both] == [both[0].expected] * 2
+            subject, object_ = (0, 2) if both[0].subject == 0 else (2, 0)
+            as_expected = canonicalise(subject, both[0].expected, object_)
+            assert not relations(artifact, scene_of([0, 3, 3], [chairs[0], as_expected]))[1]
+            seen += 1
+    assert seen > 3
+
+
+@few
+@given(names, scenes(minimum=2))
 def test_opposites_say_the_same(name, scene):
-    plain = relations(ARTIFACTS[name], scene, top_k=4096)
-    both = relations(ARTIFACTS[name], scene, top_k=4096, include_opposites=True)
+    plain, _ = relations(ARTIFACTS[name], scene, top_k=4096)
+    both, _ = relations(ARTIFACTS[name], scene, top_k=4096, include_opposites=True)
     expected = {(a.subject, a.relation, a.object, a.probability) for a in plain}
     expected |= {(a.object, OPPOSITES[a.relation], a.subject, a.probability) for a in plain}
     assert {(a.subject, a.relation, a.object, a.probability) for a in both} == expected
@@ -130,7 +235,7 @@ def test_pairs_choose_ordered_pairs(name, scene, data, opposites):
     place = st.integers(0, n - 1)
     pair = st.tuples(place, place).filter(lambda p: p[0] != p[1])
     pairs = data.draw(st.lists(pair, min_size=1, max_size=3))
-    answers = relations(
+    answers, _ = relations(
         ARTIFACTS[name], scene, top_k=4096, pairs=pairs, include_opposites=opposites
     )
     spelled = [*CANONICAL, *(OPPOSITES[a] for a in CANONICAL)] if opposites else CANONICAL
@@ -189,10 +294,17 @@ def test_the_order_of_the_objects_does_not_matter(name, scene, random):
     other = permuted(scene, order)
     assert {
         (a.subject, a.relation, a.object, a.probability)
-        for a in relations(artifact, scene, top_k=4096)
+        for a in relations(artifact, scene, top_k=4096)[0]
     } == {
         (order[a.subject], a.relation, order[a.object], a.probability)
-        for a in relations(artifact, other, top_k=4096)
+        for a in relations(artifact, other, top_k=4096)[0]
+    }
+    assert {
+        (d.subject, d.object, d.expected, d.probability)
+        for d in relations(artifact, scene, top_k=4096)[1]
+    } == {
+        (order[d.subject], order[d.object], d.expected, d.probability)
+        for d in relations(artifact, other, top_k=4096)[1]
     }
     assert [(a.label, a.probability) for a in missing(artifact, scene)] == [
         (a.label, a.probability) for a in missing(artifact, other)
@@ -218,7 +330,7 @@ def test_the_same_scene_gets_the_same_answer(name, scene):
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_but_an_empty_scene(name):
     empty = scene_of([])
-    assert relations(ARTIFACTS[name], empty) == ()
+    assert relations(ARTIFACTS[name], empty) == ((), ())
     assert outliers(ARTIFACTS[name], empty) == ((), ())
     answers = missing(ARTIFACTS[name], empty, top_k=len(LABELS))
     assert len(answers) == len(LABELS) - len(STRUCTURE)

@@ -107,7 +107,7 @@ def test_reads_back_as_written(change: dict[str, Any]) -> None:
     read = Manifest.from_bytes(data)
     assert read == written
     assert read.to_bytes() == data
-    assert json.loads(data)["format"] == 1
+    assert json.loads(data)["format"] == 2
 
 
 @given(changes, st.data())
@@ -130,7 +130,7 @@ def test_every_proper_prefix_is_refused() -> None:
     assert codes == {"truncated", "invalid_manifest"}
 
 
-@pytest.mark.parametrize("value", [0, 2, 1.0, "1", None, True])
+@pytest.mark.parametrize("value", [0, 3, 1.0, "1", None, True])
 def test_refuses_an_unknown_format(value: object) -> None:
     members = json.loads(manifest().to_bytes())
     del members["checksum"]

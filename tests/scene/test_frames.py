@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.scene.frames import body_pose, is_optical, is_world_fixed
+from app.scene.frames import body_pose, is_optical, is_world_fixed, viewer_axes
+from app.scene.geometry import Viewpoint, to_viewer_frame
 
 
 def about(axis: tuple[float, float, float], angle: float) -> tuple[float, float, float, float]:
@@ -86,3 +87,23 @@ def test_a_tilt_is_dropped(tilt: float, angle: float) -> None:
 def test_quaternions_must_have_length_one(quaternion: tuple[float, float, float, float]) -> None:
     with pytest.raises(ValueError, match="quaternion of length 1"):
         body_pose((0.0, 0.0, 0.0), None, quaternion)
+
+
+@given(st.floats(-7, 7), st.booleans(), st.tuples(*[st.floats(-5, 5)] * 3))
+def test_viewer_axes_undo_the_way_to_the_viewer(
+    yaw: float, optical: bool, point: tuple[float, float, float]
+) -> None:
+    """A point read into body axes, seen by the viewer, and told in the frame again."""
+    body, _, _ = body_pose(point, optical=optical)
+    (seen,), _ = to_viewer_frame([body], Viewpoint(0.0, 0.0, yaw))
+    axes = viewer_axes("camera_optical_frame" if optical else "map", yaw)
+    assert axes is not None
+    told = [sum(seen[k] * axes[k][n] for k in range(3)) for n in range(3)]
+    assert told == pytest.approx(point, abs=1e-9)
+
+
+def test_the_viewer_looks_along_x_unless_the_frame_is_fixed_to_the_world() -> None:
+    assert viewer_axes() == viewer_axes("base_link") == ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    assert viewer_axes("camera_optical") == ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
+    assert viewer_axes("map") is None
+    assert viewer_axes("map", 0.0) == viewer_axes()

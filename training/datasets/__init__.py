@@ -6,12 +6,14 @@ from training.datasets.readers import READERS, Reader, read_all, read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.rooms import generate_rooms, rooms_vocabulary
 from training.datasets.shuffling import shuffle_objects
-from training.datasets.splits import FRACTIONS, split
+from training.datasets.splits import FRACTIONS, split, stable_part
 from training.datasets.vocabulary import (
     build_vocabulary,
     coverage,
     indoor_vocabulary,
+    read_vocabulary,
     source_vocabulary,
+    vocabulary_json,
     with_typical_sizes,
     write_indoor_vocabulary,
 )
@@ -34,10 +36,13 @@ __all__ = [
     "indoor_vocabulary",
     "read_all",
     "read_scenes",
+    "read_vocabulary",
     "rooms_vocabulary",
     "shuffle_objects",
     "source_vocabulary",
     "split",
+    "stable_part",
+    "vocabulary_json",
     "with_typical_sizes",
     "write_indoor_vocabulary",
 ]

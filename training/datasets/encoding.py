@@ -49,6 +49,8 @@ class EncodedScene:
         instance_holds: (A, N, N) bool, relations between instances.
         instance_observed: (A, N, N) bool, whether they were observed, on or off.
         unknown: distinct labels outside the vocabulary, which are left out.
+        instance_positions: (N, 3) centres in metres in the viewer axes that the relations were
+            derived in, NaN where unknown; None where relations do not come from positions.
     """
 
     scene_id: str
@@ -60,6 +62,7 @@ class EncodedScene:
     instance_holds: NDArray[np.bool_]
     instance_observed: NDArray[np.bool_]
     unknown: int
+    instance_positions: NDArray[np.float64] | None = None
 
 
 def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[EncodedScene]:
@@ -117,7 +120,7 @@ class _Encoder:
         left_out = self.left_out.get(scene.source, frozenset())
         classes = [self._index(thing.label) for thing in scene.objects]
         kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
-        relations = _relations(scene)
+        relations, positions = _relations(scene)
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
         instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
@@ -146,6 +149,7 @@ class _Encoder:
                     if index is None
                 }
             ),
+            instance_positions=None if positions is None else positions[kept],
         )
 
     def _index(self, label: str) -> int | None:
@@ -154,18 +158,23 @@ class _Encoder:
         return self.indices[label]
 
 
-def _relations(scene: AnnotatedScene) -> PoseRelations:
-    """Relations between all instances of a scene, by the best annotation there is."""
+def _relations(scene: AnnotatedScene) -> tuple[PoseRelations, NDArray[np.float64] | None]:
+    """Relations between all instances of a scene, by the best annotation there is.
+
+    Returns:
+        Them, and the positions (n, 3) that they were derived from, if they were.
+    """
     n = len(scene.objects)
+    positions = None
     if scene.relations is not None:
         holds = np.zeros((A, n, n), dtype=np.bool_)
         for subject, relation, anchor in scene.relations:
             holds[canonicalise(subject, relation, anchor)] = True
         # Who says that each is in front of the other has said nothing.
         both = holds & holds.swapaxes(1, 2)
-        return PoseRelations(holds & ~both, ~both & ~np.eye(n, dtype=np.bool_))
+        return PoseRelations(holds & ~both, ~both & ~np.eye(n, dtype=np.bool_)), None
     if any(thing.position is not None for thing in scene.objects):
-        found = _from_poses(scene)
+        found, positions = _from_poses(scene)
     elif any(thing.box2d is not None for thing in scene.objects):
         boxes = [thing.box2d or (math.nan,) * 4 for thing in scene.objects]
         found = derive_from_boxes(boxes)
@@ -173,10 +182,10 @@ def _relations(scene: AnnotatedScene) -> PoseRelations:
         nothing = np.zeros((A, n, n), dtype=np.bool_)
         found = PoseRelations(nothing, nothing.copy())
     _add_supports(found, scene.objects)
-    return found
+    return found, positions
 
 
-def _from_poses(scene: AnnotatedScene) -> PoseRelations:
+def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, NDArray[np.float64]]:
     unknown = (math.nan,) * 3
     positions = np.array([thing.position or unknown for thing in scene.objects])
     sizes = np.array([thing.size or unknown for thing in scene.objects])
@@ -184,7 +193,7 @@ def _from_poses(scene: AnnotatedScene) -> PoseRelations:
     if not scene.viewer_frame:
         viewpoint = room_viewpoint(scene.scene_id, positions)
         positions, yaws = to_viewer_frame(positions, viewpoint, yaws)
-    return derive_relations(positions, sizes, yaws)
+    return derive_relations(positions, sizes, yaws), positions
 
 
 def _add_supports(found: PoseRelations, objects: Sequence[AnnotatedObject]) -> None:

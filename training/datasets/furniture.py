@@ -6,6 +6,7 @@ types, objects and relations hang together.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -116,7 +117,9 @@ _BIN = Piece("garbage bin", (0.28, 0.28, 0.35), 0.5)
 _FLOOR_PLANT = Piece("plant", (0.40, 0.40, 1.10), 0.35)
 _CEILING_LAMP = Piece("lamp", (0.40, 0.40, 0.20), 0.5, "ceiling")
 
-ROOMS: Final[dict[str, tuple[Piece, ...]]] = {
+Rooms = Mapping[str, tuple[Piece, ...]]
+
+ROOMS: Final[Rooms] = {
     "bedroom": (
         Piece(
             "bed",

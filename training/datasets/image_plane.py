@@ -1,20 +1,14 @@
-"""Relations between boxes in an image: left and above, as the camera sees them.
-
-Without depth there is no front, and no telling what rests on what; *above* in the image may be
-farther away on the floor. Offsets count in units of the boxes, as an image has no metres: boxes
-are neighbours if the gap between them is at most the mean of their diagonals, the larger offset
-between the centres decides, and offsets under 10 % of that mean decide nothing.
-"""
+"""Relations between the boxes of an image, by the rule of `app.image_plane`: left and above."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from app.scene import CANONICAL, PoseRelations
+from app.image_plane import are_neighbours, relation_between
+from app.scene import CANONICAL, PoseRelations, canonicalise
 
-_LEFT, _ABOVE = CANONICAL.index("left"), CANONICAL.index("above")
-_MIN_OFFSET = 0.10
+_IN_THE_IMAGE = [CANONICAL.index("left"), CANONICAL.index("above")]
 
 
 def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
@@ -30,20 +24,14 @@ def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
     n = len(corners)
     if corners.shape != (n, 4) and n:
         raise ValueError(f"boxes has shape {corners.shape}, must be {(n, 4)}")
-    corners = corners.reshape(n, 4)
-    low, high = corners[:, :2], corners[:, 2:]
-    diagonal = np.hypot(*(high - low).T)
-    unit = (diagonal[:, None] + diagonal[None]) / 2
-    offset = (low + high)[:, None] / 2 - (low + high)[None] / 2
-    apart = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).clip(min=0)
-    # Comparisons with NaN are false: what is unseen has no neighbours.
-    neighbours = (np.hypot(apart[..., 0], apart[..., 1]) <= unit) & ~np.eye(n, dtype=np.bool_)
-    du, dv = offset[..., 0], offset[..., 1]
-    sideways = np.abs(du) >= np.abs(dv)
-    far = np.maximum(np.abs(du), np.abs(dv)) >= _MIN_OFFSET * unit
+    rows = [tuple(row) for row in corners.tolist()]
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
-    holds[_LEFT] = neighbours & far & sideways & (du < 0)
-    holds[_ABOVE] = neighbours & far & ~sideways & (dv < 0)
-    observed[[_LEFT, _ABOVE]] = neighbours
+    for i in range(n):
+        for j in range(i + 1, n):
+            if not are_neighbours(rows[i], rows[j]):
+                continue
+            observed[_IN_THE_IMAGE, i, j] = observed[_IN_THE_IMAGE, j, i] = True
+            if (relation := relation_between(rows[i], rows[j])) is not None:
+                holds[canonicalise(i, relation, j)] = True
     return PoseRelations(holds, observed)

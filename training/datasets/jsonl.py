@@ -11,7 +11,8 @@ from __future__ import annotations
 import gzip
 import json
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,19 @@ def read_jsonl(path: Path) -> list[AnnotatedScene]:
         DatasetError: the file cannot be read, or a line is not a scene.
     """
     scenes: list[AnnotatedScene] = []
+    for found in scan_jsonl(path):
+        if isinstance(found, DatasetError):
+            raise found
+        scenes.append(found)
+    return scenes
+
+
+def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
+    """Every line of a file as its scene, or as what is wrong with it; blank ones say nothing.
+
+    Raises:
+        DatasetError: the file cannot be read.
+    """
     seen: dict[tuple[str, str], int] = {}
     for number, line in enumerate(_lines(path), 1):
         if not line.strip():
@@ -40,21 +54,51 @@ def read_jsonl(path: Path) -> list[AnnotatedScene]:
         try:
             scene = _scene(json.loads(line))
         except json.JSONDecodeError as error:
-            raise DatasetError(path, where, f"not JSON: {error}") from error
-        except ValueError as error:
-            raise DatasetError(path, where, str(error)) from error
-        if (first := seen.setdefault((scene.source, scene.scene_id), number)) != number:
-            raise DatasetError(path, where, f"scene {scene.scene_id!r} is on line {first} already")
-        scenes.append(scene)
-    return scenes
+            yield DatasetError(path, where, f"not JSON: {error}")
+        except (ValueError, RecursionError) as error:
+            yield DatasetError(path, where, str(error))
+        else:
+            first = seen.setdefault((scene.source, scene.scene_id), number)
+            if first == number:
+                yield scene
+            else:
+                problem = f"scene {scene.scene_id!r} is on line {first} already"
+                yield DatasetError(path, where, problem)
 
 
-def _lines(path: Path) -> Iterator[str]:
+def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
+    """Write scenes as `read_jsonl` reads them; gzipped where the name says so."""
+    opener = gzip.open if path.suffix == ".gz" else open
+    with opener(path, "wt", encoding="utf-8") as file:
+        for scene in scenes:
+            file.write(json.dumps(_values(scene), ensure_ascii=False) + "\n")
+
+
+def _values(scene: AnnotatedScene) -> dict[str, Any]:
+    ids = [thing.id for thing in scene.objects]
+    relations = scene.relations
+    values = {
+        "scene_id": scene.scene_id,
+        "source": scene.source,
+        "group": scene.group,
+        "room_type": scene.room_type,
+        "objects": [
+            # What nobody knows is left out.
+            {name: value for name, value in asdict(thing).items() if value is not None}
+            for thing in scene.objects
+        ],
+        "relations": None if relations is None else [[ids[s], r, ids[o]] for s, r, o in relations],
+    }
+    return values | ({"viewer_frame": True} if scene.viewer_frame else {})
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    """Undecoded, so that one that is no UTF-8 is one bad line."""
     opener = gzip.open if path.suffix == ".gz" else open
     try:
-        with opener(path, "rt", encoding="utf-8") as file:
+        with opener(path, "rb") as file:
             yield from file
-    except (OSError, EOFError, UnicodeDecodeError, zlib.error) as error:
+    except (OSError, EOFError, zlib.error) as error:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
 
 

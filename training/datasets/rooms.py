@@ -1,10 +1,10 @@
 """A small procedural generator of furnished rooms.
 
 For tests, examples and machines without data: real sources are read from files. Rooms are drawn
-from the tables of `training.datasets.furniture`; furniture stands at walls without overlapping,
-small things stand on it, and relations follow from the boxes by the rules of `app.scene.geometry`.
-Every room is seen one to three times, from different sides and with some small things gone: those
-views share a group, as frames of one place do.
+from the tables of `training.datasets.furniture` or of another domain; furniture stands at walls
+without overlapping, small things stand on it, and relations follow from the boxes by the rules of
+`app.scene.geometry`. Every room is seen one to three times, from different sides and with some
+small things gone: those views share a group, as frames of one place do.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from app.scene import Viewpoint, Vocabulary, to_viewer_frame
 from app.scene.footprints import overlap_and_gap
-from training.datasets.furniture import ROOMS, Beside, Piece, Size, Small
+from training.datasets.furniture import ROOMS, Beside, Piece, Rooms, Size, Small
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.vocabulary import source_vocabulary
 
@@ -43,8 +43,11 @@ class _Box:
         return self.z + self.size[2] / 2
 
 
-def generate_rooms(count: int, seed: int) -> list[AnnotatedScene]:
+def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[AnnotatedScene]:
     """Draw ``count`` scenes; the same seed draws the same scenes.
+
+    Args:
+        rooms: what each type of room may hold; other tables make another domain.
 
     Positions are in viewer axes, boxes have sizes and yaws, what lies on furniture names it as its
     support, and ``relations`` is None: they are derived when scenes are encoded.
@@ -58,8 +61,8 @@ def generate_rooms(count: int, seed: int) -> list[AnnotatedScene]:
     scenes: list[AnnotatedScene] = []
     room = 0
     while len(scenes) < count:
-        room_type = str(rng.choice(list(ROOMS)))
-        layout = _Layout(rng, room_type)
+        room_type = str(rng.choice(list(rooms)))
+        layout = _Layout(rng, room_type, rooms[room_type])
         views = range(int(rng.integers(1, 4)))
         scenes += [layout.seen(f"rooms-{seed}-{room}", view) for view in views]
         room += 1
@@ -85,12 +88,12 @@ def _labels(pieces: tuple[Piece, ...]) -> list[str]:
 class _Layout:
     """One furnished room, in room axes: a corner at the origin, walls along x and y."""
 
-    def __init__(self, rng: np.random.Generator, room_type: str) -> None:
+    def __init__(self, rng: np.random.Generator, room_type: str, pieces: tuple[Piece, ...]) -> None:
         self.rng = rng
         self.room_type = room_type
         self.width, self.depth = rng.uniform(3.2, 5.5), rng.uniform(3.0, 5.0)
         self.boxes: list[_Box] = []
-        for piece in ROOMS[room_type]:
+        for piece in pieces:
             for _ in range(piece.most):
                 if rng.random() < piece.chance:
                     self._furnish(piece)

@@ -2,11 +2,14 @@
 
 ``group``, 75 / 15 / 10, keeps near-duplicates together: whole groups go to one part, and a group
 that occurs in several sources (a frame and the 3D boxes of the same frame) goes to the same part in
-all of them. ``random``, 60 / 30 / 10, is the protocol of the seed paper: every scene on its own.
+all of them. ``stable`` has the same shares and is not stratified: a group's part follows from the
+seed and its name alone. A data set can grow without any group moving, so that no later version of a
+model learns from what an earlier one was tested on. ``random``, 60 / 30 / 10, is the protocol of
+the seed paper: every scene on its own.
 
-The parts depend on the seed and on what is split, not on its order. Sources that share no group do
-not influence each other, so a source split alone splits as it does among others; sources that share
-groups must be split together.
+The parts of the others depend on the seed and on what is split, not on its order. Sources that
+share no group do not influence each other, so a source split alone splits as it does among others;
+sources that share groups must be split together.
 """
 
 from __future__ import annotations
@@ -20,10 +23,11 @@ from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedScene
 
 Part = Literal["train", "test", "validation"]
-Protocol = Literal["group", "random"]
+Protocol = Literal["group", "stable", "random"]
 
 FRACTIONS: Final[dict[Protocol, dict[Part, float]]] = {
     "group": {"train": 0.75, "test": 0.15, "validation": 0.1},
+    "stable": {"train": 0.75, "test": 0.15, "validation": 0.1},
     "random": {"train": 0.6, "test": 0.3, "validation": 0.1},
 }
 
@@ -36,19 +40,22 @@ def split(
     Args:
         scenes: all scenes that are to be split, of all sources.
         seed: draws another split.
-        protocol: ``group`` or ``random``.
+        protocol: ``group``, ``stable`` or ``random``.
 
     Raises:
         ValueError: an unknown protocol, or two scenes of one source with one id.
     """
     if protocol not in FRACTIONS:
-        raise ValueError(f"protocol must be 'group' or 'random', not {protocol!r}")
+        raise ValueError(f"protocol must be one of {', '.join(FRACTIONS)}, not {protocol!r}")
     if len({(scene.source, scene.scene_id) for scene in scenes}) < len(scenes):
         raise ValueError("two scenes of one source share one scene_id")
     units = [_unit(scene, protocol) for scene in scenes]
     part_of: dict[str, Part] = {}
-    for family in _families(scenes, units):
-        part_of |= _assign(family, FRACTIONS[protocol], seed)
+    if protocol == "stable":
+        part_of = {unit: stable_part(unit, seed) for unit in units}
+    else:
+        for family in _families(scenes, units):
+            part_of |= _assign(family, FRACTIONS[protocol], seed)
     parts: dict[Part, list[AnnotatedScene]] = {part: [] for part in FRACTIONS[protocol]}
     for scene, unit in zip(scenes, units, strict=True):
         parts[part_of[unit]].append(scene)
@@ -57,7 +64,17 @@ def split(
 
 def _unit(scene: AnnotatedScene, protocol: Protocol) -> str:
     """What must not be torn apart."""
-    return scene.group if protocol == "group" else f"{scene.source}/{scene.scene_id}"
+    return f"{scene.source}/{scene.scene_id}" if protocol == "random" else scene.group
+
+
+def stable_part(group: str, seed: int) -> Part:
+    """The part of a group under the ``stable`` protocol, whatever else is split."""
+    place = int.from_bytes(_rank(seed, group)[:8], "big") / 2**64
+    for part, share in FRACTIONS["stable"].items():
+        if place < share:
+            return part
+        place -= share
+    return "train"
 
 
 def _families(

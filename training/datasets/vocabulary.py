@@ -78,19 +78,36 @@ def write_indoor_vocabulary(
 ) -> Vocabulary:
     """Build the indoor vocabulary from the scenes of all sources and write it, one class a line."""
     vocabulary = build_vocabulary(scenes, curated_names())
+    path.write_text(vocabulary_json(vocabulary), encoding="utf-8")
+    return vocabulary
+
+
+def vocabulary_json(vocabulary: Vocabulary) -> str:
+    """A vocabulary as a file to be read and edited, one class a line.
+
+    Sizes come from the training data (`with_typical_sizes`), not from such a file.
+    """
     values = vocabulary.to_dict()
     for entry in values["objects"]:
-        # Sizes come from the training data (`with_typical_sizes`), not from this file.
         del entry["size"]
     lines = ",\n".join(json.dumps(entry, ensure_ascii=False) for entry in values["objects"])
     rooms = json.dumps(values["room_types"], ensure_ascii=False)
-    path.write_text(f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n', encoding="utf-8")
-    return vocabulary
+    return f'{{\n"objects": [\n{lines}\n],\n"room_types": {rooms}\n}}\n'
+
+
+def read_vocabulary(path: Path) -> Vocabulary:
+    """What `vocabulary_json` wrote, or somebody by hand.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no JSON or no vocabulary.
+    """
+    return Vocabulary.from_dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def indoor_vocabulary(path: Path = INDOOR_FILE) -> Vocabulary:
     """The committed indoor vocabulary."""
-    return Vocabulary.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    return read_vocabulary(path)
 
 
 def source_vocabulary(

@@ -107,7 +107,8 @@ def ask_relations(
     if not encoded.instance_observed.any():
         return None
     found: Answered = []
-    for answer in relations(artifact, _bare(encoded, range(len(encoded.instance_classes)))):
+    answers, _ = relations(artifact, _bare(encoded, range(len(encoded.instance_classes))))
+    for answer in answers:
         triple = CANONICAL.index(answer.relation), answer.subject, answer.object
         found.append((answer.probability, bool(encoded.instance_holds[triple])))
     return found
@@ -122,7 +123,7 @@ def ask_given(
         return None
     scene = replace(scene_of(encoded, range(len(asked)), given), room_type=None)
     found: Answered = []
-    for answer in relations(artifact, scene):
+    for answer in relations(artifact, scene)[0]:
         triple = CANONICAL.index(answer.relation), answer.subject, answer.object
         if asked[triple[1:]]:
             found.append((answer.probability, bool(encoded.instance_holds[triple])))

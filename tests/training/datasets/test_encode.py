@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.scene import ObjectClass, Viewpoint, Vocabulary
+from app.scene import ObjectClass, Viewpoint, Vocabulary, to_viewer_frame
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
 from training.datasets import AnnotatedObject, AnnotatedScene, annotated_classes, encode
 from training.datasets.viewpoints import room_viewpoint
@@ -229,3 +229,31 @@ def test_a_source_of_open_vocabulary_annotates_every_class() -> None:
     """But for the labels it leaves out: what free words never mention was not there."""
     found = annotated_classes([encoded(things("desk"), source="sunrgbd")], VOCABULARY)
     assert found["sunrgbd"].tolist() == [True, True, True, False, False]
+
+
+def test_positions_are_kept_in_the_axes_that_relations_were_derived_in() -> None:
+    """Of what the vocabulary knows; without a viewer, from the viewpoint that was chosen."""
+    objects = (
+        AnnotatedObject("0", "goblet", position=(9.0, 9.0, 9.0)),
+        AnnotatedObject("1", "desk", **DESK_BOX),
+        AnnotatedObject("2", "pencil"),
+        AnnotatedObject("3", "monitor", **MONITOR_BOX),
+    )
+    seen = encoded(objects, viewer_frame=True).instance_positions
+    assert seen[[0, 2]].tolist() == [list(DESK_BOX["position"]), list(MONITOR_BOX["position"])]
+    assert np.isnan(seen[1]).all()
+    chosen = encoded(objects).instance_positions
+    viewpoint = room_viewpoint(
+        "s", np.array([thing.position or (math.nan,) * 3 for thing in objects])
+    )
+    expected, _ = to_viewer_frame([DESK_BOX["position"], MONITOR_BOX["position"]], viewpoint)
+    assert chosen[[0, 2]] == pytest.approx(expected)
+
+
+def test_positions_say_nothing_where_people_stated_the_relations() -> None:
+    objects = (
+        AnnotatedObject("1", "desk", **DESK_BOX),
+        AnnotatedObject("3", "monitor", **MONITOR_BOX),
+    )
+    assert encoded(objects, relations=((1, "left", 0),)).instance_positions is None
+    assert encoded(things("desk", "monitor")).instance_positions is None

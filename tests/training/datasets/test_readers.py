@@ -17,7 +17,15 @@ import pytest
 from scipy.io import savemat
 
 from app.scene import CANONICAL
-from training.datasets import READERS, DatasetError, encode, indoor_vocabulary, read_scenes
+from training.datasets import (
+    READERS,
+    DatasetError,
+    encode,
+    generate_rooms,
+    indoor_vocabulary,
+    jsonl,
+    read_scenes,
+)
 from training.datasets.readers import guess_format
 
 Write = Callable[[Path], Path]
@@ -63,6 +71,36 @@ def test_jsonl(tmp_path: Path) -> None:
     assert first.relations == ((1, "on-top", 0), (2, "right", 1))
     assert (second.group, second.room_type, second.relations) == ("b", None, None)
     assert second.viewer_frame is False
+
+
+@pytest.mark.parametrize("name", ["again.jsonl", "again.jsonl.gz"])
+def test_jsonl_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
+    scenes = [*read_scenes(write_jsonl(tmp_path)), *generate_rooms(10, 0)]
+    jsonl.write_jsonl(scenes, tmp_path / name)
+    assert read_scenes(tmp_path / name) == scenes
+
+
+def test_jsonl_tells_of_every_bad_line(tmp_path: Path) -> None:
+    path = write_jsonl(tmp_path)
+    path.write_text(path.read_text() + "[]\n" + "[" * 100_000 + "\n" + path.read_text())
+    found = list(jsonl.scan_jsonl(path))
+    assert [type(entry).__name__ for entry in found] == (
+        ["AnnotatedScene"] * 2 + ["DatasetError"] * 4
+    )
+    assert [entry.where for entry in found if isinstance(entry, DatasetError)] == [
+        "line 4", "line 5", "line 6", "line 8",
+    ]  # fmt: skip
+    with pytest.raises(DatasetError, match="line 4: a scene must be a JSON object"):
+        read_scenes(path)
+
+
+def test_jsonl_with_a_line_that_is_no_utf_8_and_a_mark_at_its_beginning(tmp_path: Path) -> None:
+    path, line = tmp_path / "scenes.jsonl", json.dumps(BARE_SCENE).encode()
+    path.write_bytes(b"\xef\xbb\xbf" + line + b"\n" + line.replace(b"a", b"\xff", 1) + b"\n")
+    first, second = jsonl.scan_jsonl(path)
+    assert not isinstance(first, DatasetError)
+    assert isinstance(second, DatasetError)
+    assert second.where == "line 2"
 
 
 def test_jsonl_gzipped(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from app.scene import CANONICAL
 from app.scene.footprints import overlap_and_gap
 from training.datasets import AnnotatedScene, encode, generate_rooms, rooms_vocabulary, split
 from training.datasets.furniture import ROOMS
+from training.datasets.workplaces import WORKPLACES
 
 
 @pytest.fixture(scope="module")
@@ -123,3 +124,11 @@ def test_there_is_something_to_learn(rooms: list[AnnotatedScene]) -> None:
         assert both >= 10
         assert up / both > 0.6
         assert down == 0
+
+
+def test_other_tables_make_another_domain() -> None:
+    found = generate_rooms(60, 0, WORKPLACES)
+    assert {scene.room_type for scene in found} == set(WORKPLACES)
+    homes = {thing.label for scene in generate_rooms(60, 0) for thing in scene.objects}
+    assert not homes & {thing.label for scene in found for thing in scene.objects}
+    assert generate_rooms(20, 0, WORKPLACES) == found[:20]

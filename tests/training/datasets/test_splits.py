@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from training.datasets import FRACTIONS, AnnotatedScene, split
+from training.datasets import FRACTIONS, AnnotatedScene, split, stable_part
 from training.datasets.splits import Protocol
 
 ROOMS = ("bedroom", "kitchen", "office", None)
@@ -34,7 +34,7 @@ def parts_of(scenes: list[AnnotatedScene], **options: object) -> dict[str, str]:
     }
 
 
-@given(st.integers(0, 40), st.integers(0, 5), st.sampled_from(["group", "random"]))
+@given(st.integers(0, 40), st.integers(0, 5), st.sampled_from(["group", "stable", "random"]))
 def test_every_scene_has_one_part_whatever_the_order(
     groups: int, seed: int, protocol: Protocol
 ) -> None:
@@ -93,6 +93,20 @@ def test_the_seed_protocol_tears_groups_apart() -> None:
     for scene in scenes:
         parts[scene.group].add(found[scene.scene_id])
     assert any(len(of) > 1 for of in parts.values())
+
+
+def test_a_stable_split_has_its_shares_and_moves_no_group_as_a_collection_grows() -> None:
+    scenes = collection("a", 2000)
+    found = parts_of(scenes, seed=3, protocol="stable")
+    counts = Counter(found.values())
+    for part, fraction in FRACTIONS["stable"].items():
+        assert counts[part] / len(scenes) == pytest.approx(fraction, abs=0.03)
+    fewer = parts_of(scenes[::7] + collection("b", 40), seed=3, protocol="stable")
+    shared = set(fewer) & set(found)
+    assert len(shared) > 900
+    assert all(fewer[scene] == found[scene] for scene in shared)
+    assert all(found[scene.scene_id] == stable_part(scene.group, 3) for scene in scenes)
+    assert found != parts_of(scenes, seed=4, protocol="stable")
 
 
 def test_bad_requests_are_refused() -> None:

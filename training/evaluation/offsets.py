@@ -1,0 +1,66 @@
+"""Do things stand where placements say they do?
+
+Every two things of held-out scenes with poses that stand in a relation are looked up by their
+classes. Covered in the plane are those whose offset lies within the ellipse that should hold 80 %
+of them, in space those within the ellipsoid. Distances are from the mean offset, beside those from
+what the relation alone says.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy.stats import chi2
+
+from app.scene import CANONICAL
+from training.evaluation.contenders import Contender
+from training.evaluation.intervals import Metric
+from training.evaluation.metrics import Ratio
+from training.evaluation.tasks import Outcome, Setting, Task
+from training.offsets import seen_offsets
+
+SHARE: Final = 0.8
+"""Of the offsets that the ellipses should hold."""
+
+_REGIONS: Final = {"the ellipse": 2, "the ellipsoid": 3}
+"""Names, and how many axes count, of x, y and z."""
+
+METRICS: Final = (
+    *(f"in {region}, {name}" for name in CANONICAL for region in _REGIONS),
+    "distance (m)",
+    "distance (m), relation alone",
+)
+
+
+def offsets_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Coverage by relation, and distances over all of them."""
+    if contender.artifact is None or (offsets := contender.artifact.offsets) is None:
+        return None
+    scenes = setting.scenes.scenes
+    every = seen_offsets(scenes)
+    known = offsets.relation_scenes[every.relation] > 0
+    if not known.any():
+        return None
+    seen = every.some(known)
+    values, _ = offsets.find(seen.relation, seen.subject, seen.other)
+    away = seen.offset - values[:, :3]
+    squares = np.square(away / values[:, 3:])
+    metrics: dict[str, Metric] = {}
+    for a, name in enumerate(CANONICAL):
+        asked = seen.relation == a
+        for region, axes in _REGIONS.items():
+            inside = squares[asked, :axes].sum(axis=1) <= chi2.ppf(SHARE, axes)
+            if asked.any():
+                metrics[f"in {region}, {name}"] = Ratio.of_items(
+                    seen.scene[asked], inside.astype(np.float64), len(scenes)
+                )
+    alone = seen.offset - offsets.relation[seen.relation, :3]
+    for name, vectors in (("distance (m)", away), ("distance (m), relation alone", alone)):
+        distance = np.linalg.norm(vectors, axis=1)
+        metrics[name] = Ratio.of_items(seen.scene, distance, len(scenes))
+    return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(seen.scene)))
+
+
+OFFSETS_TASKS: dict[str, Task] = {"Offsets": offsets_task}
+"""Apart from `TASKS`: all machines that were trained on the same scenes have the same offsets."""
