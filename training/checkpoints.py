@@ -26,10 +26,10 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
-    """Read a checkpoint that began with the configuration of the given digest.
+    """Read a checkpoint that began with the configuration and scenes of the given digest.
 
     Raises:
-        CheckpointError: unreadable, or begun under another configuration.
+        CheckpointError: unreadable, or begun under another configuration or on other scenes.
     """
     try:
         state: dict[str, Any] = torch.load(path, weights_only=True)
@@ -37,6 +37,7 @@ def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
         raise CheckpointError(f"{path.name} cannot be read: {error}") from error
     if state.get("digest") != digest:
         raise CheckpointError(
-            f"{path.name} was begun with another configuration: use --fresh to start over"
+            f"{path.name} was begun with another configuration or on other scenes: use --fresh to "
+            "start over"
         )
     return state

@@ -1,4 +1,4 @@
-"""The command line: train, tune, evaluate, publish, list.
+"""The command line: init, train, compare, publish, tune, evaluate, list.
 
 Ctrl-C during training leaves a checkpoint of the last finished epoch; the same command goes on from
 it.
@@ -7,6 +7,7 @@ it.
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -14,47 +15,74 @@ import httpx
 import torch
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from torch import Tensor
 
 from app.registry import Artifact, RegistryError, Store, load_model_set
+from app.registry.references import AliasTarget
 from training.ablation.command import ablate
 from training.batches import SceneTensors
 from training.benchmark.command import benchmark
 from training.checkpoints import CheckpointError
-from training.config import Config, ConfigError, load_config, shipped_configs
+from training.comparison.command import compare_command, show
+from training.comparison.compare import Comparison
+from training.comparison.gate import MARGIN, WorseError, judge, seat
+from training.config import (
+    DATA,
+    Config,
+    ConfigError,
+    data_folder,
+    load_config,
+    shipped_configs,
+    source_name,
+)
 from training.datasets import DatasetError
+from training.domain.command import init
+from training.domain.example import example
 from training.evaluation.cases import some_scenes
 from training.evaluation.report import Row, by_source, evaluate
 from training.evaluation.service import ServiceError, directly, over_http
 from training.evaluation.service import metrics as service_metrics
+from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run
-from training.runs import RunError, load_run, save_run
+from training.runs import FinishedRun, RunError, load_run, save_run
 from training.trainer import Trainer, subset
 from training.tuning.command import tune
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
+app.command()(example)
+app.command()(init)
 app.command()(tune)
+app.command(name="compare")(compare_command)
 app.command()(benchmark)
 app.command()(ablate)
 console = Console()
 
-Data = Annotated[Path, typer.Option("--data", help="folder with the scene files")]
+Data = Annotated[
+    Path | None,
+    typer.Option(
+        "--data",
+        help="folder with the scene files; by default the configuration's own, or "
+        f"{DATA} for what ships",
+    ),
+]
 Runs = Annotated[Path, typer.Option("--runs", help="folder for training runs")]
 StorePath = Annotated[Path, typer.Option("--store", help="the model store")]
 Alias = Annotated[str | None, typer.Option("--alias", help="point this alias at it afterwards")]
-_DATA, _RUNS, _STORE = Path("../shared/data"), Path("runs"), Path("model_store")
+_RUNS, _STORE = Path("runs"), Path("model_store")
 
 
 @app.command()
 def train(
     configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
-    data: Data = _DATA,
+    data: Data = None,
     runs: Runs = _RUNS,
     seed: Annotated[int | None, typer.Option(help="in place of the configuration's")] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="ignore a checkpoint")] = False,
+    tensorboard: Annotated[
+        Path | None, typer.Option("--tensorboard", help="write the curves there as well")
+    ] = None,
     publish: Annotated[str | None, typer.Option(help="publish as this version")] = None,
     alias: Alias = None,
     store: StorePath = _STORE,
@@ -62,11 +90,12 @@ def train(
     """Train a configuration; with --publish also calibrate, evaluate and publish it."""
     try:
         config = load_config(configuration, seed=seed)
-        scenes = _prepare(config, data)
+        root = data_folder(configuration, config, data)
+        scenes = _prepare(config, root)
         folder = runs / config.name / f"seed-{config.training.seed}"
-        _train(config, scenes, folder, fresh)
+        _train(config, scenes, folder, root, fresh, tensorboard)
         if publish is not None:
-            _publish(folder, scenes, store, publish, alias)
+            _publish(load_run(folder), scenes, store, publish, alias)
     except (ConfigError, DatasetError, CheckpointError, RegistryError, FloatingPointError) as error:
         _fail(error)
 
@@ -75,14 +104,44 @@ def train(
 def publish(
     folder: Annotated[Path, typer.Argument(help="a finished run")],
     version: Annotated[str, typer.Argument(help="such as 1.0.0")],
-    data: Data = _DATA,
+    data: Data = None,
     store: StorePath = _STORE,
     alias: Alias = None,
+    promote: Annotated[
+        bool,
+        typer.Option(
+            "--promote",
+            help="move `default`, or --alias, unless the version is worse than what it serves",
+        ),
+    ] = False,
+    margin: Annotated[
+        float, typer.Option(min=0, help="with --promote: worse by so much is bearable")
+    ] = MARGIN,
+    even_if_worse: Annotated[
+        bool, typer.Option("--even-if-worse", "--force", help="promote it all the same")
+    ] = False,
+    limit: Annotated[int, typer.Option(min=2, help="with --promote: scenes to compare on")] = 300,
 ) -> None:
-    """Calibrate, evaluate and publish a finished run."""
+    """Calibrate, evaluate and publish a finished run.
+
+    With --promote it is compared first with what the alias serves, on test scenes that neither has
+    learnt from. Where a primary metric is worse by more than the margin (the whole 95 % interval of
+    the paired difference), nothing is published, and the exit code is 3.
+    """
     try:
-        scenes = _prepare(load_run(folder).config, data)
-        _publish(folder, scenes, store, version, alias)
+        run = load_run(folder)
+        root = data or (Path(run.data) if run.data else DATA)
+        scenes = _prepare(run.config, root)
+        if promote:
+            gate = _Gate(alias or "default", margin, limit, even_if_worse)
+            _promote(run, scenes, root, Store(store), version, gate)
+        else:
+            _publish(run, scenes, store, version, alias)
+    except WorseError as error:
+        show(error.comparison, console)
+        console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
+        console.print("nothing was published; --even-if-worse publishes and promotes all the same")
+        raise typer.Exit(3) from None
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
         _fail(error)
 
@@ -90,7 +149,7 @@ def publish(
 @app.command(name="evaluate")
 def evaluate_command(
     models: Annotated[list[str], typer.Argument(help="aliases, names or name@version")],
-    data: Data = _DATA,
+    data: Data = None,
     store: StorePath = _STORE,
     source: Annotated[list[str] | None, typer.Option(help="only these sources")] = None,
     part: Annotated[str, typer.Option(help="train, validation or test")] = "test",
@@ -110,20 +169,17 @@ def evaluate_command(
         for reference in models:
             artifact = Store(store).load(*Store(store).resolve(reference))
             config = Config.model_validate(artifact.manifest.training["config"])
-            chosen = tuple(source) if source else config.data.sources
-            wanted = config.data.model_copy(update={"sources": chosen})
+            wanted = source or [source_name(name) for name in config.data.sources]
             with console.status("reading scenes"):
                 # All sources take part in the split, so that the parts are those of training.
                 scenes = split_and_encode(
-                    config.data, read_sources(config.data, data), artifact.vocabulary
+                    config.data, read_sources(config.data, data or DATA), artifact.vocabulary
                 )
             tensors = scenes.training_data()
             some = {"train": tensors.train, "validation": tensors.validation, "test": tensors.test}
             if part not in some:
                 raise ConfigError(f"part must be one of {', '.join(some)}, not {part!r}")
-            index = [
-                k for k, scene in enumerate(some[part].scenes) if scene.source in wanted.sources
-            ]
+            index = [k for k, scene in enumerate(some[part].scenes) if scene.source in wanted]
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
                 if url is not None:
@@ -166,7 +222,14 @@ def _prepare(config: Config, data: Path) -> SplitScenes:
     return scenes
 
 
-def _train(config: Config, scenes: SplitScenes, folder: Path, fresh: bool) -> None:
+def _train(
+    config: Config,
+    scenes: SplitScenes,
+    folder: Path,
+    root: Path,
+    fresh: bool,
+    tensorboard: Path | None,
+) -> None:
     if fresh:
         for name in ("checkpoint.pt", "result.json"):
             (folder / name).unlink(missing_ok=True)
@@ -174,48 +237,83 @@ def _train(config: Config, scenes: SplitScenes, folder: Path, fresh: bool) -> No
     if trainer.resume():
         console.print(f"resuming after epoch {len(trainer.epochs)}")
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
-    columns = (
-        "[progress.description]{task.description}",
-        BarColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as bar:
-        task = bar.add_task(config.name, total=config.training.epochs, note="")
-
-        def show(epoch: int, done: float, loss: float) -> None:
-            note = f"loss {loss:.3f}"
-            if trainer.epochs:
-                last = trainer.epochs[-1]
-                note += f"  MRR {last.mrr_validation:.3f}"
-                note += f"  R-precision {last.r_precision_validation:.3f}"
-            bar.update(task, completed=epoch + done, note=note)
-
-        try:
-            result = trainer.run(show)
-        except KeyboardInterrupt:
-            bar.stop()
-            console.print(
-                f"stopped after epoch {len(trainer.epochs)}; the same command goes on from there"
-            )
-            raise typer.Exit(130) from None
-    save_run(folder, config, result)
-    best = result.epochs[result.best_epoch]
-    console.print(
-        f"best epoch {result.best_epoch + 1} of {len(result.epochs)} in {result.seconds:.0f} s: "
-        f"MRR {best.mrr_validation:.3f}, R-precision {best.r_precision_validation:.3f}; "
-        f"curve in {folder / 'curve.png'}"
-    )
+    try:
+        with Display(trainer, console, tensorboard) as display:
+            result = trainer.run(display.progress, display.ended)
+    except KeyboardInterrupt:
+        console.print(
+            f"stopped after epoch {len(trainer.epochs)}; the same command goes on from there"
+        )
+        raise typer.Exit(130) from None
+    save_run(folder, config, result, data=root, scenes=scenes.digest)
+    summarise(result, trainer, folder, console)
 
 
 def _publish(
-    folder: Path, scenes: SplitScenes, store: Path, version: str, alias: str | None
+    run: FinishedRun, scenes: SplitScenes, store: Path, version: str, alias: str | None
 ) -> None:
     with console.status("publishing") as status:
         artifact = publish_run(
-            load_run(folder), scenes, Store(store), version, alias=alias, progress=status.update
+            run, scenes, Store(store), version, alias=alias, progress=status.update
         )
+    _published(artifact)
+
+
+def _published(artifact: Artifact) -> None:
     manifest = artifact.manifest
     console.print(f"published {manifest.name}@{manifest.version}, digest {artifact.digest[:12]}")
+
+
+@dataclass(frozen=True)
+class _Gate:
+    """How strictly a promotion is judged, see `publish`."""
+
+    alias: str
+    margin: float
+    limit: int
+    even_if_worse: bool
+
+
+def _promote(
+    run: FinishedRun, scenes: SplitScenes, root: Path, store: Store, version: str, gate: _Gate
+) -> None:
+    """Publish and point the alias at the version, unless it is worse than what that serves."""
+    before = seat(store, gate.alias)
+    found: list[Comparison] = []
+    with console.status("publishing") as status:
+
+        def judged(artifact: Artifact) -> None:
+            if before.holder is None:
+                return
+            try:
+                found.append(
+                    judge(
+                        *(run, scenes, artifact, before.holder, root),
+                        margin=gate.margin,
+                        limit=gate.limit,
+                        say=status.update,
+                    )
+                )
+            except WorseError as error:
+                if not gate.even_if_worse:
+                    raise
+                found.append(error.comparison)
+            except ConfigError as error:
+                if not gate.even_if_worse:
+                    raise
+                console.print(f"not compared: {error}", soft_wrap=True)
+
+        artifact = publish_run(run, scenes, store, version, judge=judged, progress=status.update)
+    for comparison in found:
+        show(comparison, console)
+    if before.note:
+        console.print(before.note, soft_wrap=True)
+    _published(artifact)
+    # Nobody may have moved the alias since the comparison: then it would have been with another.
+    target = AliasTarget(name=artifact.manifest.name, version=version)
+    store.set_alias(gate.alias, target, expected=before.target)
+    was = f", before {before.target}" if before.target is not None else ""
+    console.print(f"promoted: {gate.alias} → {target}{was}", soft_wrap=True)
 
 
 def _asked(

@@ -14,9 +14,22 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from app.boltzmann import MachineSpec, build
 from app.boltzmann.spec import Form, Variant
 
+DATA = Path("../shared/data")
+"""Where the sources that are known by name are looked for."""
+
 
 class ConfigError(ValueError):
     """A configuration file that cannot be used; says which entry and why."""
+
+
+def is_file(source: str) -> bool:
+    """A source that is a file, not a name."""
+    return "." in Path(source).name
+
+
+def source_name(source: str) -> str:
+    """What the scenes of a source are said to come from: its name, or its file's first word."""
+    return Path(source).name.partition(".")[0] if is_file(source) else source
 
 
 class _Section(BaseModel):
@@ -24,14 +37,38 @@ class _Section(BaseModel):
 
 
 class DataConfig(_Section):
-    """Which scenes: sources by name (`rooms` is the built-in generator), and how they are split."""
+    """Which scenes, and how they are split.
+
+    A source is a name (`rooms` is the built-in generator, any other one a file `<name>.jsonl.gz`
+    in the data folder) or a file of any known format. Files, the vocabulary's too, are looked for
+    in the data folder, which for such a configuration is its own: see `data_folder`.
+    """
 
     sources: tuple[str, ...] = Field(min_length=1)
-    vocabulary: str = "indoor"
-    split: Literal["group", "random"] = "group"
+    vocabulary: str = Field(
+        default="indoor", description="indoor, source, rooms, or a file that ends in .json"
+    )
+    split: Literal["group", "stable", "random"] = "group"
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
     limit: int | None = Field(default=None, ge=10, description="at most so many scenes a source")
+    # Not written where they say nothing, as below.
+    terms: str = Field(
+        default="", exclude_if=lambda words: not words, description="of use, for files of one's own"
+    )
+    research_only: bool = Field(default=False, exclude_if=lambda only: not only)
+
+    @model_validator(mode="after")
+    def _distinct(self) -> DataConfig:
+        names = [source_name(source) for source in self.sources]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two sources are called {', '.join(twice)}: rename a file")
+        return self
+
+    @property
+    def files(self) -> bool:
+        """It names files rather than shipped things alone."""
+        return self.vocabulary.endswith(".json") or any(map(is_file, self.sources))
 
 
 class MachineConfig(_Section):
@@ -148,13 +185,26 @@ def shipped_configs() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
+def config_path(reference: str) -> Path:
+    """The file of a shipped configuration, a TOML file, or the one a folder of its name holds."""
+    path = shipped_configs().get(reference, Path(reference))
+    return path / f"{path.resolve().name}.toml" if path.is_dir() else path
+
+
+def data_folder(reference: str, config: Config, given: Path | None = None) -> Path:
+    """Where a configuration's scenes are: as given, beside the file, or where known sources are."""
+    if given is not None:
+        return given
+    return config_path(reference).parent if config.data.files else DATA
+
+
 def load_config(reference: str, *, seed: int | None = None) -> Config:
-    """Read a TOML file, or a shipped configuration by its name.
+    """Read a TOML file, a folder that `init` made, or a shipped configuration by its name.
 
     Raises:
         ConfigError: no such file, not TOML, or an entry that does not fit.
     """
-    path = shipped_configs().get(reference, Path(reference))
+    path = config_path(reference)
     if not path.is_file():
         known = ", ".join(shipped_configs())
         raise ConfigError(f"no configuration {reference!r}: give a TOML file or one of {known}")

@@ -4,7 +4,7 @@ config.json        the validated configuration
 checkpoint.pt      training state, for resuming
 model.safetensors  the best weights, with the shape in the header
 curve.csv, .png    reconstruction error per epoch
-result.json        best epoch, seconds, thread count
+result.json        best epoch, seconds, what it learnt from
 """
 
 from __future__ import annotations
@@ -27,17 +27,47 @@ class RunError(RuntimeError):
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run as it is read back."""
+    """A run as it is read back.
+
+    Attributes:
+        data: the folder that its scenes were read from, on the machine that it ran on.
+        scenes: digest of the scenes, their vocabulary and split; "" where the run does not say.
+    """
 
     config: Config
     machine: BoltzmannMachine
     best_epoch: int
     epochs: int
     seconds: float
+    data: str = ""
+    scenes: str = ""
+
+    def require(self, scenes: str) -> None:
+        """The run learnt from these scenes.
+
+        Raises:
+            RunError: it learnt from others.
+        """
+        if self.scenes and self.scenes != scenes:
+            raise RunError(
+                f"{self.config.name} learnt from other scenes than there are now, or with another "
+                "vocabulary or split: train it again (--fresh)"
+            )
 
 
-def save_run(folder: Path, config: Config, result: TrainingResult) -> None:
-    """Write the weights and the result; `result.json` last, since it marks the run as finished."""
+def save_run(
+    folder: Path,
+    config: Config,
+    result: TrainingResult,
+    *,
+    data: Path | None = None,
+    scenes: str = "",
+) -> None:
+    """Write the weights and the result; `result.json` last, since it marks the run as finished.
+
+    Args:
+        data, scenes: see `FinishedRun`.
+    """
     machine = result.machine
     state = {name: tensor.contiguous() for name, tensor in machine.state_dict().items()}
     spec = json.dumps(machine.spec.to_dict())
@@ -47,6 +77,8 @@ def save_run(folder: Path, config: Config, result: TrainingResult) -> None:
         "best_epoch": result.best_epoch,
         "epochs": len(result.epochs),
         "seconds": round(result.seconds, 1),
+        "data": "" if data is None else str(data.resolve()),
+        "scenes": scenes,
     }
     (folder / "result.json").write_text(json.dumps(outcome), encoding="utf-8")
 

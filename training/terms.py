@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from training.config import DataConfig
+
 
 @dataclass(frozen=True)
 class Terms:
@@ -40,3 +42,11 @@ TERMS: dict[str, Terms] = {
         "Rooms made by this project's own generator; no restriction", research_only=False
     ),
 }
+
+
+def terms_of(source: str, data: DataConfig) -> Terms:
+    """The terms of a source that is known, or those that the configuration gives for its files."""
+    if source in TERMS and source in data.sources:
+        return TERMS[source]
+    words = data.terms or "scenes of the user's own, whose terms were not stated"
+    return Terms(words, data.research_only)

@@ -30,16 +30,23 @@ from training.objectives import OBJECTIVES, CompositeLikelihood
 from training.polish import polish
 
 _VALIDATION_SCENES = 400
+_DRAWN_EVERY = 20.0  # s
 # At the full learning rate: the rest are relation weights, which overfit within an epoch at it.
 _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
 # Called after every update with (epoch, share of the epoch done, mean loss so far).
 Progress = Callable[[int, float, float], None]
+# Called with every epoch that has ended.
+Ended = Callable[[Epoch], None]
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Tensors of the three parts, and what the machine's shape follows from."""
+    """Tensors of the three parts, and what the machine's shape follows from.
+
+    Attributes:
+        digest: of the scenes, their vocabulary and split; a run is not gone on with on others.
+    """
 
     train: SceneTensors
     validation: SceneTensors
@@ -47,6 +54,7 @@ class TrainingData:
     structure: Tensor
     relations: int
     room_types: int
+    digest: str = ""
 
 
 @dataclass(frozen=True)
@@ -163,6 +171,7 @@ class Trainer:
         self.best: dict[str, Tensor] = {}
         self.best_epoch, self.best_score = -1, -math.inf
         self.seconds = 0.0
+        self._drawn = -math.inf
 
     def _optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training
@@ -209,7 +218,7 @@ class Trainer:
         """
         if self.folder is None or not (self.folder / "checkpoint.pt").exists():
             return False
-        state = load_checkpoint(self.folder / "checkpoint.pt", self.config.digest)
+        state = load_checkpoint(self.folder / "checkpoint.pt", self._digest)
         self.machine.load_state_dict(state["machine"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.scheduler.load_state_dict(state["scheduler"])
@@ -221,7 +230,7 @@ class Trainer:
         self.epochs = [Epoch(**row) for row in state["epochs"]]
         return True
 
-    def run(self, progress: Progress | None = None) -> TrainingResult:
+    def run(self, progress: Progress | None = None, ended: Ended | None = None) -> TrainingResult:
         """Train to the last epoch or until patience runs out.
 
         KeyboardInterrupt passes through; the last finished epoch is on disk by then.
@@ -229,6 +238,9 @@ class Trainer:
         while len(self.epochs) < self.config.training.epochs and not self._out_of_patience():
             self._epoch(progress)
             self._save()
+            if ended is not None:
+                ended(self.epochs[-1])
+        self._draw()
         parameters = dict(self.machine.named_parameters())
         with torch.no_grad():
             for name, value in self.best.items():
@@ -241,6 +253,10 @@ class Trainer:
             self.config.training.seed,
         )
         return TrainingResult(self.machine, self.epochs, self.best_epoch, self.seconds, True)
+
+    @property
+    def _digest(self) -> str:
+        return f"{self.config.digest} {self.data.digest}"
 
     def _out_of_patience(self) -> bool:
         patience = self.config.training.patience
@@ -338,7 +354,7 @@ class Trainer:
         save_checkpoint(
             self.folder / "checkpoint.pt",
             {
-                "digest": self.config.digest,
+                "digest": self._digest,
                 "machine": self.machine.state_dict(),
                 "optimiser": self.optimiser.state_dict(),
                 "scheduler": self.scheduler.state_dict(),
@@ -354,7 +370,14 @@ class Trainer:
             },
         )
         write_csv(self.folder / "curve.csv", self.epochs)
-        write_plot(self.folder / "curve.png", self.epochs, self.config.name)
+        # Drawing takes longer than an epoch on few scenes does.
+        if time.perf_counter() - self._drawn > _DRAWN_EVERY:
+            self._draw()
+
+    def _draw(self) -> None:
+        if self.folder is not None:
+            write_plot(self.folder / "curve.png", self.epochs, self.config.name)
+            self._drawn = time.perf_counter()
 
 
 def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:

@@ -10,6 +10,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -20,7 +21,10 @@ from app.scene import Scene, SceneObject
 from tests.http.conftest import launch
 from tests.http.stores import make_store
 from training.cli import app
+from training.config import load_config
 from training.evaluation.service import ServiceError, over_http
+from training.offsets import fit_offsets
+from training.pipeline import prepare
 
 ROOT = Path(__file__).parents[2]
 
@@ -69,6 +73,16 @@ def same_through_a_service(folder, *store: str) -> None:
     )
     assert {task for task, _ in ours} == {"T1a", "T1b", "T2", "T2-at", "T3", "T3b"}
     assert served == pytest.approx(ours, abs=1e-6)
+
+
+def same_offsets_as_training_alone_teaches(artifact, config) -> None:
+    """Scenes held out for testing have no part in them."""
+    parts = prepare(config, Path()).parts
+    scenes, V = parts["train"], len(artifact.vocabulary)
+    for name, tensor in fit_offsets(scenes, V).tensors().items():
+        assert np.array_equal(artifact.offsets.tensors()[name], tensor), name
+    leaking = fit_offsets([*scenes, *parts["test"]], V)
+    assert not np.array_equal(leaking.pair_scenes, artifact.offsets.pair_scenes)
 
 
 def pinned(name: str) -> set[str]:
@@ -121,8 +135,9 @@ def test_from_rooms_to_answers(tmp_path, variant):
     again = {(r["task"], r["source"], r["metric"]): r["value"] for r in tables["default"]}
     assert again == pytest.approx(card, abs=1e-6)
     assert {task.split()[0] for task, _, _ in card} == {
-        "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T4", "Calibration",
+        "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T4", "Calibration", "Offsets",
     }  # fmt: skip
+    same_offsets_as_training_alone_teaches(artifact, load_config(str(config)))
     same_through_a_service(tmp_path, *folders[2:])
     calibration = artifact.calibration
     assert calibration.outlier.slope < 0  # the likelier an object, the less an intruder
@@ -132,7 +147,7 @@ def test_from_rooms_to_answers(tmp_path, variant):
         tuple(SceneObject(name, name, artifact.vocabulary.index(name)) for name in things)
     )
     assert missing(artifact, scene)
-    assert relations(artifact, scene)
+    assert relations(artifact, scene)[0]
     assert len(outliers(artifact, scene)[0]) == 3
     assert len(generate(artifact, scene, seed=0, steps=5)) == 1
 

@@ -29,7 +29,7 @@ from training.benchmark.measure import (
 from training.benchmark.summary import summarise
 from training.benchmark.workers import fill
 from training.checkpoints import CheckpointError
-from training.config import Config, ConfigError, load_config, with_settings
+from training.config import Config, ConfigError, data_folder, load_config, with_settings
 from training.datasets import DatasetError
 from training.evaluation.report import SourceReport, pooled, settings_by_source
 from training.evaluation.tasks import Setting
@@ -51,9 +51,7 @@ def ablate(
     asked: Annotated[int, typer.Option(min=1, help="scenes a source where a task is slow")] = 300,
     epochs: Annotated[int | None, typer.Option(min=1, help="at most, for every row")] = None,
     workers: Annotated[int, typer.Option(min=1, help="processes, of one thread each")] = 2,
-    data: Annotated[Path, typer.Option("--data", help="folder with the scene files")] = Path(
-        "../shared/data"
-    ),
+    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="for runs and results")] = Path(
         "runs/ablation"
     ),
@@ -69,7 +67,9 @@ def ablate(
         configs = _configs(configuration, rows, row, limit, epochs)
         place = folder / configs[0].name
         with console.status("reading and encoding scenes"):
-            material = Material.of(prepare(configs[0], data))
+            material = Material.of(
+                prepare(configs[0], data_folder(configuration, configs[0], data))
+            )
         plan = Plan(place, material, _settings(material.data, asked), tasks=TASKS)
         entries = [
             machine_entry(with_settings(config, {"training.seed": seed}))

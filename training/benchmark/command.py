@@ -23,7 +23,7 @@ from training.benchmark.domains import default_configs, read_domains
 from training.benchmark.measure import DONE, KNOWN, BenchmarkError, Progress
 from training.benchmark.sections import SEED_PROTOCOL, SHUFFLED, assemble
 from training.checkpoints import CheckpointError
-from training.config import ConfigError
+from training.config import ConfigError, data_folder
 from training.datasets import DatasetError
 from training.evaluation.tasks import TASKS
 
@@ -44,9 +44,7 @@ def benchmark(
             "them compared with all other rows. By default the indoor and the everyday machines."
         ),
     ] = None,
-    data: Annotated[Path, typer.Option("--data", help="folder with the scene files")] = Path(
-        "../shared/data"
-    ),
+    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="for reports and results")] = Path(
         "runs/benchmark"
     ),
@@ -86,7 +84,9 @@ def benchmark(
         )
         if shuffled:
             options.shuffled_tasks()  # a request that cannot be met fails before hours of training
-        domains = read_domains(machines or default_configs())
+        machines = machines or default_configs()
+        domains = read_domains(machines)
+        root = data_folder(machines[0], domains[0].configs[0], data)
         for domain in domains:
             if shuffled or not seed_protocol:
                 require_groups(domain)
@@ -95,15 +95,15 @@ def benchmark(
             with _Shown() as shown:
                 # The seed protocol is all that may be asked of a random split.
                 if not domain.leaks:
-                    compare_domain(domain, data, place, options, shown.begin)
+                    compare_domain(domain, root, place, options, shown.begin)
                     assemble(place, domain.name)
                 if seed_protocol:
                     compare_by_seed_protocol(
-                        domain, data, place / SEED_PROTOCOL, options, shown.begin
+                        domain, root, place / SEED_PROTOCOL, options, shown.begin
                     )
                     assemble(place, domain.name)
                 if shuffled:
-                    compare_on_shuffled(domain, data, place / SHUFFLED, options, shown.begin)
+                    compare_on_shuffled(domain, root, place / SHUFFLED, options, shown.begin)
             text = assemble(place, domain.name)
             console.print(text, markup=False)
             console.print(f"every figure: {place / 'results.json'}; plots beside it")

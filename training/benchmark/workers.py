@@ -101,7 +101,7 @@ def _begin(material: bytes, messages: SimpleQueue[_Message]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
     # Written by the process that started this one, and passed on in memory: nobody else's bytes.
-    _plan = pickle.loads(material)  # nosec B301
+    _plan = pickle.loads(material)  # noqa: S301  # nosec B301
     _messages = messages
 
 

@@ -12,7 +12,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from training.config import Config, ConfigError, config_toml, load_config, with_settings
+from training.config import (
+    Config,
+    ConfigError,
+    config_toml,
+    data_folder,
+    load_config,
+    with_settings,
+)
 from training.datasets import DatasetError
 from training.pipeline import prepare
 from training.tuning.space import load_space, proposals, shipped_spaces
@@ -31,9 +38,7 @@ def tune(
     seed: Annotated[int, typer.Option(help="of the draws")] = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="for shorter cycles")] = None,
     prune: Annotated[bool, typer.Option(help="give up on trials below the median")] = True,
-    data: Annotated[Path, typer.Option("--data", help="folder with the scene files")] = Path(
-        "../shared/data"
-    ),
+    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="for trials and results")] = Path(
         "runs/tuning"
     ),
@@ -54,7 +59,7 @@ def tune(
         shortened = {"training.epochs": epochs} if epochs else {}
         config = with_settings(original, shortened)
         with console.status("reading and encoding scenes"):
-            scenes = prepare(config, data)
+            scenes = prepare(config, data_folder(configuration, config, data))
         study = Study(place, config, scenes.training_data(), scenes.digests, by)
         _search(study, [{}, *draws], prune)
     except (ConfigError, DatasetError, TuningError) as error:

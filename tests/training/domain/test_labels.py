@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+from tests.training.domain.scenes import scene
+from training.datasets.names import Names
+from training.domain.labels import count_labels, lookalikes
+
+NAMES = Names(base=("cup", "table"), aliases={"sofa": ("couch",)})
+
+
+def test_spellings_and_aliases_count_as_one_label() -> None:
+    scenes = [scene("a", "Lab Stool", "lab_stools", "couch"), scene("b", "lab stool", "sofa")]
+    found = {label.name: label for label in count_labels(scenes, NAMES)}
+    assert set(found) == {"lab stool", "sofa"}
+    stool = found["lab stool"]
+    assert (stool.mentions, stool.scenes) == (3, 2)
+    assert set(stool.spellings) == {"Lab Stool", "lab_stools", "lab stool"}
+    assert found["sofa"].mentions == 2
+
+
+def many(label: str, count: int, *others: str) -> list:
+    return [scene(f"{label} {k}", label, *others) for k in range(count)]
+
+
+def pairs(scenes):
+    return {
+        (pair.name, pair.like): pair
+        for pair in lookalikes(count_labels(scenes, NAMES), scenes, NAMES)
+    }
+
+
+def test_a_rare_slip_of_a_frequent_label_is_proposed_as_its_alias() -> None:
+    (pair,) = pairs(many("oscilloscope", 30) + many("osciloscope", 2)).values()
+    assert pair.merged
+    assert (pair.name, pair.like, pair.mentions) == ("osciloscope", "oscilloscope", (2, 30))
+
+
+def test_what_may_be_two_things_is_only_pointed_at() -> None:
+    both = many("pallet rack", 30) + many("pallet jack", 2) + many("pallet rack", 1, "pallet jack")
+    assert not pairs(both)["pallet jack", "pallet rack"].merged
+    frequent = pairs(many("hammers", 30) + many("hamper", 12))
+    assert [pair.merged for pair in frequent.values()] == [False]
+    short = pairs(many("blade", 30) + many("blaze", 1))
+    assert [pair.merged for pair in short.values()] == [False]
+
+
+def test_numbered_and_curated_names_are_no_lookalikes() -> None:
+    assert not pairs(many("conveyor 1", 20) + many("conveyor 2", 1))
+    curated = Names(base=("cushion", "pushion"))
+    scenes = many("cushion", 30) + many("pushion", 1)
+    assert not lookalikes(count_labels(scenes, curated), scenes, curated)
+
+
+def test_a_slip_is_merged_into_one_label_alone() -> None:
+    found = pairs(
+        many("soldering iron", 60) + many("soldering irom", 40) + many("soldering irok", 2)
+    )
+    merged = [pair for pair in found.values() if pair.merged]
+    assert len(merged) == 1
+    assert merged[0].name == "soldering irok"

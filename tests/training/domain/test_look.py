@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import pytest
+
+from tests.training.domain.scenes import scene
+from training.datasets import generate_rooms
+from training.datasets.names import Names
+from training.datasets.workplaces import WORKPLACES
+from training.domain.look import Facts, look
+
+NAMES = Names()
+
+
+def found(*scenes) -> dict[str, tuple[int, list[str]]]:
+    """Findings by how their sentence begins."""
+    facts = look(scenes, NAMES)
+    return {f.what.split(" (")[0]: (f.count, f.examples) for f in facts.findings}
+
+
+def finding(word: str, *scenes) -> tuple[int, list[str]]:
+    return next((value for what, value in found(*scenes).items() if word in what), (0, []))
+
+
+CUP_ON_TABLE = (0, "on-top", 1)
+
+
+def test_facts_are_counted() -> None:
+    facts = look(
+        [
+            scene("a", "cup", "table", relations=[CUP_ON_TABLE], room="Kitchen"),
+            scene("b", "cup", "table", "lamp", group="a", position=[(0.0, 0.0, 1.0)] * 3),
+        ],
+        NAMES,
+    )
+    assert isinstance(facts, Facts)
+    assert (facts.scenes, facts.groups, facts.objects) == (2, 1, 5)
+    assert facts.objects_per_scene == (2, 2.5, 3)
+    assert facts.rooms == {"kitchen": 1}
+    assert facts.shares["relations"] == facts.shares["positions"] == 0.5
+    assert facts.relations == {"on-top": 1}
+    assert facts.related
+
+
+def test_objects_alone_teach_no_relation() -> None:
+    assert not look([scene("a", "cup", "table"), scene("b", "lamp", "bed")], NAMES).related
+
+
+def test_both_sides_of_a_pair_contradict_each_other_in_either_wording() -> None:
+    count, examples = finding(
+        "both ways", scene("a", "cup", "pot", relations=[(0, "left", 1), (0, "right", 1)])
+    )
+    assert count == 1
+    assert "cup (0) and pot (1)" in examples[0]
+    agreed = scene("a", "cup", "pot", relations=[(0, "left", 1), (1, "right", 0)])
+    assert finding("both ways", agreed) == (0, [])
+
+
+def test_what_carries_its_own_carrier_is_found() -> None:
+    circle = [(0, "on-top", 1), (1, "on-top", 2), (2, "on-top", 0), (3, "on-top", 0)]
+    count, (example,) = finding("circle", scene("a", "cup", "tray", "box", "pen", relations=circle))
+    assert count == 1
+    assert "pen" not in example
+    assert finding("circle", scene("a", "cup", "tray", "box", relations=circle[:2])) == (0, [])
+    supports = scene("b", "cup", "tray", supported_by=["1", "0"])
+    assert finding("circle", supports)[0] == 1
+
+
+def test_on_top_of_what_is_above_it() -> None:
+    scenes = scene("a", "cup", "table", relations=[CUP_ON_TABLE, (1, "above", 0)])
+    assert finding("on top of", scenes)[0] == 1
+
+
+def test_copies_in_other_groups_are_found() -> None:
+    related = {"relations": [CUP_ON_TABLE]}
+    first, second = (scene(name, "cup", "table", **related) for name in "ab")
+    assert finding("different groups", first, second) == (1, ["a and b"])
+    framed = scene("c", "cup", "table", group="a", **related)
+    assert finding("different groups", first, framed) == (0, [])
+    # Two small rooms may hold the same things.
+    assert finding("different groups", scene("a", "cup", "bed"), scene("b", "cup", "bed"))[0] == 0
+
+
+def test_examples_are_few_and_all_are_counted() -> None:
+    count, examples = finding("fewer than two", *(scene(str(k), "cup") for k in range(40)))
+    assert count == 40
+    assert len(examples) == 5
+
+
+def test_generated_scenes_contradict_nothing() -> None:
+    facts = look(generate_rooms(60, 0, WORKPLACES), NAMES)
+    assert not facts.findings
+    assert facts.shares["viewer axes"] == 1.0
+
+
+def test_nothing_is_no_set_of_scenes() -> None:
+    with pytest.raises(ValueError, match="no scene"):
+        look([], NAMES)

@@ -1,0 +1,124 @@
+"""What a run shows of itself."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from training.config import Config
+from training.curves import Epoch
+from training.live import Display, sparkline, summarise
+from training.pipeline import prepare
+from training.trainer import Trainer
+
+ROOT = Path(__file__).parents[2]
+
+CONFIG = """
+name = "live"
+[data]
+sources = ["rooms"]
+vocabulary = "rooms"
+rooms = 60
+[machine]
+variant = "rbm"
+form = "local"
+H1 = 8
+H2 = 0
+[objective]
+name = "composite"
+[training]
+epochs = {epochs}
+batch_size = 16
+"""
+
+
+def small(epochs: int) -> Config:
+    import tomllib
+
+    return Config.model_validate(tomllib.loads(CONFIG.format(epochs=epochs)))
+
+
+def test_a_line_of_blocks_rises_with_its_values() -> None:
+    assert sparkline([0, 1, 2, 3, 4, 5, 6, 7]) == "▁▂▃▄▅▆▇█"
+    assert sparkline([5.0]) == sparkline([math.nan, 3.0]) == "▁"
+    assert sparkline([]) == sparkline([math.nan]) == ""
+    assert len(sparkline(range(1000), width=30)) <= 30
+    assert sparkline(list(range(100)), width=10) == sparkline(list(range(10)), width=10)
+
+
+def test_a_run_shows_its_scores_and_what_to_do_next(tmp_path) -> None:
+    config = small(4)
+    trainer = Trainer(config, prepare(config, tmp_path).training_data(), tmp_path)
+    console = Console(file=io.StringIO(), width=200, force_terminal=True)
+    with Display(trainer, console, tmp_path / "logs") as display:
+        result = trainer.run(display.progress, display.ended)
+    summarise(result, trainer, tmp_path, console)
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", console.file.getvalue())
+    assert "epoch 4/4" in shown
+    assert f"update {trainer.updates}" in shown
+    assert f"MRR {result.epochs[result.best_epoch].mrr_validation:.3f}" in shown
+    assert f"best epoch {result.best_epoch + 1} of 4" in shown
+    assert f"compare {tmp_path}" in shown
+    assert f"publish {tmp_path}" in shown
+
+    events = EventAccumulator(str(tmp_path / "logs" / "live" / "seed-0"))
+    events.Reload()
+    logged = events.Scalars("validation/MRR")
+    assert [point.step for point in logged] == [trainer.steps_per_epoch * k for k in (1, 2, 3, 4)]
+    assert [point.value for point in logged] == pytest.approx(
+        [epoch.mrr_validation for epoch in result.epochs], abs=1e-6
+    )
+
+
+def test_nobody_who_asks_for_no_logs_waits_for_tensorboard() -> None:
+    code = "import sys; import training.cli; assert 'torch.utils.tensorboard' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def epochs_of(curve: Path) -> int:
+    return len(curve.read_text().splitlines()) - 1 if curve.exists() else 0
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path) -> None:
+    config = tmp_path / "live.toml"
+    config.write_text(CONFIG.format(epochs=400))
+    command = [sys.executable, "-m", "training", "train", str(config), "--runs", str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    curve = tmp_path / "live" / "seed-0" / "curve.csv"
+    with (tmp_path / "log").open("w") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=tmp_path, env=environment)
+        try:
+            while epochs_of(curve) < 2:
+                assert process.poll() is None, (tmp_path / "log").read_text()
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=120) == 130
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+    text = " ".join((tmp_path / "log").read_text().split())
+    stopped = re.search(r"stopped after epoch (\d+); the same command goes on from there", text)
+    assert stopped is not None
+    # The curve may be an epoch ahead of the checkpoint, which is written after it.
+    assert 2 <= epochs_of(curve) <= int(stopped[1]) + 1
+
+    import tomllib
+
+    resumed = Config.model_validate(tomllib.loads(config.read_text()))
+    trainer = Trainer(resumed, prepare(resumed, tmp_path).training_data(), curve.parent)
+    assert trainer.resume()
+    assert len(trainer.epochs) == int(stopped[1])
+    assert all(isinstance(epoch, Epoch) for epoch in trainer.epochs)

@@ -1,0 +1,168 @@
+"""`python -m training init`: look at somebody's scenes, propose how to train on them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from rich.console import Console
+
+from training.config import ConfigError, is_file, shipped_configs, source_name
+from training.datasets import READERS, AnnotatedScene, DatasetError, vocabulary_json
+from training.datasets.jsonl import scan_jsonl, write_jsonl
+from training.datasets.readers import guess_format
+from training.domain.proposal import Proposal, propose
+from training.domain.report import as_dict, show
+
+# Bad lines that are shown; the rest are counted.
+BAD_LINES = 20
+
+console = Console()
+
+
+class BadLinesError(ValueError):
+    """Lines that are no scenes; holds all of them."""
+
+    def __init__(self, errors: list[DatasetError]) -> None:
+        super().__init__(f"{len(errors)} lines are no scenes")
+        self.errors = errors
+
+
+def init(
+    name: Annotated[str, typer.Argument(help="of the model: lower case, digits and hyphens")],
+    files: Annotated[list[Path], typer.Argument(help="scene files, of one domain")],
+    output: Annotated[
+        Path | None, typer.Option(help="folder for what is written; by default of the model's name")
+    ] = None,
+    format_: Annotated[
+        str | None,
+        typer.Option("--format", help=f"{', '.join(READERS)}; by default by the file's name"),
+    ] = None,
+    terms: Annotated[str, typer.Option(help="of use of the scenes, for the model card")] = "",
+    report: Annotated[Path | None, typer.Option("--json", help="write the report here")] = None,
+    force: Annotated[bool, typer.Option("--force", help="overwrite an earlier proposal")] = False,
+) -> None:
+    """Look at your scenes, and propose a vocabulary and a configuration to train with.
+
+    Writes <name>.toml and vocabulary.json into the folder. Both are meant to be read and edited;
+    neither is overwritten unless --force says so.
+    """
+    folder = Path(name) if output is None else output
+    try:
+        _check_name(name)
+        targets = [folder / f"{name}.toml", folder / "vocabulary.json"]
+        if not force and (there := [path for path in targets if path.exists()]):
+            raise ConfigError(
+                f"{' and '.join(map(str, there))} would be overwritten: give --force, or another "
+                "--output"
+            )
+        with console.status("reading scenes"):
+            found = {file: _read(file, format_) for file in files}
+        for file in files:
+            if not found[file]:
+                raise DatasetError(file, "", "there is no scene in it")
+        sources, copies = _sources(folder, found)
+        scenes = [scene for some in found.values() for scene in some]
+        with console.status("looking at them"):
+            proposal = propose(name, scenes, sources, terms=terms)
+            proposal.config  # noqa: B018  # what is written can be read back
+    except BadLinesError as error:
+        _fail_lines(error)
+    except (ConfigError, DatasetError, ValueError) as error:
+        _fail(error)
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, some in copies.items():
+        write_jsonl(some, path)
+    _write(targets[0], proposal.toml())
+    _write(targets[1], vocabulary_json(proposal.vocabulary))
+    if report is not None:
+        _write(report, json.dumps(as_dict(proposal), indent=1, ensure_ascii=False) + "\n")
+    show(proposal, console)
+    _next(proposal, folder, targets, copies)
+
+
+def _check_name(name: str) -> None:
+    if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
+        raise ConfigError(f"a model's name is lower case words joined by hyphens, not {name!r}")
+    if name in shipped_configs():
+        raise ConfigError(f"a configuration called {name} is shipped: take another name")
+
+
+def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
+    """The scenes of a file.
+
+    Raises:
+        BadLinesError: some lines are no scenes.
+        DatasetError: the file cannot be read.
+    """
+    if format_ is not None and format_ not in READERS:
+        raise ConfigError(f"unknown format {format_!r}: {', '.join(READERS)}")
+    if (format_ or guess_format(path)) != "jsonl":
+        return READERS[format_ or guess_format(path)](path)
+    scenes: list[AnnotatedScene] = []
+    errors: list[DatasetError] = []
+    for found in scan_jsonl(path):
+        if isinstance(found, DatasetError):
+            errors.append(found)
+        else:
+            scenes.append(found)
+    if errors:
+        raise BadLinesError(errors)
+    return scenes
+
+
+def _sources(
+    folder: Path, found: dict[Path, list[AnnotatedScene]]
+) -> tuple[list[str], dict[Path, list[AnnotatedScene]]]:
+    """The files as seen from the folder, and copies of those whose names tell no format."""
+    sources: list[str] = []
+    copies: dict[Path, list[AnnotatedScene]] = {}
+    for file, scenes in found.items():
+        try:
+            guess_format(file)
+            sources.append(Path(os.path.relpath(file, folder)).as_posix())
+        except DatasetError:
+            copy = f"{source_name(file.name) if is_file(file.name) else file.name}.jsonl"
+            sources.append(copy)
+            copies[folder / copy] = scenes
+    return sources, copies
+
+
+def _write(path: Path, text: str) -> None:
+    """The whole file or none of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".part")
+    draft.write_text(text, encoding="utf-8")
+    draft.replace(path)
+
+
+def _next(
+    proposal: Proposal, folder: Path, targets: list[Path], copies: dict[Path, list[AnnotatedScene]]
+) -> None:
+    written = ", ".join(map(str, [*targets, *copies]))
+    console.print(f"\nwritten: {written}", markup=False, soft_wrap=True)
+    console.print(
+        f"next: read them, then  python -m training train {folder}",
+        markup=False,
+        soft_wrap=True,
+    )
+    if folder.resolve().name != proposal.name:
+        console.print(f"      (the configuration is {targets[0]})", markup=False, soft_wrap=True)
+
+
+def _fail_lines(error: BadLinesError) -> NoReturn:
+    console.print(f"[red]error:[/red] {error}; nothing was written", soft_wrap=True)
+    for line in error.errors[:BAD_LINES]:
+        console.print(f"  {line.path.name}, {line.where}: {line.problem}", markup=False)
+    if (more := len(error.errors) - BAD_LINES) > 0:
+        console.print(f"  and {more} more")
+    raise typer.Exit(1)
+
+
+def _fail(error: Exception) -> NoReturn:
+    console.print(f"[red]error:[/red] {error}", soft_wrap=True)
+    raise typer.Exit(1) from None

@@ -1,0 +1,300 @@
+"""From what there is in the scenes to a vocabulary and a configuration, with the reasons.
+
+The rules interpolate between configurations that were searched for (docs/decisions/objective.md,
+docs/decisions/own-scenes.md); `training tune` is there for whoever wants better ones than a rule's.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from app.scene import Vocabulary, label_key
+from training.config import Config, ConfigError
+from training.datasets import (
+    FRACTIONS,
+    AnnotatedScene,
+    Names,
+    coverage,
+    curated_names,
+    source_vocabulary,
+    split,
+)
+from training.domain.labels import Label, Lookalike, count_labels, lookalikes
+from training.domain.look import Facts, look
+
+# Fewer mentions hardly train a class; so small data sets need smaller minima to be covered at all.
+MINIMA: Final = (8, 5, 3, 2)
+COVERED: Final = 0.97
+_TABLE: Final = (2, 3, 5, 8, 16, 30)
+# What a larger vocabulary costs is told in docs/scaling.md.
+_MOST_CLASSES: Final = 2000
+_SPLIT_SEEDS: Final = 50
+# Shares of the parts that are near enough to what was asked for.
+_TOLERANCE: Final = 0.2
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What `init` writes and says.
+
+    Attributes:
+        name: of the configuration and so of the model.
+        facts, labels, lookalikes: what was found.
+        minimum: mentions that a class needs; covered: share of the mentions for some minima, with
+            the number of classes.
+        vocabulary: with the lookalikes that were merged as aliases.
+        dropped: names without a class, with why.
+        values: the configuration, section by section; reasons: why, by "section.entry".
+        parts: scenes of each part under the proposed split.
+    """
+
+    name: str
+    facts: Facts
+    labels: tuple[Label, ...]
+    lookalikes: tuple[Lookalike, ...]
+    minimum: int
+    covered: dict[int, tuple[int, float]]
+    vocabulary: Vocabulary
+    dropped: tuple[tuple[str, int, str], ...]
+    values: dict[str, Any]
+    reasons: dict[str, str]
+    parts: dict[str, int]
+
+    @property
+    def config(self) -> Config:
+        """The configuration as it is read back."""
+        return Config.model_validate(self.values)
+
+    def toml(self) -> str:
+        """The configuration with the reason of each entry above it."""
+        lines = [
+            f"# Proposed by `python -m training init {self.name}`; every entry may be changed.",
+            "# python -m training tune searches better ones on the validation scenes.",
+            "",
+        ]
+        lines += [_entry(name, self.values[name]) for name in ("name", "description")]
+        for section, entries in self.values.items():
+            if isinstance(entries, Mapping):
+                lines += ["", f"[{section}]"]
+                for name, value in entries.items():
+                    if reason := self.reasons.get(f"{section}.{name}"):
+                        lines.append(f"# {reason}")
+                    lines.append(_entry(name, value))
+        return "\n".join(lines) + "\n"
+
+
+def _entry(name: str, value: Any) -> str:
+    # Of the values that a configuration holds, JSON writes all as TOML does.
+    return f"{name} = {json.dumps(value, ensure_ascii=False)}"
+
+
+def propose(
+    name: str,
+    scenes: Sequence[AnnotatedScene],
+    sources: Sequence[str],
+    *,
+    vocabulary_file: str = "vocabulary.json",
+    terms: str = "",
+) -> Proposal:
+    """Look at the scenes and choose.
+
+    Args:
+        sources: files as the configuration is to name them.
+
+    Raises:
+        ConfigError: there are too few scenes to learn from and to test on.
+        ValueError: no scene, or none that mentions anything.
+    """
+    names = curated_names()
+    facts = look(scenes, names)
+    labels = count_labels(scenes, names)
+    pairs = lookalikes(labels, scenes, names)
+    minimum, covered = _minimum(scenes, pairs)
+    vocabulary = _vocabulary(scenes, pairs, minimum)
+    seed, parts = _split(scenes)
+    values, reasons = _configuration(facts, parts)
+    reasons["data.vocabulary"] = (
+        f"{len(vocabulary)} classes of at least {minimum} mentions; edit the file to change them"
+    )
+    data: dict[str, Any] = {
+        "sources": list(sources),
+        "vocabulary": vocabulary_file,
+        "split": "stable",
+        "split_seed": seed,
+    }
+    if terms:
+        data["terms"] = terms
+    reasons["data.split"] = (
+        "a group's part follows from its name: scenes may be added, and versions stay comparable"
+    )
+    reasons["data.split_seed"] = (
+        f"{parts['train']} scenes to train, {parts['validation']} to validate, "
+        f"{parts['test']} to test"
+    )
+    values = {
+        "name": name,
+        "description": f"{values['machine']['variant'].capitalize()} machine over {name} scenes.",
+        "data": data,
+    } | values
+    return Proposal(
+        name=name,
+        facts=facts,
+        labels=tuple(labels),
+        lookalikes=tuple(pairs),
+        minimum=minimum,
+        covered=covered,
+        vocabulary=vocabulary,
+        dropped=tuple(_dropped(labels, vocabulary, names, minimum)),
+        values=values,
+        reasons=reasons,
+        parts=parts,
+    )
+
+
+def _minimum(
+    scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
+) -> tuple[int, dict[int, tuple[int, float]]]:
+    """The largest of the minima whose vocabulary covers the scenes, and what each would cover."""
+    covered: dict[int, tuple[int, float]] = {}
+    for minimum in sorted({*_TABLE, *MINIMA}):
+        try:
+            found = _vocabulary(scenes, pairs, minimum)
+        except ValueError:
+            continue  # nothing is mentioned so often
+        covered[minimum] = (len(found), coverage(found, scenes))
+    if not covered:
+        raise ConfigError("no label is mentioned twice: there is nothing to learn from")
+    enough = [
+        minimum for minimum in covered if covered[minimum][1] >= COVERED and minimum <= MINIMA[0]
+    ]
+    small = [minimum for minimum in covered if covered[minimum][0] <= _MOST_CLASSES]
+    chosen = max(enough, default=min(covered))
+    return max(chosen, min(small, default=chosen)), covered
+
+
+def _vocabulary(
+    scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike], minimum: int
+) -> Vocabulary:
+    merged = {label_key(pair.name): pair.like for pair in pairs if pair.merged}
+    vocabulary = source_vocabulary([_renamed(scene, merged) for scene in scenes], minimum=minimum)
+    also = {label_key(pair.like): pair.name for pair in pairs if pair.merged}
+    objects = [
+        replace(entry, aliases=(*entry.aliases, also[key]))
+        if (key := label_key(entry.label)) in also and vocabulary.index(also[key]) is None
+        else entry
+        for entry in vocabulary.objects
+    ]
+    return Vocabulary(objects, vocabulary.room_types)
+
+
+def _renamed(scene: AnnotatedScene, merged: Mapping[str, str]) -> AnnotatedScene:
+    if not merged:
+        return scene
+    objects = tuple(
+        replace(thing, label=merged.get(label_key(thing.label), thing.label))
+        for thing in scene.objects
+    )
+    return replace(scene, objects=objects)
+
+
+def _dropped(
+    labels: Sequence[Label], vocabulary: Vocabulary, names: Names, minimum: int
+) -> list[tuple[str, int, str]]:
+    refused = {label_key(name) for name in names.not_objects}
+    return [
+        (
+            label.name,
+            label.mentions,
+            "names no thing" if label_key(label.name) in refused else f"under {minimum} mentions",
+        )
+        for label in labels
+        if vocabulary.index(label.name) is None
+    ]
+
+
+def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int]]:
+    """The first seed whose parts are near their shares, or the nearest of some."""
+    best: tuple[float, int, dict[str, int]] | None = None
+    for seed in range(_SPLIT_SEEDS):
+        found = split(scenes, seed=seed, protocol="stable")
+        parts: dict[str, int] = {part: len(some) for part, some in found.items()}
+        shares = FRACTIONS["stable"]
+        off = max(abs(parts[p] / (share * len(scenes)) - 1) for p, share in shares.items())
+        if min(_telling(some) for some in found.values()) and (best is None or off < best[0]):
+            best = (off, seed, parts)
+        if best is not None and best[0] <= _TOLERANCE:
+            break
+    if best is None:
+        raise ConfigError(
+            f"{len(scenes)} scenes of {len({scene.group for scene in scenes})} groups cannot be "
+            "split: every part needs scenes of three different things; take more scenes, or "
+            "smaller groups"
+        )
+    return best[1], best[2]
+
+
+def _telling(scenes: Sequence[AnnotatedScene]) -> int:
+    return sum(len({label_key(thing.label) for thing in scene.objects}) >= 3 for scene in scenes)
+
+
+def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, Any], dict[str, str]]:
+    n = parts["train"]
+    related = facts.related
+    H1 = _between(n, (200, 50), (2000, 200))
+    batch = 32 if n < 1500 else 64
+    updates = _between(n, (200, 600), (2500, 1800))
+    epochs = max(15, math.ceil(updates / math.ceil(n / batch)))
+    machine: dict[str, Any] = {"variant": "triway" if related else "rbm", "form": "local"}
+    machine |= {"H1": H1, "H2": 0, "initial_c1": -1.0, "N": 128 if n < 1500 else 512}
+    if related:
+        machine |= {"K": 16 if n < 1500 else 32, "G": 8, "min_triple_count": 2}
+    else:
+        machine |= {"K": 0}
+    objective: dict[str, Any] = {
+        "name": "composite",
+        "presence_weight": 0.4,
+        "generative_weight": 0.05,
+        "k": 3,
+        "chains": 64 if n < 1500 else 128,
+        "object_dropout": 0.15,
+    }
+    if related:
+        objective |= {"count_dropout": 0.3, "unlisted": "off"}
+    training: dict[str, Any] = {
+        "optimiser": "adamw",
+        "learning_rate": 0.01,
+        "epochs": epochs,
+        "batch_size": batch,
+        "weight_decay": 0.06 if n < 3500 else 0.03,
+        "relation_rate": 0.1,
+        "relation_decay": 1.0,
+        "averaging": 0.99 if n < 1500 else 0.998,
+    }
+    reasons = {
+        "machine.variant": "relations are there to be learnt"
+        if related
+        else "no relation and no position is annotated: objects alone are learnt",
+        "machine.H1": f"hidden units: {n} training scenes would be learnt by heart with many more",
+        "training.epochs": f"{updates} updates or a few more, {math.ceil(n / batch)} an epoch",
+        "training.weight_decay": "few scenes need more decay",
+        "objective.unlisted": "a relation that nobody listed counts as off: what /relations "
+        "promises is what would be listed",
+    }
+    values = {
+        "machine": machine,
+        "objective": objective,
+        "training": training,
+        "polish": {"updates": 100 if n < 1500 else 300},
+    }
+    return values, reasons
+
+
+def _between(n: int, low: tuple[int, int], high: tuple[int, int]) -> int:
+    """Linear in the logarithm of the scenes between two points, and flat beyond them."""
+    (n0, x0), (n1, x1) = low, high
+    share = math.log(max(n, 1) / n0) / math.log(n1 / n0)
+    return round((x0 + min(max(share, 0.0), 1.0) * (x1 - x0)) / 10) * 10

@@ -1,0 +1,127 @@
+"""What `init` found and proposes, in tables for people and as one JSON value for programs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from training.domain.proposal import Proposal
+
+# Rows of a table; the JSON report has all of them.
+ROWS = 12
+
+
+def as_dict(proposal: Proposal) -> dict[str, Any]:
+    """Everything that was found and proposed, JSON-able."""
+    return {
+        "name": proposal.name,
+        "facts": asdict(proposal.facts),
+        "labels": [asdict(label) for label in proposal.labels],
+        "lookalikes": [asdict(pair) for pair in proposal.lookalikes],
+        "minimum": proposal.minimum,
+        "covered": {
+            str(minimum): {"classes": classes, "share": share}
+            for minimum, (classes, share) in proposal.covered.items()
+        },
+        "vocabulary": proposal.vocabulary.to_dict(),
+        "dropped": [
+            {"label": label, "mentions": mentions, "why": why}
+            for label, mentions, why in proposal.dropped
+        ],
+        "configuration": proposal.values,
+        "reasons": proposal.reasons,
+        "parts": proposal.parts,
+    }
+
+
+def show(proposal: Proposal, console: Console) -> None:
+    """Print the report."""
+    _facts(proposal, console)
+    _labels(proposal, console)
+    _lookalikes(proposal, console)
+    _coverage(proposal, console)
+    _findings(proposal, console)
+    _choices(proposal, console)
+
+
+def _facts(proposal: Proposal, console: Console) -> None:
+    facts = proposal.facts
+    least, mean, most = facts.objects_per_scene
+    table = Table("what", "how much", title=f"Scenes for {proposal.name}", title_justify="left")
+    table.add_row("scenes", f"{facts.scenes} in {facts.groups} groups")
+    table.add_row("objects", f"{facts.objects}: {least} to {most} a scene, {mean:.1f} on average")
+    rooms = ", ".join(f"{room} {count}" for room, count in list(facts.rooms.items())[:ROWS])
+    table.add_row("room types", rooms or "none")
+    for name, share in facts.shares.items():
+        table.add_row(f"with {name}", f"{share:.0%}")
+    if facts.relations:
+        triples = ", ".join(f"{name} {count}" for name, count in facts.relations.items())
+        table.add_row("annotated relations", triples)
+    console.print(table)
+
+
+def _labels(proposal: Proposal, console: Console) -> None:
+    labels = proposal.labels
+    title = f"Labels: {len(labels)}, the most frequent of them"
+    table = Table("label", "mentions", "scenes", "spelt", title=title, title_justify="left")
+    for label in labels[:ROWS]:
+        spellings = ", ".join(label.spellings[:4])
+        table.add_row(label.name, str(label.mentions), str(label.scenes), spellings)
+    console.print(table)
+    varied = [label for label in labels if len(label.spellings) > 1]
+    if varied:
+        console.print(f"{len(varied)} labels are spelt in several ways and count as one each:")
+        for label in varied[:ROWS]:
+            console.print(f"  {' = '.join(label.spellings[:6])}", markup=False)
+
+
+def _lookalikes(proposal: Proposal, console: Console) -> None:
+    if not proposal.lookalikes:
+        return
+    table = Table("label", "like", "mentions", "proposal", "why", title_justify="left")
+    table.title = "Labels that look alike"
+    ordered = sorted(proposal.lookalikes, key=lambda pair: not pair.merged)
+    for pair in ordered[:ROWS]:
+        a, b = pair.mentions
+        done = "alias" if pair.merged else "two things: check"
+        table.add_row(pair.name, pair.like, f"{a}, {b}", done, pair.why)
+    console.print(table)
+    if (more := len(ordered) - ROWS) > 0:
+        console.print(f"and {more} more in the JSON report")
+
+
+def _coverage(proposal: Proposal, console: Console) -> None:
+    title = "Vocabulary: mentions that a class needs, and what is covered then"
+    table = Table("mentions", "classes", "covered", "", title=title, title_justify="left")
+    for minimum, (classes, share) in proposal.covered.items():
+        chosen = "chosen" if minimum == proposal.minimum else ""
+        table.add_row(str(minimum), str(classes), f"{share:.1%}", chosen)
+    console.print(table)
+    if proposal.dropped:
+        shown = ", ".join(f"{label} ({why})" for label, _, why in proposal.dropped[:ROWS])
+        console.print(f"without a class, {len(proposal.dropped)}: {shown}", markup=False)
+
+
+def _findings(proposal: Proposal, console: Console) -> None:
+    if not proposal.facts.findings:
+        console.print("nothing contradicts itself")
+        return
+    console.print("To look at:")
+    for finding in proposal.facts.findings:
+        console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
+        console.print(f"    {finding.advice}")
+        for example in finding.examples:
+            console.print(f"    - {example}", markup=False)
+
+
+def _choices(proposal: Proposal, console: Console) -> None:
+    title = "Configuration"
+    table = Table("entry", "value", "why", title=title, title_justify="left")
+    for name, reason in proposal.reasons.items():
+        section, _, entry = name.partition(".")
+        if entry in proposal.values[section]:
+            table.add_row(name, str(proposal.values[section][entry]), reason)
+    console.print(table)

@@ -1,0 +1,172 @@
+"""What a training run shows: its progress as it goes, its curve when it ends, and TensorBoard."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from training.config import Config
+from training.curves import Epoch
+
+if TYPE_CHECKING:
+    from training.trainer import Trainer, TrainingResult
+
+_LEVELS = "▁▂▃▄▅▆▇█"
+_WIDTH = 21
+# Figures of the summary: title, and attribute of an epoch.
+_CURVES = (
+    ("objective", "loss"),
+    ("missing objects, MRR", "mrr_validation"),
+    ("relations, R-precision", "r_precision_validation"),
+)
+
+
+class Display:
+    """A bar over the epochs, with updates, objective, validation scores and the time left.
+
+    Args:
+        logs: a folder for TensorBoard, None for none.
+    """
+
+    def __init__(self, trainer: Trainer, console: Console, logs: Path | None = None) -> None:
+        self._trainer = trainer
+        self._bar = Progress(
+            "[progress.description]{task.description}",
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            "/",
+            TimeRemainingColumn(),
+            console=console,
+        )
+        self._task = self._bar.add_task(
+            trainer.config.name,
+            total=trainer.config.training.epochs,
+            completed=len(trainer.epochs),
+            note="",
+        )
+        self._log = None if logs is None else tensorboard(logs, trainer.config)
+
+    def __enter__(self) -> Display:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def progress(self, epoch: int, done: float, loss: float) -> None:
+        """After an update."""
+        trainer = self._trainer
+        total = trainer.config.training.epochs
+        note = f"epoch {epoch + 1}/{total}, update {trainer.updates:,}, objective {loss:.3f}"
+        if trainer.epochs:
+            note += f", {scores(trainer.epochs[-1])}"
+        self._bar.update(self._task, completed=epoch + done, note=note)
+
+    def ended(self, epoch: Epoch) -> None:
+        """After an epoch."""
+        if self._log is not None:
+            self._log(epoch, self._trainer.updates)
+
+
+def scores(epoch: Epoch) -> str:
+    """The validation scores that there are."""
+    found = f"MRR {epoch.mrr_validation:.3f}"
+    if not math.isnan(epoch.r_precision_validation):
+        found += f", R-precision {epoch.r_precision_validation:.3f}"
+    return found
+
+
+def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
+    """Writes every epoch, at its number of updates, where TensorBoard reads it."""
+    # Late, for it takes longer to import than a small run to train.
+    from torch.utils.tensorboard import SummaryWriter
+
+    writer = SummaryWriter(str(folder / config.name / f"seed-{config.training.seed}"))
+    names = {
+        "objective/train": "loss",
+        "validation/MRR": "mrr_validation",
+        "validation/R-precision": "r_precision_validation",
+        "error of objects/train": "object_error_train",
+        "error of objects/validation": "object_error_validation",
+        "error of relations/train": "relation_error_train",
+        "error of relations/validation": "relation_error_validation",
+        "seconds": "seconds",
+    }
+
+    def log(epoch: Epoch, updates: int) -> None:
+        for name, attribute in names.items():
+            if not math.isnan(value := getattr(epoch, attribute)):
+                writer.add_scalar(name, value, updates)
+        # An interrupted run has its curve.
+        writer.flush()
+
+    return log
+
+
+def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
+    """The values as a line of blocks from the lowest to the highest, means where there are many."""
+    known = [value for value in values if math.isfinite(value)]
+    if not known:
+        return ""
+    size = max(1, math.ceil(len(known) / width))
+    means = [
+        sum(part) / len(part)
+        for part in (known[start : start + size] for start in range(0, len(known), size))
+    ]
+    low, high = min(means), max(means)
+    step = (high - low) / (len(_LEVELS) - 1)
+    return "".join(_LEVELS[round((value - low) / step) if step else 0] for value in means)
+
+
+def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: Console) -> None:
+    """Print the curve, the best epoch, how long it took, and what to do next."""
+    best = result.epochs[result.best_epoch]
+    table = Table("curve", "", "first", "best epoch", "last", title_justify="left")
+    table.title = f"{trainer.config.name}, seed {trainer.config.training.seed}"
+    for title, name in _CURVES:
+        values = [getattr(epoch, name) for epoch in result.epochs]
+        if math.isnan(values[-1]):
+            continue
+        ends = (values[0], values[result.best_epoch], values[-1])
+        table.add_row(title, sparkline(values), *(f"{value:.3f}" for value in ends))
+    console.print(table)
+    updates = (result.best_epoch + 1) * trainer.steps_per_epoch
+    console.print(
+        f"best epoch {result.best_epoch + 1} of {len(result.epochs)} (update {updates:,}) in "
+        f"{result.seconds:.0f} s: {scores(best)}; curve in {folder / 'curve.png'}",
+        soft_wrap=True,
+    )
+    if advice := _advice(result):
+        console.print(advice, soft_wrap=True)
+    console.print(
+        f"next: python -m training compare {folder}\n"
+        f"      python -m training publish {folder} 1.0.0 --promote",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _advice(result: TrainingResult) -> str:
+    """What the shape of the curve says."""
+    total, best = len(result.epochs), result.best_epoch + 1
+    if total >= 10 and best == total:
+        return "the last epoch was the best: more epochs may help (training.epochs)"
+    if total >= 10 and best <= total // 2:
+        return (
+            "the best epoch came early, what followed was learnt by heart: fewer epochs, fewer "
+            "hidden units (machine.H1) or more decay (training.weight_decay) may help"
+        )
+    return ""
