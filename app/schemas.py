@@ -252,12 +252,9 @@ def _examples(*examples: dict[str, Any]) -> ConfigDict:
     return ConfigDict(json_schema_extra={"examples": list(examples)})
 
 
-class RelationsRequest(SceneRequest):
-    """How do these objects stand to each other?"""
+class RelationsOptions(Request):
+    """What `/relations` is asked beside the scene."""
 
-    model_config = _examples(_BEDROOM | {"top_k": 5}, _POSES)
-
-    objects: Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
     top_k: Annotated[int, Field(ge=1, le=4096, description="how many relations at most")] = 20
     min_probability: Annotated[
         float, Field(ge=0, le=1, allow_inf_nan=False, description="leave out what is less likely")
@@ -271,15 +268,17 @@ class RelationsRequest(SceneRequest):
     ] = False
 
 
-class MissingRequest(SceneRequest):
-    """What else should be here, and where?"""
+class RelationsRequest(RelationsOptions, SceneRequest):
+    """How do these objects stand to each other?"""
 
-    model_config = _examples(
-        _BEDROOM | {"top_k": 3},
-        {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
-    )
+    model_config = _examples(_BEDROOM | {"top_k": 5}, _POSES)
 
     objects: Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
+
+
+class MissingOptions(Request):
+    """What `/missing` is asked beside the scene."""
+
     top_k: Annotated[
         int, Field(ge=1, description="how many objects at most; not above the vocabulary")
     ] = 10
@@ -290,12 +289,20 @@ class MissingRequest(SceneRequest):
     at: Annotated[Anchor | None, Field(description="what is missing at this place?")] = None
 
 
-class OutliersRequest(SceneRequest):
-    """What does not belong here, or stands in the wrong place?"""
+class MissingRequest(MissingOptions, SceneRequest):
+    """What else should be here, and where?"""
 
-    model_config = _examples({**_BEDROOM, "objects": [*_BEDROOM["objects"], "toilet"]})
+    model_config = _examples(
+        _BEDROOM | {"top_k": 3},
+        {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
+    )
 
     objects: Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
+
+
+class OutliersOptions(Request):
+    """What `/outliers` is asked beside the scene."""
+
     threshold: Annotated[
         float | None,
         Field(
@@ -306,6 +313,14 @@ class OutliersRequest(SceneRequest):
             "own, which raises an alarm in at most 5 % of untouched scenes",
         ),
     ] = None
+
+
+class OutliersRequest(OutliersOptions, SceneRequest):
+    """What does not belong here, or stands in the wrong place?"""
+
+    model_config = _examples({**_BEDROOM, "objects": [*_BEDROOM["objects"], "toilet"]})
+
+    objects: Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
 
 
 class GenerateRequest(SceneRequest):
@@ -401,10 +416,61 @@ class ScoredRelation(Reply):
     probability: Probability
 
 
+@dataclass(slots=True)
+class Disagreement:
+    """Two objects (by id) that stand otherwise than the rest of the scene makes one expect.
+
+    `observed`: relations of `subject` to `object` that were stated or derived. `expected`: the
+    likeliest relation without all that is known of how the two stand, with its `probability`;
+    `observed_probability`: of the likeliest observed one.
+    """
+
+    # No model either: half of the observed relations may be in it.
+    subject: str
+    object: str
+    observed: list[RelationName]
+    expected: RelationName
+    probability: Probability
+    observed_probability: Probability
+
+
 class RelationsAnswer(Answer):
     """Relations, best first. `probability`: an annotator would list this relation for this pair."""
 
     relations: list[ScoredRelation]
+    disagreements: Annotated[
+        list[Disagreement],
+        Field(
+            description="where another relation than what was stated or observed is expected: "
+            "from the rest of the scene alone it has a probability of at least one half; largest "
+            "ratio of the probabilities first, at most `top_k`"
+        ),
+    ]
+
+
+# No models: an answer holds thirty of them, and a model takes ten times as long.
+@dataclass(slots=True)
+class Vector:
+    """Metres along the axes of ``frame_id``."""
+
+    x: float
+    y: float
+    z: float
+
+
+@dataclass(slots=True)
+class Offset:
+    """From the centre of a placement's object to that of the missing one: add it to a position.
+
+    Along the axes of `frame_id`; where the request names none, away from the viewer, to the left
+    and up. `std`: a robot that looks within 1.8 of them in the plane, or 2.15 in space, finds four
+    of five. `scenes`: training scenes that showed the two classes so; 0: the offset is what is
+    usual for the relation and for either class.
+    """
+
+    mean: Vector
+    std: Vector
+    scenes: int
 
 
 class Placement(Reply):
@@ -413,6 +479,22 @@ class Placement(Reply):
     relation: RelationName
     object: str
     probability: Probability
+    offset: Annotated[
+        Offset | None,
+        Field(
+            description="how far from it, in metres; absent where training saw no poses, and for "
+            "left, right, front and behind in a map, odom or world frame without a viewpoint"
+        ),
+    ] = None
+
+
+@dataclass(slots=True)
+class Because:
+    """How much the presence of one object (by id) changes the log-odds of another."""
+
+    # No model here either: an answer holds some thirty.
+    object: str
+    log_odds_change: Finite
 
 
 class MissingObject(Reply):
@@ -426,19 +508,19 @@ class MissingObject(Reply):
     probability: Probability
     log_odds: Finite
     placements: list[Placement]
+    because: Annotated[
+        list[Because],
+        Field(
+            description="objects that change its log-odds most, strongest first, at most 3; the "
+            "first 32 entries have them"
+        ),
+    ]
 
 
 class MissingAnswer(Answer):
     """Absent classes, likeliest first; over all of them the probabilities sum to 1."""
 
     missing: list[MissingObject]
-
-
-class Because(Reply):
-    """How much the presence of one object (by id) changes the log-odds of another."""
-
-    object: str
-    log_odds_change: Finite
 
 
 class Outlier(Reply):
@@ -614,6 +696,10 @@ class VocabularyEntry(Reply):
     label: str
     aliases: list[str]
     structure: bool
+    size: Annotated[
+        Size | None,
+        Field(description="typical extents in metres, taken where a detection brings none"),
+    ] = None
 
 
 class VocabularyAnswer(Reply):
@@ -632,11 +718,28 @@ class WeightedLabel(Reply):
     weight: Finite
 
 
+class WeightedRelation(Reply):
+    """A relation between two classes and its weight to a hidden unit."""
+
+    subject: str
+    relation: RelationName
+    object: str
+    weight: Finite
+
+
 class ContextUnit(Reply):
-    """A hidden unit by the objects and room types it goes with, strongest first."""
+    """A hidden unit by the objects, relations and room types it goes with, strongest first."""
 
     unit: int
+    name: Annotated[str, Field(description="its first objects and relation, for people to read")]
     objects: list[WeightedLabel]
+    relations: Annotated[
+        list[WeightedRelation],
+        Field(
+            description="of those that the model saw in training; their weights are beyond the "
+            "mean over the layer"
+        ),
+    ]
     room_types: list[WeightedLabel]
 
 

@@ -118,6 +118,27 @@ class Settings(BaseSettings):
         int,
         Field(ge=1, le=600_000, description="of requests that send no X-Request-Timeout-Ms"),
     ] = 10_000
+    max_streams: Annotated[
+        int, Field(ge=0, le=4096, description="most streams a process has at once")
+    ] = 64
+    stream_idle: Annotated[
+        float,
+        Field(
+            ge=1,
+            le=86_400,
+            allow_inf_nan=False,
+            description="seconds a stream may be silent",
+        ),
+    ] = 300
+    stream_resume: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=3600,
+            allow_inf_nan=False,
+            description="seconds for which a session without a connection can be resumed",
+        ),
+    ] = 60
     drain_seconds: Annotated[
         float,
         Field(ge=0, le=300, description="from SIGTERM until the listening socket is closed"),
@@ -142,7 +163,7 @@ class Settings(BaseSettings):
     opentelemetry: Annotated[
         bool, Field(description="send traces to where OTEL_EXPORTER_OTLP_ENDPOINT says")
     ] = False
-    docs: Annotated[bool, Field(description="serve /docs and /redoc")] = True
+    docs: Annotated[bool, Field(description="serve the visual page, /docs and /redoc")] = True
     root_path: Annotated[
         str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")
     ] = ""

@@ -17,9 +17,11 @@ from app.api import (
     pages,
     problems,
     questions,
+    stream,
     telemetry,
 )
 from app.serving.runtime import Runtime
+from app.serving.stream import Streams
 from app.settings import Settings
 
 
@@ -46,6 +48,7 @@ def build(
     )
     app.state.settings = settings
     app.state.runtime = runtime
+    app.state.streams = Streams(settings.max_streams, settings.stream_resume, runtime.metrics)
     problems.install(app)
     middleware.install(
         app,
@@ -57,6 +60,7 @@ def build(
     for router in (
         questions.router,
         batches.router,
+        stream.router,
         # Before what it shares addresses with: the first that fits an address names its methods.
         models.administration,
         models.router,

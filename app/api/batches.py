@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Annotated, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
-from fastapi import APIRouter, Body
+from fastapi import APIRouter
 from pydantic import ValidationError
 
-from app.api import catalogue, examples
+from app.api import catalogue
 from app.api.body import JSONRoute
 from app.api.dependencies import SessionDep
 from app.api.openapi import queued
@@ -96,8 +96,7 @@ def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
     response_model_exclude_none=True,
 )
 async def relations_batch(
-    request: Annotated[BatchRequest[RelationsRequest], Body(examples=[examples.BATCH])],
-    session: SessionDep,
+    request: BatchRequest[RelationsRequest], session: SessionDep
 ) -> BatchAnswer[RelationsAnswer]:
     """As `POST /relations`, for up to 256 scenes."""
     return await _answer_each(session, request, RelationsRequest, questions.relations)
@@ -109,8 +108,7 @@ async def relations_batch(
     response_model_exclude_none=True,
 )
 async def missing_batch(
-    request: Annotated[BatchRequest[MissingRequest], Body(examples=[examples.BATCH])],
-    session: SessionDep,
+    request: BatchRequest[MissingRequest], session: SessionDep
 ) -> BatchAnswer[MissingAnswer]:
     """As `POST /missing`, for up to 256 scenes."""
     return await _answer_each(session, request, MissingRequest, questions.missing)
@@ -122,8 +120,7 @@ async def missing_batch(
     response_model_exclude_none=True,
 )
 async def outliers_batch(
-    request: Annotated[BatchRequest[OutliersRequest], Body(examples=[examples.BATCH])],
-    session: SessionDep,
+    request: BatchRequest[OutliersRequest], session: SessionDep
 ) -> BatchAnswer[OutliersAnswer]:
     """As `POST /outliers`, for up to 256 scenes."""
     return await _answer_each(session, request, OutliersRequest, questions.outliers)

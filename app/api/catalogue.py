@@ -203,6 +203,34 @@ INTERNAL_ERROR: Final = ProblemType(
     "This is a defect of the service. Its log has the details under the request id.",
 )
 
+UPGRADE_REQUIRED: Final = ProblemType(
+    "upgrade-required",
+    426,
+    "This address is for WebSockets",
+    "GET /stream opens a WebSocket of version 13, whose handshake is the first request of its "
+    "connection, or comes after the answers to all before. docs/stream.md says how it goes on.",
+)
+TOO_MANY_STREAMS: Final = ProblemType(
+    "too-many-streams",
+    503,
+    "Too many streams are open",
+    "The process has as many streams as SCENE_MAX_STREAMS allows. Retry-After says when to ask "
+    "again; POST answers meanwhile.",
+)
+STREAM_IDLE: Final = ProblemType(
+    "stream-idle",
+    408,
+    "The stream was silent for too long",
+    "A stream is opened by a message within SCENE_CLIENT_TIMEOUT seconds, and then has another at "
+    "least every SCENE_STREAM_IDLE seconds; a ping will do. The session can be resumed.",
+)
+SESSION_RESUMED: Final = ProblemType(
+    "session-resumed",
+    409,
+    "The session goes on in another stream",
+    "Somebody who knows its id has resumed it. If it was not you, open a session of your own.",
+)
+
 PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
     kind.slug: kind
     for kind in (
@@ -231,5 +259,9 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         DRAINING,
         QUEUE_FULL,
         DEADLINE_PASSED,
+        UPGRADE_REQUIRED,
+        TOO_MANY_STREAMS,
+        STREAM_IDLE,
+        SESSION_RESUMED,
     )
 }

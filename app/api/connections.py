@@ -26,6 +26,9 @@ from app.api.problems import MEDIA_TYPE, ProblemError
 MAX_HEAD: Final = 64 * 1024
 """Bytes of a request line with its headers, or of what follows a chunked body."""
 
+STREAM: Final = b"/stream"
+"""Where WebSockets are; who asks for one elsewhere is answered in HTTP."""
+
 MAX_PIPELINED: Final = 64
 """Requests of one connection that may wait for the answer to an earlier one."""
 
@@ -58,6 +61,7 @@ class GuardedProtocol(HttpToolsProtocol):
         # Bytes since the parser last told of a whole head or of a part of a body.
         self._untold = 0
         self._in_head = False
+        self._switches = False
         self._running: RequestResponseCycle | None = None
         self._refusal: ProblemType | None = None
 
@@ -148,6 +152,8 @@ class GuardedProtocol(HttpToolsProtocol):
         if len(self.pipeline) >= MAX_PIPELINED or self._has_lost_body():
             self._refuse(catalogue.BAD_REQUEST)
             raise _RefusedError
+        # Asked again and again from here on, and must not change with what is answered.
+        self._switches = self._may_switch()
         super().on_headers_complete()
         self._in_head = False
         self._head_came()
@@ -169,11 +175,20 @@ class GuardedProtocol(HttpToolsProtocol):
         self._untold = 0
         super().on_message_complete()
 
+    def _may_switch(self) -> bool:
+        """Whether the request asks for a WebSocket where there is one, and owes it no answer."""
+        return (
+            self.url.partition(b"?")[0] == STREAM and self._owes_nothing() and self._unread is None
+        )
+
+    def _should_upgrade(self) -> bool:
+        return self._switches and super()._should_upgrade()
+
     def _unsupported_upgrade_warning(self) -> None:
         """Who asks for another protocol is answered in HTTP: nothing to warn of."""
 
     def handle_websocket_upgrade(self) -> None:
-        """Hand the connection over; nothing here watches it any longer."""
+        """Hand the connection over to `app.api.sockets`."""
         self._head_came()
         super().handle_websocket_upgrade()
 

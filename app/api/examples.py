@@ -1,6 +1,6 @@
-"""Worked examples for the documentation: a batch, and an answer of every operation.
+"""Worked examples for the documentation: an answer of every operation. The figures illustrate.
 
-Examples of single questions stand beside their schemas. The figures only illustrate.
+Requests are in `example_requests`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,6 @@ _MODEL: Final = {
 }
 _ENVELOPE: Final = {"model": _MODEL, "request_id": _ID, "ignored": []}
 
-BATCH: Final[dict[str, Any]] = {
-    "scenes": [
-        {"objects": ["bed", "nightstand", "lamp"], "room_type": "bedroom"},
-        {"objects": ["desk", "nigthstand"]},
-    ]
-}
 _UNKNOWN: Final = {
     "type": "/problems/unknown-labels",
     "title": "The model does not know some of the labels",
@@ -46,7 +40,17 @@ _RELATIONS: Final = _ENVELOPE | {
             "probability": 0.83,
         },
         {"subject": "nightstand_1", "relation": "left", "object": "bed", "probability": 0.41},
-    ]
+    ],
+    "disagreements": [
+        {
+            "subject": "lamp_1",
+            "object": "bed",
+            "observed": ["on-top"],
+            "expected": "left",
+            "probability": 0.36,
+            "observed_probability": 0.02,
+        }
+    ],
 }
 _MISSING: Final = _ENVELOPE | {
     "missing": [
@@ -54,7 +58,22 @@ _MISSING: Final = _ENVELOPE | {
             "label": "pillow",
             "probability": 0.46,
             "log_odds": 1.9,
-            "placements": [{"relation": "on-top", "object": "bed", "probability": 0.91}],
+            "placements": [
+                {
+                    "relation": "on-top",
+                    "object": "bed",
+                    "probability": 0.91,
+                    "offset": {
+                        "mean": {"x": 0.005, "y": 0.012, "z": 0.421},
+                        "std": {"x": 0.466, "y": 0.491, "z": 0.242},
+                        "scenes": 1089,
+                    },
+                }
+            ],
+            "because": [
+                {"object": "bed", "log_odds_change": 1.7},
+                {"object": "lamp_1", "log_odds_change": -0.2},
+            ],
         }
     ]
 }
@@ -169,7 +188,12 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     "show_vocabulary": {
         "model": _MODEL,
         "objects": [
-            {"label": "garbage bin", "aliases": ["trash can"], "structure": False},
+            {
+                "label": "garbage bin",
+                "aliases": ["trash can"],
+                "structure": False,
+                "size": {"x": 0.3, "y": 0.3, "z": 0.5},
+            },
             {"label": "floor", "aliases": [], "structure": True},
         ],
         "relations": ["left", "front", "on-top", "above", "right", "behind", "under", "below"],
@@ -181,9 +205,13 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
             "h1": [
                 {
                     "unit": 0,
+                    "name": "bed, nightstand; pillow on-top bed",
                     "objects": [
                         {"label": "bed", "weight": 2.1},
                         {"label": "nightstand", "weight": 1.7},
+                    ],
+                    "relations": [
+                        {"subject": "pillow", "relation": "on-top", "object": "bed", "weight": 1.2}
                     ],
                     "room_types": [{"label": "bedroom", "weight": 0.9}],
                 }

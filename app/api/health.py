@@ -11,6 +11,7 @@ from fastapi import APIRouter
 from app import __version__
 from app.api import catalogue
 from app.api.dependencies import RuntimeDep
+from app.api.models import Reference
 from app.api.openapi import problems, queued
 from app.schemas import (
     Health,
@@ -61,7 +62,7 @@ async def server_ready(runtime: RuntimeDep) -> ServerReady:
 
 
 @protocol.get("/models/{name}", summary="Model metadata", responses=_NO_MODEL)
-async def model_metadata(name: str, runtime: RuntimeDep) -> ModelMetadata:
+async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
     """Versions and variant of a model, named by an alias, `name` or `name@version`."""
     models = runtime.models
     reference = models.resolve(name).reference
@@ -73,7 +74,7 @@ async def model_metadata(name: str, runtime: RuntimeDep) -> ModelMetadata:
 
 
 @protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_NO_MODEL)
-async def model_ready(name: str, runtime: RuntimeDep) -> ModelReady:
+async def model_ready(name: Reference, runtime: RuntimeDep) -> ModelReady:
     """Status 200 when the model answers."""
     model = runtime.models.resolve(name)
     return ModelReady(name=model.reference.name, ready=True)

@@ -25,8 +25,13 @@ _PROBLEMS: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY)
 _USABLE: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
 
 Reference = Annotated[
-    str, Path(description="an alias, `name` (its newest version) or `name@version`")
+    str,
+    Path(
+        description="an alias, `name` (its newest version) or `name@version`",
+        openapi_examples={"alias": {"summary": "the default model", "value": "default"}},
+    ),
 ]
+Version = Annotated[str, Path(description="as GET /models lists it")]
 
 router = APIRouter(prefix="/models", tags=["models"])
 administration = APIRouter(
@@ -60,7 +65,7 @@ async def show_model(name: Reference, runtime: RuntimeDep) -> ModelSummary:
     responses=_PROBLEMS,
     response_model_exclude_none=True,
 )
-async def show_version(name: Reference, version: str, runtime: RuntimeDep) -> VersionDetails:
+async def show_version(name: Reference, version: Version, runtime: RuntimeDep) -> VersionDetails:
     """Metrics, data, terms and card of a version; of a refused one, why."""
     return describe.version(runtime.models, name, version)
 
@@ -112,7 +117,13 @@ async def refresh_models(runtime: RuntimeDep, request_id: RequestId) -> RefreshA
     response_model_exclude_none=True,
 )
 async def move_alias(
-    alias: Annotated[str, Path(description="`default`, or any name of your own")],
+    alias: Annotated[
+        str,
+        Path(
+            description="`default`, or any name of your own",
+            openapi_examples={"default": {"summary": "the default model", "value": "default"}},
+        ),
+    ],
     request: AliasRequest,
     runtime: RuntimeDep,
     request_id: RequestId,

@@ -9,6 +9,7 @@ from fastapi.routing import APIRoute
 
 from app.api import catalogue, examples, keys
 from app.api.catalogue import ProblemType
+from app.api.example_requests import REQUESTS
 from app.api.middleware.turnstile import MAX_TIMEOUT_MS, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE, ProblemError
 from app.schemas import MAX_SEED, FieldError, Problem
@@ -23,7 +24,7 @@ _ERRORS: Final = {
     ],
     catalogue.UNKNOWN_LABELS: [
         FieldError(
-            pointer="#/objects/0",
+            pointer="#/objects/1",
             message="the model does not know this label",
             suggestions=["nightstand"],
         )
@@ -42,6 +43,7 @@ _TIMEOUT_PARAMETER: Final = {
     "description": "milliseconds after which nobody waits for the answer: work that has not begun "
     "by then is dropped (504)",
     "schema": {"type": "integer", "minimum": 1, "maximum": MAX_TIMEOUT_MS},
+    "examples": {"second": {"summary": "a second", "value": 1000}},
 }
 _KEY_SCHEMES: Final = {
     "api-key": {"type": "apiKey", "in": "header", "name": keys.API_KEY},
@@ -126,6 +128,10 @@ class DocumentedAPI(FastAPI):
                 for operation in path.values():
                     (ok,) = operation["responses"]["200"]["content"].values()
                     ok["example"] = examples.ANSWERS[operation["operationId"]]
+                    if "requestBody" in operation:
+                        (body,) = operation["requestBody"]["content"].values()
+                        cases = REQUESTS[operation["operationId"]].items()
+                        body["examples"] = {name: case.describe() for name, case in cases}
                     if "504" in operation["responses"]:
                         operation.setdefault("parameters", []).append(_TIMEOUT_PARAMETER)
                     content = operation["responses"].get("422", {}).get("content", {})

@@ -12,13 +12,17 @@ from pathlib import Path
 from typing import Final
 
 from fastapi import APIRouter, FastAPI
-from starlette.responses import HTMLResponse, RedirectResponse
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
+from starlette.types import Scope
 
 from app.api import catalogue
 from app.api.problems import ProblemError
 
 STATIC: Final = Path(__file__).parents[1] / "static"
+_BOARD: Final = "board.html"
+_VENDOR: Final = "vendor/"
 
 # Swagger UI and Redoc style their elements inline and Redoc searches in a worker made from a blob;
 # neither needs inline script.
@@ -37,6 +41,20 @@ _POLICY: Final = "; ".join(
     )
 )
 _HEADERS: Final = {"Content-Security-Policy": _POLICY}
+
+# The visual page is all our own: it has no inline style either.
+_STRICT_POLICY: Final = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' data:",
+        "connect-src 'self'",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
 
 _PAGE: Final = """<!doctype html>
 <html lang="en">
@@ -85,10 +103,26 @@ async def show_problem_type(slug: str) -> HTMLResponse:
     return _page(kind.title, body, root="../")
 
 
+class Assets(StaticFiles):
+    """Files with entity tags; those of a library, whose folder names its version, never change."""
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        """A file, or 304 for who has it."""
+        response = await super().get_response(path, scope)
+        if response.status_code in {200, 304}:
+            # A browser that guesses how long to keep a module would mix those of two releases.
+            kept = path.startswith(_VENDOR)
+            response.headers["Cache-Control"] = (
+                "public, max-age=31536000, immutable" if kept else "no-cache"
+            )
+        return response
+
+
 def install(app: FastAPI, *, docs: bool) -> None:
-    """Serve the pages and their assets; ``docs`` False leaves out /docs and /redoc."""
+    """Serve the pages and their assets; ``docs`` False leaves out /, /docs and /redoc."""
     app.include_router(problems)
-    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    static = Assets(directory=STATIC)
+    app.mount("/static", static, name="static")
     if not docs:
         return
     assets = Path(str(files("fastapi_standalone_docs"))) / "static"
@@ -97,8 +131,10 @@ def install(app: FastAPI, *, docs: bool) -> None:
         app.mount(f"/{name}", StaticFiles(directory=assets / folder), name=f"{name} assets")
 
     @app.get("/", include_in_schema=False)
-    async def home() -> RedirectResponse:
-        return RedirectResponse("docs")
+    async def board(request: Request) -> Response:
+        response = await static.get_response(_BOARD, request.scope)
+        response.headers["Content-Security-Policy"] = _STRICT_POLICY
+        return response
 
 
 def _serve_document(app: FastAPI, path: str, html: str) -> None:

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any, Final
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import HTTPConnection, Request
 from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
 
-from app import schemas
 from app.api import catalogue
 from app.api.catalogue import ProblemType
-from app.api.pointers import pointer
+from app.faults import MAX_ERRORS, field_errors
+from app.pointers import pointer
 from app.schemas import Failure, FieldError, Problem
 from app.serving.errors import (
     AliasConflictError,
@@ -39,7 +39,9 @@ from app.serving.errors import (
 )
 
 MEDIA_TYPE: Final = "application/problem+json"
-MAX_ERRORS: Final = 100
+
+# The server can answer a handshake with more than 403.
+_DENIAL: Final = "websocket.http.response"
 
 _logger = logging.getLogger("app.api")
 
@@ -54,14 +56,6 @@ _OF_REASON: Final = {
     Reason.UNKNOWN_LABELS: catalogue.UNKNOWN_LABELS,
     Reason.CONTRADICTION: catalogue.CONTRADICTORY_EVIDENCE,
 }
-_FIELDS: Final = sorted(
-    {
-        name
-        for value in vars(schemas).values()
-        if isinstance(value, type) and issubclass(value, schemas.Request)
-        for name in value.model_fields
-    }
-)
 
 
 class ProblemError(HTTPException):
@@ -97,17 +91,6 @@ class ProblemError(HTTPException):
             errors=self.errors or None,
             failures=self.failures or None,
         )
-
-
-# Where pydantic's own words would puzzle a reader who does not write Python.
-_MESSAGES: Final = {
-    "extra_forbidden": "unknown field",
-    "missing": "required",
-    "model_attributes_type": "must be an object",
-    "model_type": "must be an object",
-    "dict_type": "must be an object",
-    "list_type": "must be an array",
-}
 
 
 def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
@@ -182,20 +165,10 @@ def unfit(
         body: what was validated.
         at: where in the request ``body`` stands.
     """
-    of_framework = isinstance(error, RequestValidationError)
-    errors = []
     faults = error.errors()
-    # Only of those that are listed: suggestions for 100,000 members take a minute.
-    for entry in faults[:MAX_ERRORS]:
-        location: Location = tuple(entry["loc"])[1:] if of_framework else entry["loc"]
-        unknown = str(location[-1]) if entry["type"] == "extra_forbidden" else ""
-        errors.append(
-            FieldError(
-                pointer=pointer(at) + pointer(location, body)[1:],
-                message=_MESSAGES.get(entry["type"], entry["msg"]),
-                suggestions=get_close_matches(unknown[:64], _FIELDS) if unknown else [],
-            )
-        )
+    # The framework's begin with where they were found: in the body.
+    skip = 1 if isinstance(error, RequestValidationError) else 0
+    errors = field_errors(faults, body, at=at, skip=skip)
     return _faulty(catalogue.INVALID_REQUEST, errors, len(faults))
 
 
@@ -204,11 +177,11 @@ def report_defect(error: Exception, request_id: str) -> None:
     _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
 
 
-def _request_id(request: Request) -> str:
+def _request_id(request: HTTPConnection) -> str:
     return str(request.scope.get("state", {}).get("request_id", ""))
 
 
-def respond(request: Request, problem: ProblemError) -> Response:
+def respond(request: HTTPConnection, problem: ProblemError) -> Response:
     """The problem as a response, and its name in the request's record."""
     record = request.scope.get("state", {}).get("record")
     if record is not None:
@@ -222,6 +195,15 @@ def respond(request: Request, problem: ProblemError) -> Response:
         headers=headers,
         media_type=MEDIA_TYPE,
     )
+
+
+async def answer(problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer a request, or the handshake of a WebSocket, with a problem."""
+    if scope["type"] == "websocket" and _DENIAL not in scope.get("extensions", {}):
+        # Before it is accepted: the server answers the handshake with 403.
+        await send({"type": "websocket.close", "code": 1008})
+    else:
+        await respond(HTTPConnection(scope), problem)(scope, receive, send)
 
 
 async def _handle(request: Request, error: Exception) -> Response:

@@ -15,12 +15,14 @@ from app.schemas import (
     ModelList,
     ModelSummary,
     RelationName,
+    Size,
     TrainingSource,
     VersionDetails,
     VersionSummary,
     VocabularyAnswer,
     VocabularyEntry,
     WeightedLabel,
+    WeightedRelation,
 )
 from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
 from app.serving.models import ServedModel, ServedModels
@@ -62,7 +64,7 @@ def version(models: ServedModels, reference: str, number: str) -> VersionDetails
         name=name,
         **dict(summary),
         created=manifest.created,
-        parameters=sum(math.prod(tensor.shape) for tensor in manifest.tensors.values()),
+        parameters=sum(math.prod(tensor.shape) for tensor in manifest.weights.values()),
         metrics=[Metric(**metric.model_dump()) for metric in manifest.metrics],
         data=[TrainingSource(**source.model_dump()) for source in manifest.data],
         terms=manifest.terms,
@@ -78,7 +80,10 @@ def vocabulary(served: ServedModel) -> VocabularyAnswer:
         model=served.reference,
         objects=[
             VocabularyEntry(
-                label=entry.label, aliases=list(entry.aliases), structure=entry.structure
+                label=entry.label,
+                aliases=list(entry.aliases),
+                structure=entry.structure,
+                size=_size(entry.size),
             )
             for entry in served.vocabulary.objects
         ],
@@ -88,14 +93,24 @@ def vocabulary(served: ServedModel) -> VocabularyAnswer:
 
 
 def contexts(served: ServedModel) -> ContextsAnswer:
-    """The hidden units of a model by their strongest objects."""
+    """The hidden units of a model by their strongest objects and relations."""
     return ContextsAnswer(
         model=served.reference,
         layers={
             layer: [
                 ContextUnit(
                     unit=unit.unit,
+                    name=unit.name,
                     objects=_weighted(unit.objects),
+                    relations=[
+                        WeightedRelation(
+                            subject=subject,
+                            relation=cast("RelationName", relation),
+                            object=other,
+                            weight=weight,
+                        )
+                        for (subject, relation, other), weight in unit.relations
+                    ],
                     room_types=_weighted(unit.room_types),
                 )
                 for unit in units
@@ -103,6 +118,13 @@ def contexts(served: ServedModel) -> ContextsAnswer:
             for layer, units in served.contexts.items()
         },
     )
+
+
+def _size(extents: Sequence[float] | None) -> Size | None:
+    if extents is None:
+        return None
+    x, y, z = extents
+    return Size(x=x, y=y, z=z)
 
 
 def _weighted(pairs: Sequence[tuple[str, float]]) -> list[WeightedLabel]:

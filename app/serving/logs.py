@@ -19,6 +19,10 @@ _EXTRAS = (
     "latency_ms",
     "queue_ms",
     "compute_ms",
+    "messages",
+    "answers",
+    "superseded",
+    "close_code",
 )
 _MASK = "**********"
 
@@ -110,5 +114,7 @@ def log_config(
         "loggers": {
             "app": {"level": level.upper()},
             "uvicorn.access": {"level": "CRITICAL"},
+            # Tells of every WebSocket that opens, is refused or closes.
+            "websockets": {"level": "WARNING"},
         },
     }

@@ -119,6 +119,29 @@ class Metrics:
             multiprocess_mode="livesum",
             registry=registry,
         )
+        self._streams = Gauge(
+            "scene_streams",
+            "Streams that are open",
+            multiprocess_mode="livesum",
+            registry=registry,
+        )
+        self._messages = Counter(
+            "scene_stream_messages_total",
+            "Messages of streams; outcome is success or the name of the problem",
+            ("type", "outcome"),
+            registry=registry,
+        )
+        self._answers = Counter(
+            "scene_stream_answers_total",
+            "Answers to streams; outcome is success or the name of the problem",
+            ("outcome",),
+            registry=registry,
+        )
+        self._superseded = Counter(
+            "scene_stream_superseded_total",
+            "Updates of streams that a newer one replaced before they were answered",
+            registry=registry,
+        )
         # 1 if any process serves it: processes that disagree show as two versions of one alias.
         self._info = Gauge(
             _INFO,
@@ -195,20 +218,22 @@ class Metrics:
         """Somebody tried to change what is served."""
         self._reloads.labels(change, outcome).inc()
 
-    def answered(self, route: str, method: str, outcome: str, seconds: float) -> None:
+    def answered(self, route: str, method: str, outcome: str, seconds: float | None) -> None:
         """A request has been answered.
 
         Args:
             route: the template of the route, "-" where none answered.
             method: the request's, "-" if HTTP defines no such method.
             outcome: "success", or the name of the problem.
-            seconds: how long it took.
+            seconds: how long it took; None for a stream, which lasts as long as its client likes.
         """
         key = (route, method, outcome)
         counter = self._of_request.get(key)
         if counter is None:
             counter = self._of_request[key] = self._requests.labels(*key)
         counter.inc()
+        if seconds is None:
+            return
         histogram = self._of_route.get(route)
         if histogram is None:
             histogram = self._of_route[route] = self._latency.labels(route)
@@ -221,6 +246,23 @@ class Metrics:
     def serialised(self, seconds: float) -> None:
         """An answer has been put into names and written as JSON."""
         self._serialisation.observe(seconds)
+
+    def streams(self, count: int) -> None:
+        """So many streams are open now."""
+        self._streams.set(count)
+
+    def stream_message(self, kind: str, outcome: str) -> None:
+        """A stream's message has been taken, or refused by the named problem.
+
+        Args:
+            kind: its type, "-" if there is no such type.
+        """
+        self._messages.labels(kind, outcome).inc()
+
+    def stream_answered(self, outcome: str, superseded: int) -> None:
+        """A stream has been given an answer, which covers so many updates besides the newest."""
+        self._answers.labels(outcome).inc()
+        self._superseded.inc(superseded)
 
     # What is told about a model that has been removed meanwhile is dropped: it would come back.
 
@@ -270,13 +312,22 @@ class Unmeasured(Metrics):
     def reloaded(self, change: Change, outcome: Outcome) -> None:
         """Nothing is counted."""
 
-    def answered(self, route: str, method: str, outcome: str, seconds: float) -> None:
+    def answered(self, route: str, method: str, outcome: str, seconds: float | None) -> None:
         """Nothing is counted."""
 
     def entry_answered(self, question: str, outcome: str) -> None:
         """Nothing is counted."""
 
     def serialised(self, seconds: float) -> None:
+        """Nothing is counted."""
+
+    def streams(self, count: int) -> None:
+        """Nothing is counted."""
+
+    def stream_message(self, kind: str, outcome: str) -> None:
+        """Nothing is counted."""
+
+    def stream_answered(self, outcome: str, superseded: int) -> None:
         """Nothing is counted."""
 
     def waited(self, model: ModelReference, seconds: float) -> None:

@@ -34,7 +34,7 @@ class ServedModel:
 
     Attributes:
         artifact: what the reasoning works with.
-        contexts: its hidden units by their strongest objects, layer by layer.
+        contexts: its hidden units by their strongest objects and relations, layer by layer.
         queue: its work.
     """
 

@@ -7,15 +7,18 @@ from collections.abc import Callable, Sequence
 from typing import cast
 
 from app import reasoning
+from app.scene.frames import viewer_axes
 from app.scene.relations import opposite
 from app.schemas import (
     Because,
+    Disagreement,
     GenerateAnswer,
     GeneratedScene,
     GenerateRequest,
     MissingAnswer,
     MissingObject,
     MissingRequest,
+    Offset,
     Outlier,
     OutliersAnswer,
     OutliersRequest,
@@ -25,6 +28,7 @@ from app.schemas import (
     RelationsAnswer,
     RelationsRequest,
     ScoredRelation,
+    Vector,
 )
 from app.serving.errors import Location, Reason
 from app.serving.models import ServedModel
@@ -44,7 +48,7 @@ async def relations(session: Session, request: RelationsRequest) -> RelationsAns
     """
     model, reading = session.read(request)
     pairs = _pairs(request, reading)
-    found = await session.ask(
+    found, disagreements = await session.ask(
         model,
         reasoning.relations,
         reading.scene,
@@ -54,7 +58,19 @@ async def relations(session: Session, request: RelationsRequest) -> RelationsAns
         include_opposites=request.include_opposites,
     )
     return RelationsAnswer(
-        **session.envelope(request, model, reading), relations=_scored(found, reading)
+        **session.envelope(request, model, reading),
+        relations=_scored(found, reading),
+        disagreements=[
+            Disagreement(
+                subject=reading.id(entry.subject),
+                object=reading.id(entry.object),
+                observed=[_name(relation) for relation in entry.observed],
+                expected=_name(entry.expected),
+                probability=entry.probability,
+                observed_probability=entry.observed_probability,
+            )
+            for entry in disagreements
+        ],
     )
 
 
@@ -74,6 +90,7 @@ async def missing(session: Session, request: MissingRequest) -> MissingAnswer:
     candidates, dropped = _candidates(request, model, faults)
     at = _place(request, model, reading, faults)
     faults.raise_any()
+    viewpoint = request.viewpoint
     found = await session.ask(
         model,
         reasoning.missing,
@@ -81,6 +98,7 @@ async def missing(session: Session, request: MissingRequest) -> MissingAnswer:
         top_k=request.top_k,
         candidates=candidates,
         at=at,
+        axes=viewer_axes(request.frame_id, None if viewpoint is None else viewpoint.yaw),
     )
     envelope = session.envelope(request, model, reading)
     envelope["ignored"] += dropped
@@ -96,9 +114,11 @@ async def missing(session: Session, request: MissingRequest) -> MissingAnswer:
                         relation=_name(place.relation),
                         object=reading.id(place.object),
                         probability=place.probability,
+                        offset=_offset(place.offset),
                     )
                     for place in entry.placements
                 ],
+                because=_because(entry.because, reading),
             )
             for entry in found
         ],
@@ -125,10 +145,7 @@ async def outliers(session: Session, request: OutliersRequest) -> OutliersAnswer
                 probability=entry.probability,
                 log_odds=entry.log_odds,
                 is_outlier=entry.is_outlier,
-                because=[
-                    Because(object=reading.id(cause.object), log_odds_change=cause.log_odds_change)
-                    for cause in entry.because
-                ],
+                because=_because(entry.because, reading),
             )
             for entry in found
         ],
@@ -178,8 +195,16 @@ async def generate(session: Session, request: GenerateRequest) -> GenerateAnswer
     )
 
 
+def _because(causes: Sequence[reasoning.Because], reading: Reading) -> list[Because]:
+    return [Because(reading.id(cause.object), cause.log_odds_change) for cause in causes]
+
+
 def _name(relation: str) -> RelationName:
     return cast("RelationName", relation)
+
+
+def _offset(offset: reasoning.Offset | None) -> Offset | None:
+    return offset and Offset(Vector(*offset.mean), Vector(*offset.std), offset.scenes)
 
 
 def _scored(

@@ -6,6 +6,9 @@ of them. A job that is expected to take longer than `CHEAP` goes to a worker thr
 where compiled loops and tensor kernels let the event loop go on. Drawings, which may take seconds,
 have a thread of their own: nobody who asks about a scene waits for them.
 
+Questions of streams give way to those of requests: a stream has an answer under way all the time,
+and what it says next is about the newest state anyway.
+
 A job whose deadline has passed, or whose client has gone, is dropped when its turn comes.
 """
 
@@ -141,7 +144,8 @@ class WorkQueue:
         limit: most rows (scenes, or drawn scenes) that may wait or be under way.
         threads: for work that is not cheap.
         rows: how many there are now.
-        backlog: how many questions wait or are under way; drawings are not counted.
+        backlog: how many questions of requests wait or are under way; drawings and streams are not
+            counted.
     """
 
     limit: int
@@ -149,6 +153,7 @@ class WorkQueue:
     rows: int = 0
     backlog: int = 0
     _waiting: deque[_Job] = field(default_factory=deque)
+    _giving_way: deque[_Job] = field(default_factory=deque)
     _draining: bool = False
     _costs: _Costs = field(default_factory=_Costs)
 
@@ -167,12 +172,21 @@ class WorkQueue:
         finally:
             self.rows -= rows
 
-    async def run(self, call: Callable[[], T], ticket: Ticket, *, kind: str, size: int) -> Done[T]:
+    async def run(
+        self,
+        call: Callable[[], T],
+        ticket: Ticket,
+        *,
+        kind: str,
+        size: int,
+        gives_way: bool = False,
+    ) -> Done[T]:
         """Let a question be answered.
 
         Args:
             call: the work; it may run in another thread.
             kind: jobs of one kind and about one size, at least 1, cost alike.
+            gives_way: to all those that do not.
 
         Raises:
             DeadlinePassedError: the deadline passed first; the work is dropped, or its result.
@@ -187,13 +201,15 @@ class WorkQueue:
             self._costs.learn(kind, size, thread_time() - began)
             return result
 
-        self.backlog += 1
+        counted = 0 if gives_way else 1
+        self.backlog += counted
         try:
             if self._costs.expected(kind, size) > CHEAP:
                 return await _in_thread(lambda _: learnt(), ticket, self.threads.costly)
-            return await self._in_tick(_measured(learnt), ticket)
+            line = self._giving_way if gives_way else self._waiting
+            return await self._in_tick(_measured(learnt), ticket, line)
         finally:
-            self.backlog -= 1
+            self.backlog -= counted
 
     async def draw(self, call: Callable[[Callable[[], bool]], T], ticket: Ticket) -> Done[T]:
         """Let scenes be drawn.
@@ -207,10 +223,12 @@ class WorkQueue:
         """
         return await _in_thread(call, ticket, self.threads.drawing)
 
-    async def _in_tick(self, call: Callable[[], Done[T]], ticket: Ticket) -> Done[T]:
+    async def _in_tick(
+        self, call: Callable[[], Done[T]], ticket: Ticket, line: deque[_Job]
+    ) -> Done[T]:
         loop = asyncio.get_running_loop()
         job = _Job(call, ticket, loop.create_future())
-        self._waiting.append(job)
+        line.append(job)
         if not self._draining:
             self._draining = True
             loop.call_soon(self._drain)
@@ -221,11 +239,11 @@ class WorkQueue:
 
     def _drain(self) -> None:
         end = monotonic() + _TICK
-        while self._waiting:
-            job = self._waiting.popleft()
+        while line := self._waiting or self._giving_way:
+            job = line.popleft()
             if not job.future.done():
                 _settle(job)
-            if self._waiting and monotonic() > end:
+            if (self._waiting or self._giving_way) and monotonic() > end:
                 asyncio.get_running_loop().call_soon(self._drain)
                 return
         self._draining = False

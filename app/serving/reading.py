@@ -140,6 +140,11 @@ class Names:
             faults.add(Reason.INVALID, location, "names no object of the scene")
         return None
 
+    def id(self, name: str) -> str | None:
+        """The id of the one object that ``name`` names, if it names one."""
+        place = self.find(name, (), Faults())
+        return None if place is None else self._objects[place].id
+
     def is_ignored(self, name: str) -> bool:
         """Whether the name belongs to an object that was left out."""
         if name in self._by_id:
@@ -155,6 +160,30 @@ def read_scene(
     Raises:
         RequestError: everything that is wrong with it, of the gravest kind found.
     """
+    given, ignored, names = _given(request, vocabulary, limits, may_be_empty=may_be_empty)
+    scene = observe(
+        given,
+        frame_id=request.frame_id,
+        viewpoint=_viewpoint(request),
+        typical_sizes=vocabulary.sizes,
+    )
+    observed = None if scene.poses is None else _relations(scene)
+    return Reading(scene, tuple(ignored), observed, names)
+
+
+def check_scene(request: SceneRequest, vocabulary: Vocabulary, limits: Limits) -> Names:
+    """How a scene, which may be empty, names its objects: read but for what its poses show.
+
+    Raises:
+        RequestError: as `read_scene`, which then reads it without fault.
+    """
+    return _given(request, vocabulary, limits, may_be_empty=True)[2]
+
+
+def _given(
+    request: SceneRequest, vocabulary: Vocabulary, limits: Limits, *, may_be_empty: bool
+) -> tuple[Scene, list[str], Names]:
+    """What a request says, the names of what is left out, and names for the rest."""
     faults = Faults()
     if len(request.objects) > limits.objects:
         faults.add(
@@ -198,15 +227,7 @@ def read_scene(
     names = Names(objects, unknown, vocabulary)
     triples = _triples(request, names, tolerant, faults)
     faults.raise_any()
-    given = Scene(tuple(objects), triples, request.relations_complete, room)
-    scene = observe(
-        given,
-        frame_id=request.frame_id,
-        viewpoint=_viewpoint(request),
-        typical_sizes=vocabulary.sizes,
-    )
-    observed = None if scene.poses is None else _relations(scene)
-    return Reading(scene, tuple(ignored), observed, names)
+    return Scene(tuple(objects), triples, request.relations_complete, room), ignored, names
 
 
 def unknown_label(vocabulary: Vocabulary, label: str, location: Location, faults: Faults) -> None:

@@ -21,6 +21,7 @@ class RequestRecord:
         queue_seconds: how long its scenes waited, together; None where none had to.
         compute_seconds: how long the models computed for it; None where none was asked.
         answered_at: `time.perf_counter` when the last answer of a model came.
+        stream: of a stream its messages, answers, superseded updates and the code of its close.
     """
 
     outcome: str = SUCCESS
@@ -28,6 +29,7 @@ class RequestRecord:
     queue_seconds: float | None = None
     compute_seconds: float | None = None
     answered_at: float | None = None
+    stream: dict[str, int] = field(default_factory=dict)
 
     def asked(self, model: ModelReference) -> None:
         """The request is for this model."""
@@ -44,7 +46,7 @@ class RequestRecord:
 
     def known(self) -> dict[str, str | float]:
         """The record for a line of the log: times in milliseconds, the model if there is one."""
-        entry: dict[str, str | float] = {"outcome": self.outcome}
+        entry: dict[str, str | float] = {"outcome": self.outcome, **self.stream}
         if len(self.models) == 1:
             ((entry["model"], entry["version"]),) = self.models
         if self.queue_seconds is not None:

@@ -15,7 +15,7 @@ from app.serving.errors import ServingError
 from app.serving.metrics import Metrics
 from app.serving.models import ServedModel, ServedModels
 from app.serving.queue import Done, Ticket
-from app.serving.reading import Limits, Reading, read_scene
+from app.serving.reading import Limits, Names, Reading, check_scene, read_scene
 from app.serving.record import RequestRecord
 
 P = ParamSpec("P")
@@ -34,6 +34,7 @@ class Session:
         metrics: what the service counts.
         record: what is known about the request.
         holding: whether rows of the models' queues are held for it already.
+        known: what `read` found, where several questions are asked about one scene.
     """
 
     models: ServedModels
@@ -43,6 +44,7 @@ class Session:
     metrics: Metrics
     record: RequestRecord
     holding: bool = False
+    known: tuple[ServedModel, Reading] | None = None
 
     def read(
         self, request: SceneRequest, *, may_be_empty: bool = False
@@ -54,9 +56,20 @@ class Session:
             ModelUnavailableError: the model was refused when it was loaded.
             RequestError: the scene does not fit; see `read_scene`.
         """
+        if self.known is not None:
+            return self.known
         model = self.models.resolve(request.model)
         self.record.asked(model.reference)
         return model, read_scene(request, model.vocabulary, self.limits, may_be_empty=may_be_empty)
+
+    def check(self, request: SceneRequest) -> Names:
+        """How a scene, which may be empty, names its objects, once it is found to fit.
+
+        Raises:
+            UnknownModelError, ModelUnavailableError, RequestError: see `read`.
+        """
+        model = self.models.resolve(request.model)
+        return check_scene(request, model.vocabulary, self.limits)
 
     async def ask(
         self,
@@ -80,6 +93,8 @@ class Session:
                 self.ticket,
                 kind=name,
                 size=size,
+                # Of a stream, which has read its scene already.
+                gives_way=self.known is not None,
             )
         return self._noted(model, name, 1, done)
 

@@ -33,7 +33,7 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     # Kernels of tensors are warm after one scene; compiled loops are told apart by what is given.
     is_compiled = artifact.closed_form is not None
     scenes = (scene, bare, seen) if is_compiled else (scene,)
-    relations = [entry for one in scenes for entry in reasoning.relations(artifact, one)]
+    stand = [reasoning.relations(artifact, one) for one in scenes]
     missing = [entry for one in scenes for entry in reasoning.missing(artifact, one)]
     if is_compiled and len(scene.objects) > 1:
         for one in (scene, bare):
@@ -43,8 +43,9 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     for one in scenes[1:]:
         outliers += reasoning.outliers(artifact, one)[0]
     generated = reasoning.generate(artifact, scene, count=2, seed=0, steps=STEPS)
-    numbers = [entry.probability for entry in relations]
+    numbers = [entry.probability for both in stand for found in both for entry in found]
     numbers += [number for entry in missing for number in (entry.probability, entry.log_odds)]
+    numbers += [cause.log_odds_change for entry in missing for cause in entry.because]
     numbers += [number for entry in outliers for number in (entry.probability, entry.log_odds)]
     numbers += [entry.probability for entry in misplaced]
     numbers += [entry.log_score for entry in generated]

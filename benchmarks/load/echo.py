@@ -19,12 +19,14 @@ from app.api.dependencies import RequestId
 from app.schemas import (
     Because,
     Detection,
+    Disagreement,
     Health,
     MissingAnswer,
     MissingObject,
     MissingRequest,
     ModelReference,
     ObservedRelation,
+    Offset,
     Outlier,
     OutliersAnswer,
     OutliersRequest,
@@ -33,6 +35,7 @@ from app.schemas import (
     RelationsRequest,
     SceneRequest,
     ScoredRelation,
+    Vector,
 )
 from app.serving.logs import log_config
 from app.serving.metrics import Metrics, Unmeasured
@@ -72,6 +75,10 @@ def _envelope(request: SceneRequest, request_id: str) -> dict[str, Any]:
     }
 
 
+def _because(names: list[str]) -> list[Because]:
+    return [Because(names[k % len(names)], -0.123456789) for k in range(3)]
+
+
 @router.post("/relations", response_model_exclude_none=True)
 async def relations(request: RelationsRequest, request_id: RequestId) -> RelationsAnswer:
     names = _names(request)
@@ -85,6 +92,17 @@ async def relations(request: RelationsRequest, request_id: RequestId) -> Relatio
                 probability=0.123456789,
             )
             for k in range(request.top_k)
+        ],
+        disagreements=[
+            Disagreement(
+                subject=relation.subject,
+                object=relation.object,
+                observed=[relation.relation],
+                expected="front",
+                probability=0.123456789,
+                observed_probability=0.0123456789,
+            )
+            for relation in (request.relations or _derived(request) or [])[: request.top_k : 3]
         ],
     )
 
@@ -101,10 +119,14 @@ async def missing(request: MissingRequest, request_id: RequestId) -> MissingAnsw
                 log_odds=-1.23456789,
                 placements=[
                     Placement(
-                        relation="left", object=names[p % len(names)], probability=0.123456789
+                        relation="left",
+                        object=names[p % len(names)],
+                        probability=0.123456789,
+                        offset=Offset(Vector(0.123, -1.234, 0.5), Vector(0.4, 0.3, 0.2), 123),
                     )
                     for p in range(3)
                 ],
+                because=_because(names),
             )
             for k in range(request.top_k)
         ],
@@ -123,10 +145,7 @@ async def outliers(request: OutliersRequest, request_id: RequestId) -> OutliersA
                 probability=0.123456789,
                 log_odds=-1.23456789,
                 is_outlier=False,
-                because=[
-                    Because(object=names[k % len(names)], log_odds_change=-0.123456789)
-                    for k in range(3)
-                ],
+                because=_because(names),
             )
             for name in names
         ],

@@ -74,12 +74,21 @@ class LiveService:
 
 
 def launch(
-    store: Path, log: Path, *, program: tuple[str, ...] = ("-m", "app"), **variables: str
+    store: Path,
+    log: Path,
+    *,
+    program: tuple[str, ...] = ("-m", "app"),
+    port: int | None = None,
+    **variables: str,
 ) -> LiveService:
-    """Start ``python -m app`` (or another program) on a free port and wait until it answers."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    """Start ``python -m app`` (or another program) and wait until it answers.
+
+    The port is a free one unless it is given.
+    """
+    if port is None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
     }

@@ -14,6 +14,7 @@ from app.registry import (
     DataSource,
     Description,
     Metric,
+    Offsets,
     Store,
     VocabularyEntry,
 )
@@ -70,6 +71,7 @@ def publish(
     seed: int = 0,
     classes: int = V,
     alias: str | None = None,
+    offsets: Offsets | None = None,
 ) -> None:
     """Publish a random machine, which knows the first ``classes`` classes."""
     machine = random_machine(variant, seed, classes)
@@ -100,7 +102,7 @@ def publish(
             terms="public domain",
             libraries={"torch": torch.__version__},
         ),
-        machine.state_dict(),
+        machine.state_dict() | ({} if offsets is None else offsets.tensors()),
         alias=alias,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from hashlib import sha256
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,48 @@ import httpx
 import pytest
 
 from app import schemas
+from app.api.example_requests import REQUESTS
 from app.schemas import Problem
 from tests.http.conftest import serve
+from tests.http.test_problems import problem
 
 pytestmark = pytest.mark.anyio
 
-PAGES = ["/docs", "/redoc", "/problems", "/problems/not-json"]
+PAGES = ["/", "/docs", "/redoc", "/problems", "/problems/not-json"]
+
+
+LIBRARIES = {
+    "d3-dispatch-3.0.2/LICENSE": (
+        "2a6d2d5f32ba0b755ddbc1c833f766e30cdbe6ebe9a6d4e3e24427721f0b63d3"
+    ),
+    "d3-dispatch-3.0.2/d3-dispatch.min.js": (
+        "5afe071dad74c14cd580f540c9ec85b0755eed78b7f9ed3e9f63b989fc41aa4b"
+    ),
+    "d3-drag-3.0.1/LICENSE": ("2a6d2d5f32ba0b755ddbc1c833f766e30cdbe6ebe9a6d4e3e24427721f0b63d3"),
+    "d3-drag-3.0.1/d3-drag.min.js": (
+        "da7f489ebae8418e53759d2df5e9327eb9bedcdb4aa93feb065beda31f085232"
+    ),
+    "d3-force-3.0.1/LICENSE": ("2a6d2d5f32ba0b755ddbc1c833f766e30cdbe6ebe9a6d4e3e24427721f0b63d3"),
+    "d3-force-3.0.1/d3-force.min.js": (
+        "ed05b52ecfe280d753ebab954e4e1f24097952480a9d277be55b6ba297bf4a9b"
+    ),
+    "d3-quadtree-3.0.2/LICENSE": (
+        "2a6d2d5f32ba0b755ddbc1c833f766e30cdbe6ebe9a6d4e3e24427721f0b63d3"
+    ),
+    "d3-quadtree-3.0.2/d3-quadtree.min.js": (
+        "6bd9974b3efdf9c22942a6fb9a5a027ee39f81a6c27b09a3444c9e911796f439"
+    ),
+    "d3-selection-3.0.1/LICENSE": (
+        "2a6d2d5f32ba0b755ddbc1c833f766e30cdbe6ebe9a6d4e3e24427721f0b63d3"
+    ),
+    "d3-selection-3.0.1/d3-selection.min.js": (
+        "1dcd563b613b841dbe5a536df5289b0ac64c233a21bc1e954651cbe2a4809877"
+    ),
+    "d3-timer-3.0.2/LICENSE": ("2a6d2d5f32ba0b755ddbc1c833f766e30cdbe6ebe9a6d4e3e24427721f0b63d3"),
+    "d3-timer-3.0.2/d3-timer.min.js": (
+        "f6b80ed73b21d01658db60d1c04adb88adc70f885346ae07d59ed69ba0348849"
+    ),
+}
 
 
 class Links(HTMLParser):
@@ -86,10 +123,41 @@ async def test_pages_can_be_switched_off(shared_store: Path) -> None:
         assert (await client.get("/problems/not-json")).status_code == 200
 
 
-async def test_the_root_leads_to_the_documentation(client: httpx.AsyncClient) -> None:
+async def test_the_visual_page_has_no_style_of_its_own_and_leads_to_the_documentation(
+    client: httpx.AsyncClient,
+) -> None:
     response = await client.get("/")
-    assert response.status_code == 307
-    assert response.headers["location"] == "docs"
+    assert response.headers["content-type"] == "text/html; charset=utf-8"
+    assert "unsafe" not in response.headers["content-security-policy"]
+    parser = Links()
+    parser.feed(response.text)
+    assert "docs" in parser.links
+
+
+async def test_files_are_asked_for_again_and_those_of_libraries_are_kept(
+    client: httpx.AsyncClient,
+) -> None:
+    page = await client.get("/")
+    assert page.headers["cache-control"] == "no-cache"
+    again = await client.get("/", headers={"If-None-Match": page.headers["etag"]})
+    assert again.status_code == 304
+    assert again.headers["content-security-policy"] == page.headers["content-security-policy"]
+    module = await client.get("/static/board/main.js")
+    assert module.headers["cache-control"] == "no-cache"
+    assert module.headers["content-type"].startswith("text/javascript")
+    library = await client.get("/static/vendor/d3-drag-3.0.1/d3-drag.min.js")
+    assert "immutable" in library.headers["cache-control"]
+
+
+def test_libraries_lie_here_as_they_were_published(repository: Path) -> None:
+    """Each of their files by its sha256: whoever changes one changes this list, and is seen."""
+    folder = repository / "app" / "static" / "vendor"
+    found = {
+        path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+    assert found == LIBRARIES
 
 
 # ------------------------------------------------------------------------------------ OpenAPI
@@ -159,25 +227,79 @@ async def test_errors_are_problems_and_nothing_else(document: dict[str, Any]) ->
                 assert str(described.status) == status
 
 
-async def test_every_question_has_worked_examples(
-    client: httpx.AsyncClient, document: dict[str, Any]
-) -> None:
-    components = document["components"]["schemas"]
-    for method, path, operation in operations(document):
+async def test_every_parameter_is_described(document: dict[str, Any]) -> None:
+    for _, path, operation in operations(document):
+        for parameter in operation.get("parameters", []):
+            assert parameter.get("description"), (path, parameter["name"])
+
+
+async def test_every_body_has_worked_examples(document: dict[str, Any]) -> None:
+    cases = {
+        "relations": {"labels", "relations", "poses", "camera", "map", "ignore", "pairs"},
+        "missing": {"labels", "relations", "poses", "at", "candidates", "ignore"},
+        "outliers": {"labels", "relations", "poses", "misplaced", "threshold", "ignore"},
+        "generate": {"room", "evidence", "context", "varied"},
+        "missing_batch": {"scenes", "bad-entry"},
+        "move_alias": {"promote", "guarded", "create"},
+    }
+    for _, path, operation in operations(document):
         (ok,) = operation["responses"]["200"]["content"].values()
         assert "example" in ok, path
         if "requestBody" not in operation:
             continue
-        schema = operation["requestBody"]["content"]["application/json"]["schema"]
-        examples = schema.get("examples")
-        if examples is None:
-            examples = components[schema["$ref"].rpartition("/")[2]]["examples"]
-        assert examples, path
-        if "administration" in operation["tags"]:
-            continue
-        for example in examples:
-            response = await client.request(method, path, json=example)
-            assert response.status_code == 200, (path, response.text)
+        found = operation["requestBody"]["content"]["application/json"]["examples"]
+        assert cases.get(operation["operationId"], set()) <= found.keys()
+        assert found == {
+            name: case.describe() for name, case in REQUESTS[operation["operationId"]].items()
+        }
+
+
+QUESTIONS = [
+    (operation, name)
+    for operation, cases in REQUESTS.items()
+    if operation != "move_alias"
+    for name in cases
+]
+
+
+@pytest.mark.parametrize(("operation", "name"), QUESTIONS)
+async def test_an_example_is_answered_or_refused_as_it_says(
+    client: httpx.AsyncClient, document: dict[str, Any], operation: str, name: str
+) -> None:
+    case = REQUESTS[operation][name]
+    address = "/" + operation.replace("_", "/")
+    response = await client.post(address, json=case.value)
+    if case.problem is None:
+        assert response.status_code == 200, response.text
+        return
+    found = problem(response, case.problem.status, case.problem.slug)
+    documented = document["paths"][address]["post"]["responses"][str(case.problem.status)]
+    shown = documented["content"]["application/problem+json"]["examples"][case.problem.slug]
+    if name in {"unknown-labels", "contradictory-evidence"}:
+        # The problem in the document is the one that this example meets.
+        assert shown["value"]["errors"] == found["errors"]
+
+
+async def test_a_bad_scene_of_the_batch_spoils_its_own_entry(client: httpx.AsyncClient) -> None:
+    for operation in ("relations_batch", "missing_batch", "outliers_batch"):
+        body = REQUESTS[operation]["bad-entry"].value
+        response = await client.post("/" + operation.replace("_", "/"), json=body)
+        assert [entry["status"] for entry in response.json()["results"]] == [200, 422]
+
+
+@pytest.mark.parametrize("name", REQUESTS["move_alias"])
+async def test_an_example_of_moving_an_alias_does_as_it_says(
+    store: Path, admin: dict[str, str], name: str
+) -> None:
+    case = REQUESTS["move_alias"][name]
+    alias = "mine" if name == "create" else "default"
+    async with serve(store) as client:
+        response = await client.put(f"/models/aliases/{alias}", json=case.value, headers=admin)
+    if case.problem is None:
+        assert response.status_code == 200
+        assert response.json()["model"] == case.value["model"]
+    else:
+        problem(response, case.problem.status, case.problem.slug)
 
 
 async def test_example_answers_have_the_fields_of_real_ones(document: dict[str, Any]) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import pytest
 
+from app.scene.relations import CANONICAL
 from app.serving.queue import Ticket
 from tests.http.conftest import ADMIN_KEY, serve
 from tests.http.stores import VOCABULARY, corrupt, publish
@@ -72,6 +73,9 @@ async def test_the_vocabulary_tells_every_word(client: httpx.AsyncClient) -> Non
         "floor",
         "object",
     ]
+    for entry, known in zip(words["objects"], VOCABULARY.objects, strict=True):
+        size = entry["size"]
+        assert (size and tuple(size[axis] for axis in "xyz")) == known.size
     assert words["room_types"] == list(VOCABULARY.room_types)
     assert len(set(words["relations"])) == 8
     assert words["model"]["version"] == "1.0.0"
@@ -87,7 +91,14 @@ async def test_contexts_name_every_hidden_unit(
         assert [unit["unit"] for unit in units] == list(range(len(units)))
         for unit in units:
             assert unit["objects"]
-            assert {entry["label"] for entry in unit["objects"]} <= set(VOCABULARY.labels)
+            labels = {entry["label"] for entry in unit["objects"]}
+            for entry in unit["relations"]:
+                labels |= {entry["subject"], entry["object"]}
+                assert entry["relation"] in CANONICAL
+                assert entry["weight"] > 0
+            assert labels <= set(VOCABULARY.labels)
+            assert unit["name"].startswith(unit["objects"][0]["label"])
+    assert any(unit["relations"] for units in contexts.values() for unit in units)
 
 
 @pytest.mark.parametrize(

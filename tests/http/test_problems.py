@@ -324,6 +324,15 @@ async def test_unknown_candidates_are_named(client: httpx.AsyncClient) -> None:
     ]
 
 
+async def test_a_field_of_another_part_is_no_suggestion_for_itself(
+    client: httpx.AsyncClient,
+) -> None:
+    response = await client.post("/missing", json={"objects": ["bed"], "x": 1.0})
+    (error,) = problem(response, 422, "invalid-request")["errors"]
+    assert error["pointer"] == "#/x"
+    assert "x" not in error.get("suggestions", [])
+
+
 async def test_misspelt_fields_are_pointed_at_with_suggestions(client: httpx.AsyncClient) -> None:
     body = {"objects": [{"label": "bed", "confidense": 1}], "topk": 3}
     document = problem(await client.post("/relations", json=body), 422, "invalid-request")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
+from app.scene.relations import CANONICAL, opposite
 from app.schemas import (
     GenerateAnswer,
     GenerateRequest,
@@ -158,6 +160,30 @@ async def test_opposites_are_reported_on_request(client: httpx.AsyncClient) -> N
     assert {entry["relation"] for entry in both} >= {"right", "behind", "under", "below"}
 
 
+async def test_disagreements_name_the_pairs_as_they_were_stated(
+    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever is stated of a pair, the same is expected of it."""
+    monkeypatch.setattr(import_module("app.reasoning.disagreements"), "EXPECTED", 0)
+    objects = ["bed", "chair", {"id": "l", "label": "lamp"}]
+    expected = []
+    for relation in (*CANONICAL, *map(opposite, CANONICAL)):
+        stated = [{"subject": "l", "relation": relation, "object": "bed"}]
+        answer = await ask(client, "relations", objects=objects, relations=stated)
+        for entry in answer["disagreements"]:
+            canonical = relation in CANONICAL
+            ends = [entry["subject"], entry["object"]]
+            assert ends == (["l", "bed"] if canonical else ["bed", "l"])
+            assert entry["observed"] == [relation if canonical else opposite(relation)]
+            assert entry["probability"] > entry["observed_probability"]
+            expected.append(entry["expected"] if canonical else opposite(entry["expected"]))
+            assert expected[-1] != relation
+    # All but the likeliest relation itself.
+    assert len(expected) == 7
+    assert len(set(expected)) == 1
+    assert (await ask(client, "relations", objects=objects))["disagreements"] == []
+
+
 async def test_one_object_has_no_relations(client: httpx.AsyncClient) -> None:
     assert (await ask(client, "relations", objects=["bed"]))["relations"] == []
 
@@ -178,6 +204,17 @@ async def test_placements_name_objects_of_the_scene(client: httpx.AsyncClient) -
     anchors = {place["object"] for entry in found for place in entry["placements"]}
     assert anchors <= {"bed", "chair_1", "chair_2", "l"}
     assert anchors
+
+
+async def test_reasons_for_what_is_missing_name_objects_of_the_scene(
+    client: httpx.AsyncClient,
+) -> None:
+    found = (await ask(client, "missing", **SCENE))["missing"]
+    for entry in found:
+        objects = [because["object"] for because in entry["because"]]
+        assert sorted(objects) == ["bed", "chair_1", "l"]
+        sizes = [abs(because["log_odds_change"]) for because in entry["because"]]
+        assert sizes == sorted(sizes, reverse=True)
 
 
 async def test_missing_candidates(client: httpx.AsyncClient) -> None:
@@ -314,3 +351,19 @@ async def test_the_documented_examples_work(
     assert examples
     for example in examples:
         await ask(client, question, **example)
+
+
+async def test_the_place_that_was_asked_about_comes_first(client: httpx.AsyncClient) -> None:
+    """Of the very object, though another of its class comes before it; others stay as they were."""
+    objects = ["bed", {"id": "a", "label": "desk"}, {"id": "b", "label": "desk"}]
+    for relation in (*CANONICAL, *map(opposite, CANONICAL)):
+        place = {"relation": relation, "object": "b"}
+        answer = await ask(client, "missing", objects=objects, at=place)
+        for entry in answer["missing"]:
+            first, *others = entry["placements"]
+            assert {name: first[name] for name in ("relation", "object")} == place
+            listed = [(other["relation"], other["object"]) for other in others]
+            assert (relation, "b") not in listed
+            values = [other["probability"] for other in others]
+            assert values == sorted(values, reverse=True)
+            assert len(entry["placements"]) == 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from typing import Any
 
 import pytest
@@ -305,6 +306,62 @@ def test_orientation_turns_the_footprint() -> None:
     assert ("k", "on-top", "t") in (
         observed(read(objects=[{**board, "orientation": quarter}, book])) or ()
     )
+
+
+Turn = tuple[float, float, float, float]
+
+
+def after(first: Turn, second: Turn) -> Turn:
+    """The turn ``second``, then ``first``: the product of two quaternions (x, y, z, w)."""
+    ax, ay, az, aw = first
+    bx, by, bz, bw = second
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def about_z(angle: float) -> Turn:
+    return (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
+
+
+# From body axes to those of a camera: x right, y down, z forward.
+TO_OPTICAL: Turn = (0.5, -0.5, 0.5, 0.5)
+LYING: Turn = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+
+
+@given(st.integers(0, 2**32))
+def test_one_scene_told_in_three_frames_is_one_scene(seed: int) -> None:
+    """Random boxes, turned and lying, by a robot, by its camera, and in a map."""
+    draw = random.Random(seed)
+    robot = [draw.uniform(-5, 5), draw.uniform(-5, 5), draw.uniform(-7, 7)]
+    cos, sin = math.cos(robot[2]), math.sin(robot[2])
+    told: dict[str, list[Any]] = {"base_link": [], "camera_optical_frame": [], "map": []}
+    for number in range(draw.randint(2, 6)):
+        x, y, z = (draw.uniform(-2, 2) for _ in range(3))
+        turn = about_z(draw.uniform(-4, 4))
+        if draw.random() < 0.4:
+            turn = after(turn, LYING)
+        thing: dict[str, Any] = {"id": str(number), "label": "desk"}
+        if draw.random() < 0.8:
+            thing["size"] = at(*(draw.uniform(0.05, 2) for _ in range(3)))
+        in_map = (robot[0] + cos * x - sin * y, robot[1] + sin * x + cos * y, z)
+        for frame, place, turned in (
+            ("base_link", (x, y, z), turn),
+            ("camera_optical_frame", (-y, -z, x), after(TO_OPTICAL, turn)),
+            ("map", in_map, after(about_z(robot[2]), turn)),
+        ):
+            orientation = dict(zip("xyzw", turned, strict=True))
+            told[frame].append(thing | {"position": at(*place), "orientation": orientation})
+    here = observed(read(objects=told["base_link"], frame_id="base_link"))
+    camera = "camera_optical_frame"
+    assert observed(read(objects=told[camera], frame_id=camera)) == here
+    viewpoint = dict(zip(("x", "y", "yaw"), robot, strict=True))
+    assert observed(read(objects=told["map"], frame_id="map", viewpoint=viewpoint)) == here
+    vertical = {entry for entry in here or () if entry[1] in ("on-top", "above")}
+    assert observed(read(objects=told["map"], frame_id="/map")) == vertical
 
 
 @given(

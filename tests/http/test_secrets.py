@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.http.conftest import ADMIN_KEY, LiveService, launch
+from tests.http.streams import hear, opened, talk
 
 pytestmark = pytest.mark.system
 
@@ -115,11 +116,23 @@ def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> N
         ):
             with socket.create_connection(("127.0.0.1", defective.port), timeout=10) as connection:
                 connection.sendall(text.format(key=key, header=header).encode())
-                if text is left:
+                if text is not broken:
                     connection.shutdown(socket.SHUT_WR)
                 with suppress(ConnectionError):
                     while connection.recv(65536):
                         pass
+    with opened(defective, additional_headers={"X-API-Key": API_KEY}) as stream:
+        for key in SECRETS:
+            stream.send(key)
+            hear(stream)
+            talk(stream, key, seq=1)
+            talk(stream, "open", session=key, model=key)
+            talk(stream, "open", **{key: key})
+        talk(stream, "open", frame_id=MISTAKEN)
+        for key in SECRETS:
+            talk(stream, "update", seq=1, objects=[key])
+            talk(stream, "update", seq=1, remove=[key])
+        talk(stream, "close")
     assert client.get("/health/live").status_code == 200
 
     log = stop(defective)

@@ -116,6 +116,25 @@ async def test_questions_are_counted_until_they_are_answered_and_drawings_are_no
     assert queue.backlog == 0
 
 
+async def test_questions_of_streams_give_way_and_hold_up_no_request(queue: WorkQueue) -> None:
+    order: list[str] = []
+
+    async def ask(name: str, *, gives_way: bool) -> None:
+        def note() -> None:
+            order.append(f"{name}, {queue.backlog} counted")
+
+        await queue.run(note, ENDLESS, kind="cheap", size=1, gives_way=gives_way)
+
+    await asyncio.gather(
+        ask("stream 1", gives_way=True),
+        ask("stream 2", gives_way=True),
+        ask("request", gives_way=False),
+    )
+    # All of one tick: the request is first, and alone is counted.
+    assert order == ["request, 1 counted", "stream 1, 1 counted", "stream 2, 1 counted"]
+    assert queue.backlog == 0
+
+
 async def test_nobody_who_asks_waits_for_a_drawing(queue: WorkQueue) -> None:
     release = threading.Event()
     drawing = asyncio.ensure_future(drawn(queue, lambda: release.wait(30)))

@@ -27,11 +27,19 @@ _METHODS: Final = frozenset(
     ("GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH")
 )
 
+# A response to a request or to a handshake, or a stream that opens.
+_BEGINNINGS = frozenset(
+    ("http.response.start", "websocket.http.response.start", "websocket.accept")
+)
+_SWITCHED: Final = 101
+
 _access = logging.getLogger("app.access")
 
 
 class RequestContext:
     """Gives every request an id, echoes it as ``X-Request-Id``, counts it and writes a line.
+
+    A stream is one request, whose line is written at its end.
 
     A client's own id is kept if it is made of 1–128 unreserved URI characters or colons; any other
     is replaced, so that logs and answers hold nothing a client made up.
@@ -44,7 +52,7 @@ class RequestContext:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection."""
-        if scope["type"] != "http":
+        if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
         given = Headers(scope=scope).get("x-request-id", "")
@@ -58,8 +66,9 @@ class RequestContext:
 
         async def send_with_id(message: Message) -> None:
             nonlocal status
-            if message["type"] == "http.response.start":
-                status = message["status"]
+            if message["type"] in _BEGINNINGS:
+                status = message.get("status", _SWITCHED)
+                message.setdefault("headers", [])
                 MutableHeaders(scope=message)["X-Request-Id"] = request_id
                 if record.answered_at is not None and status < 400:
                     self.metrics.serialised(time.perf_counter() - record.answered_at)
@@ -78,9 +87,11 @@ class RequestContext:
             seconds = time.perf_counter() - began
             if status >= 400 and record.outcome == SUCCESS:
                 record.outcome = OTHER
-            method = scope["method"] if scope["method"] in _METHODS else "-"
+            asked = scope.get("method", "GET")
+            method = asked if asked in _METHODS else "-"
             route = _route(scope)
-            self.metrics.answered(route, method, record.outcome, seconds)
+            took = None if status == _SWITCHED else seconds
+            self.metrics.answered(route, method, record.outcome, took)
             if self.access_log and _access.isEnabledFor(logging.INFO):
                 _access.info(
                     "%s %s %d %.2f ms",

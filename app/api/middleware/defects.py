@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from starlette.requests import Request
+from contextlib import suppress
+from typing import Final
+
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.problems import from_exception, report_defect, respond
+from app.api import catalogue
+from app.api.problems import answer, from_exception, report_defect
+
+# RFC 6455: the server met a condition that it did not expect.
+_DEFECT: Final = 1011
 
 
 class Defects:
@@ -16,7 +22,7 @@ class Defects:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection."""
-        if scope["type"] != "http":
+        if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
         begun = False
@@ -29,9 +35,14 @@ class Defects:
         try:
             await self.app(scope, receive, send_and_note)
         except Exception as error:
-            if begun:
+            if begun and scope["type"] == "http":
                 # Half an answer cannot be taken back: the server breaks the connection off.
                 raise
-            request = Request(scope)
-            report_defect(error, request.state.request_id)
-            await respond(request, from_exception(error))(scope, receive, send)
+            state = scope["state"]
+            report_defect(error, state["request_id"])
+            if begun:
+                state["record"].outcome = catalogue.INTERNAL_ERROR.slug
+                with suppress(OSError):  # the client has gone
+                    await send({"type": "websocket.close", "code": _DEFECT})
+            else:
+                await answer(from_exception(error), scope, receive, send)

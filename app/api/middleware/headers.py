@@ -28,7 +28,7 @@ class SafeHeaders:
         """Serve one connection."""
 
         async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
+            if message["type"] in ("http.response.start", "websocket.http.response.start"):
                 headers = [*message.get("headers", ()), *self._ALWAYS]
                 names = {name for name, _ in headers}
                 if b"content-security-policy" not in names:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pydantic import SecretStr
 from starlette.datastructures import Headers
-from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from app.api import catalogue, keys
-from app.api.problems import ProblemError, respond
+from app.api.problems import ProblemError, answer
 
 
 class KeyGuard:
@@ -26,16 +25,13 @@ class KeyGuard:
         """Serve one connection."""
         if scope["type"] == "lifespan" or keys.is_open(scope) or self._may_enter(scope):
             await self.app(scope, receive, send)
-        elif scope["type"] == "websocket":
-            # Before it is accepted: the server answers the handshake with 403.
-            await send({"type": "websocket.close", "code": 1008})
         else:
             problem = ProblemError(
                 catalogue.UNAUTHORIZED,
                 "This service needs its API key, or for administration its admin key.",
                 headers={"WWW-Authenticate": "Bearer"},
             )
-            await respond(Request(scope), problem)(scope, receive, send)
+            await answer(problem, scope, receive, send)
 
     def _may_enter(self, scope: Scope) -> bool:
         headers = Headers(scope=scope)

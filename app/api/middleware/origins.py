@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from starlette.datastructures import Headers
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import Request
@@ -55,6 +57,25 @@ class CrossOrigin(CORSMiddleware):
         if answer.status_code != 200:
             raise _PreflightRefusedError(answer.headers["vary"])
         return answer
+
+
+def may_connect(headers: Headers, origins: Sequence[str]) -> bool:
+    """Whether a WebSocket is asked for by a page of these origins or of ours, or by no page.
+
+    Browsers ask nobody beforehand whether a page may open one, and let it read what comes: the
+    origin, which no page can change, is all there is to judge by.
+
+    Args:
+        origins: as browsers send them.
+    """
+    origin = headers.get("origin")
+    if origin is None or origin in origins:
+        return True
+    scheme, _, host = origin.partition("://")
+    usual = {"http": ":80", "https": ":443"}.get(scheme)
+    if usual is None or not host:
+        return False
+    return host == headers.get("host", "").lower().removesuffix(usual)
 
 
 class _PreflightRefusedError(Exception):

@@ -1,0 +1,85 @@
+"""Streams for tests: raw messages over a socket, and scenes that change step by step."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from typing import Any
+
+import httpx
+from websockets.sync.client import ClientConnection, connect
+
+from tests.http.conftest import LiveService
+from tests.http.stores import VOCABULARY
+
+LABELS = [entry.label for entry in VOCABULARY.objects]
+ASK: dict[str, Any] = {
+    "missing": {"top_k": 5},
+    "outliers": {},
+    "relations": {"top_k": 12, "include_opposites": True},
+}
+
+
+def opened(service: LiveService, **arguments: Any) -> AbstractContextManager[ClientConnection]:
+    """A WebSocket to a service."""
+    address = f"ws://127.0.0.1:{service.port}/stream"
+    return connect(address, proxy=None, compression=None, **arguments)
+
+
+def say(stream: ClientConnection, kind: str, **fields: Any) -> None:
+    """Send one message."""
+    stream.send(json.dumps({"type": kind, **fields}))
+
+
+def hear(stream: ClientConnection) -> dict[str, Any]:
+    """The next message."""
+    found: dict[str, Any] = json.loads(stream.recv(timeout=30))
+    return found
+
+
+def talk(stream: ClientConnection, kind: str, **fields: Any) -> dict[str, Any]:
+    """Send one message, and hear what the service has to say."""
+    say(stream, kind, **fields)
+    return hear(stream)
+
+
+def posted(client: httpx.Client, scene: dict[str, Any], ask: dict[str, Any]) -> dict[str, Any]:
+    """The lists that one request of each kind answers with about a scene."""
+    lists: dict[str, Any] = {}
+    for question, options in ask.items():
+        response = client.post(f"/{question}", json={**scene, **options})
+        assert response.status_code == 200, response.text
+        own = response.json().items()
+        lists |= {name: value for name, value in own if isinstance(value, list)}
+    lists.pop("ignored")
+    return lists
+
+
+def updates(count: int, seed: int, *, poses: bool = True) -> Iterator[tuple[dict, dict]]:
+    """Random updates of a room of up to twenty things, each with the scene that it leads to."""
+    draw = random.Random(seed)
+    objects: dict[str, dict[str, Any]] = {}
+    scene: dict[str, Any] = {}
+    for number in range(count):
+        update: dict[str, Any] = {}
+        if len(objects) > 4 and draw.random() < 0.2:
+            update["remove"] = draw.sample(sorted(objects), draw.randint(1, 3))
+            for name in update["remove"]:
+                del objects[name]
+        update["objects"] = []
+        for name in draw.sample([f"thing_{k}" for k in range(20)], draw.randint(1, 3)):
+            thing = {"id": name, "label": objects.get(name, {}).get("label", draw.choice(LABELS))}
+            if poses:
+                thing["position"] = {axis: round(draw.uniform(0, 3), 2) for axis in "xyz"}
+            if draw.random() < 0.3:
+                thing["confidence"] = round(draw.uniform(0.2, 1), 2)
+            objects[name] = thing
+            update["objects"].append(thing)
+        if number % 97 == 50:
+            update["room_type"] = draw.choice([None, "bedroom", "bathroom"])
+        if number % 53 == 20:
+            update["stamp"] = {"sec": number, "nanosec": 0}
+        scene |= {name: update[name] for name in ("room_type", "stamp") if name in update}
+        yield update, {**scene, "objects": list(objects.values())}

@@ -1,0 +1,684 @@
+"""Streams over real sockets: what a client holds in the end is what one request would say."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from app.api.catalogue import PROBLEM_TYPES
+from app.changes import applied
+from app.client import (
+    ProblemError,
+    StreamClient,
+    StreamClosedError,
+    StreamProblemError,
+    UnreachableError,
+)
+from app.messages import AnswerMessage
+from tests.chaos.service import memory, running
+from tests.http.conftest import ADMIN_KEY, LiveService, launch
+from tests.http.stores import make_store
+from tests.http.streams import ASK, hear, opened, posted, say, talk, updates
+from tests.http.test_problems import problem
+
+pytestmark = pytest.mark.system
+
+API_KEY = "a-key-for-all-who-ask-0123456789"
+PAGE = "https://panel.example"
+
+
+def is_problem(message: dict[str, Any], status: int, slug: str, seq: int | None = None) -> None:
+    assert message["type"] == "problem", message
+    assert message.get("seq") == seq
+    is_document(message["problem"], status, slug)
+
+
+def is_document(document: dict[str, Any], status: int, slug: str) -> None:
+    assert document["type"] == f"/problems/{slug}"
+    assert document["status"] == status
+    assert document["request_id"]
+
+
+def closed(stream: Any) -> tuple[int, str]:
+    """How a stream was closed; what was still sent is read."""
+    try:
+        while True:
+            stream.recv(timeout=30)
+    except ConnectionClosed as ended:
+        return (1006, "") if ended.rcvd is None else (ended.rcvd.code, ended.rcvd.reason)
+
+
+# --------------------------------------------------------------------------- the same answers
+
+
+@pytest.mark.parametrize("poses", [True, False], ids=["poses", "labels"])
+@pytest.mark.anyio
+async def test_a_thousand_updates_come_to_what_one_request_says(
+    live: LiveService, poses: bool
+) -> None:
+    """Sometimes one at a time, sometimes many: every change in between has to be right."""
+    url = f"http://127.0.0.1:{live.port}"
+    scene: dict[str, Any] = {}
+    pauses = {0, 1, 2, 3, 999, *random.Random(1).sample(range(1000), 100)}
+    covered = 0
+    async with StreamClient(url, ask=ASK) as stream:
+        for number, (update, scene) in enumerate(updates(1000, 7, poses=poses)):  # noqa: B007
+            sent = await stream.update(**update)
+            while number in pauses:
+                answer = await anext(stream)
+                covered += 1 + answer.superseded
+                assert answer.full == (answer.revision == 1)
+                if answer.seq == sent:
+                    break
+        assert covered == 1000
+        assert len(pauses) <= stream.revision <= 1000
+        assert stream.lists == posted(live.client, scene, ASK)
+        assert [entry.label for entry in stream.missing] == [
+            entry["label"] for entry in stream.lists["missing"]
+        ]
+        assert {entry.object for entry in stream.outliers} == {
+            thing["id"] for thing in scene["objects"]
+        }
+        assert len(stream.relations) <= 12
+        assert all(0 <= entry.probability <= 1 for entry in stream.misplaced)
+        assert bool(stream.observed_relations) == poses
+        await stream.close()
+
+
+def test_a_flood_is_answered_about_its_newest_state_only(live: LiveService) -> None:
+    """Nobody reads while thousands of updates come: they are merged, and none is kept."""
+    scene: dict[str, Any] = {}
+    with opened(live) as stream:
+        talk(stream, "open", ask=ASK)
+        before = memory(live)
+        count = 0
+        for turn in range(4):
+            for update, scene in updates(1000, turn):  # noqa: B007 - the last is used
+                count += 1
+                say(stream, "update" if count % 1000 != 1 else "scene", seq=count, **update)
+        grown = memory(live) - before
+        lists: dict[str, Any] = {}
+        answers = covered = 0
+        while True:
+            answer = AnswerMessage.model_validate(hear(stream))
+            answers += 1
+            covered += 1 + answer.superseded
+            before_it = {} if answer.full else lists
+            lists = applied(before_it, answer.changes, answer.dropped)
+            if answer.seq == count:
+                break
+        assert covered == count
+        assert answers < count / 2
+        assert lists == posted(live.client, scene, ASK)
+        assert grown < 16 * 2**20
+        # Nothing is left over: the next message is the answer to a ping.
+        assert talk(stream, "ping") == {"type": "pong"}
+        talk(stream, "close")
+
+
+def test_the_scene_is_told_of_in_an_answer_as_in_a_response(live: LiveService) -> None:
+    with opened(live) as stream:
+        talk(stream, "open", frame_id="base_link", unknown_labels="ignore", model="plain")
+        stamp = {"sec": 3, "nanosec": 4}
+        answer = talk(stream, "update", seq=5, objects=["bed", "gizmo"], stamp=stamp)
+        scene = {"objects": ["bed", "gizmo"], "unknown_labels": "ignore", "model": "plain"}
+        response = live.client.post("/missing", json=scene).json()
+        assert answer["model"] == response["model"]
+        assert answer["ignored"] == response["ignored"] == ["gizmo"]
+        assert (answer["frame_id"], answer["stamp"]) == ("base_link", stamp)
+        # What the model knows nothing of is no scene, and no fault either.
+        answer = talk(stream, "update", seq=6, remove=["bed"])
+        lists = applied({}, AnswerMessage.model_validate(talk(stream, "get")).changes, ())
+        assert lists == {"missing": [], "outliers": [], "misplaced": []}
+        assert answer["alarms"]["raised"] == []
+        talk(stream, "close")
+
+
+def test_asked_for_it_gives_whole_answers(live: LiveService) -> None:
+    with opened(live) as stream:
+        talk(stream, "open", ask=ASK)
+        talk(stream, "update", seq=1, objects=["bed", "lamp"])
+        talk(stream, "update", seq=2, objects=["desk"])
+        answer = AnswerMessage.model_validate(talk(stream, "get"))
+        assert (answer.seq, answer.revision, answer.full, answer.superseded) == (2, 3, True, 0)
+        scene = {"objects": ["bed", "lamp", "desk"]}
+        assert applied({}, answer.changes, ()) == posted(live.client, scene, ASK)
+        talk(stream, "close")
+
+
+def test_an_opening_may_bring_the_scene(live: LiveService) -> None:
+    with opened(live) as stream:
+        assert talk(stream, "open", objects=["bed"], room_type="bedroom")["seq"] == 0
+        answer = hear(stream)
+        assert (answer["type"], answer["seq"], answer["full"]) == ("answer", 0, True)
+        talk(stream, "close")
+
+
+# -------------------------------------------------------------------------------- bad messages
+
+
+@pytest.mark.parametrize(
+    ("text", "slug", "seq"),
+    [
+        ("{", "not-json", None),
+        ('{"type": "update", "seq": 2, "objects": [NaN]}', "not-json", None),
+        ('{"type": "update", "seq": 2, "seq": 3}', "not-json", None),
+        ('{"type": "update", "seq": 2, "objects": ["\\ud800"]}', "not-json", None),
+        ("[" * 10_000, "not-json", None),
+        (b'{"type": "ping"}', "unsupported-media-type", None),
+        ("[]", "invalid-request", None),
+        ('{"type": "upd\\u0000ate", "seq": 2}', "invalid-request", 2),
+        ('{"type": ["update"], "seq": 2}', "invalid-request", 2),
+        ('{"type": "update", "objects": ["bed"]}', "invalid-request", None),
+        ('{"type": "update", "seq": "2"}', "invalid-request", None),
+        ('{"type": "update", "seq": 2, "set": ["bed"]}', "invalid-request", 2),
+        ('{"type": "update", "seq": 2, "objects": [{"label": 1}]}', "invalid-request", 2),
+        ('{"type": "update", "seq": 1, "objects": ["bed"]}', "invalid-request", 1),
+        ('{"type": "update", "seq": 2, "remove": ["sofa"]}', "invalid-request", 2),
+        ('{"type": "update", "seq": 2, "ask": {}}', "invalid-request", 2),
+        ('{"type": "update", "seq": 2, "objects": ["gizmo"]}', "unknown-labels", 2),
+        ('{"type": "scene", "seq": 2, "objects": ["gizmo"]}', "unknown-labels", 2),
+        ('{"type": "update", "seq": 2, "model": "nowhere"}', "model-not-found", 2),
+        ('{"type": "open"}', "invalid-request", None),
+        ('{"type": "ping", "seq": 1, "extra": 0}', "invalid-request", 1),
+    ],
+)
+def test_a_bad_message_is_named_and_changes_nothing(
+    live: LiveService, text: str | bytes, slug: str, seq: int | None
+) -> None:
+    with opened(live) as stream:
+        talk(stream, "open", ask=ASK)
+        talk(stream, "update", seq=1, objects=["bed", "lamp"])
+        stream.send(text)
+        is_problem(hear(stream), PROBLEM_TYPES[slug].status, slug, seq)
+        answer = AnswerMessage.model_validate(talk(stream, "get"))
+        assert answer.seq == 1
+        expected = posted(live.client, {"objects": ["bed", "lamp"]}, ASK)
+        assert applied({}, answer.changes, ()) == expected
+        talk(stream, "close")
+
+
+def test_the_first_message_opens(live: LiveService) -> None:
+    with opened(live) as stream:
+        for message in ({"type": "update", "seq": 1}, {"type": "get"}):
+            stream.send(json.dumps(message))
+            is_problem(hear(stream), 422, "invalid-request", message.get("seq"))  # type: ignore[arg-type]
+        is_problem(talk(stream, "open", model="nowhere"), 404, "model-not-found")
+        is_problem(talk(stream, "open", room_type="cellar"), 422, "unknown-labels")
+        # Every one of these left the stream as it was.
+        assert talk(stream, "ping") == {"type": "pong"}
+        assert talk(stream, "open")["type"] == "opened"
+        talk(stream, "close")
+
+
+@pytest.mark.anyio
+async def test_a_client_is_told_and_goes_on(live: LiveService) -> None:
+    async with StreamClient(f"http://127.0.0.1:{live.port}", ask=ASK) as stream:
+        await stream.update(["bed"])
+        await anext(stream)
+        refused = await stream.update(["gizmo"])
+        with pytest.raises(StreamProblemError) as told:
+            await anext(stream)
+        assert told.value.seq == refused
+        assert told.value.problem.type == "/problems/unknown-labels"
+        await stream.replace(["bed", "desk"])
+        async for _ in stream:
+            break
+        assert stream.lists == posted(live.client, {"objects": ["bed", "desk"]}, ASK)
+        await stream.close()
+        assert [answer async for answer in stream] == []
+    with pytest.raises(StreamClosedError):
+        await stream.ping()
+
+
+# ------------------------------------------------------------------------------------- resume
+
+
+def test_a_session_is_resumed_where_it_was(live: LiveService) -> None:
+    with opened(live) as stream:
+        session = talk(stream, "open", ask=ASK, room_type="bedroom")["session"]
+        talk(stream, "update", seq=1, objects=["bed", "lamp"])
+        talk(stream, "update", seq=2, objects=["desk"])
+        stream.socket.close()
+    with opened(live) as stream:
+        again = talk(stream, "open", session=session)
+        assert (again["session"], again["resumed"]) == (session, True)
+        assert (again["seq"], again["revision"]) == (2, 2)
+        answer = AnswerMessage.model_validate(hear(stream))
+        assert (answer.seq, answer.revision, answer.full) == (2, 3, True)
+        scene = {"objects": ["bed", "lamp", "desk"], "room_type": "bedroom"}
+        assert applied({}, answer.changes, ()) == posted(live.client, scene, ASK)
+        is_problem(talk(stream, "update", seq=2, objects=["sofa"]), 422, "invalid-request", 2)
+        assert talk(stream, "update", seq=3, objects=["sofa"])["seq"] == 3
+        talk(stream, "close")
+        assert closed(stream) == (1000, "")
+    # Forgotten when it was closed.
+    with opened(live) as stream:
+        again = talk(stream, "open", session=session)
+        assert again["resumed"] is False
+        assert again["session"] != session
+        assert (again["seq"], again["revision"]) == (0, 0)
+        talk(stream, "close")
+
+
+def test_a_connection_that_hangs_does_not_keep_its_session(live: LiveService) -> None:
+    with opened(live) as first, opened(live) as second:
+        session = talk(first, "open")["session"]
+        talk(first, "update", seq=1, objects=["bed"])
+        # An opening that does not fit leaves the session where it is.
+        is_problem(talk(second, "open", session=session, room_type="cellar"), 422, "unknown-labels")
+        assert talk(first, "update", seq=2, objects=["lamp"])["seq"] == 2
+        again = talk(second, "open", session=session)
+        assert (again["resumed"], again["seq"]) == (True, 2)
+        is_problem(hear(first), 409, "session-resumed")
+        assert closed(first) == (1008, "session-resumed")
+        assert hear(second)["full"] is True
+        talk(second, "close")
+
+
+def test_ids_of_sessions_are_long_and_all_different(live: LiveService) -> None:
+    names = set()
+    for _ in range(5):
+        with opened(live) as stream:
+            names.add(talk(stream, "open")["session"])
+            talk(stream, "close")
+    assert len(names) == 5
+    # 144 random bits.
+    assert {len(name) for name in names} == {24}
+
+
+# -------------------------------------------------------------------------------- model swaps
+
+
+def test_the_next_answer_is_of_the_model_that_was_promoted(tmp_path: Path) -> None:
+    service = launch(make_store(tmp_path / "store"), tmp_path / "log")
+    try:
+        with opened(service) as stream:
+            talk(stream, "open", ask=ASK)
+            answer = talk(stream, "update", seq=1, objects=["bed", "lamp"])
+            assert answer["model"]["version"] == "1.0.0"
+            response = service.client.put(
+                "/models/aliases/default",
+                json={"model": "home@1.1.0"},
+                headers={"X-Admin-Key": ADMIN_KEY},
+            )
+            assert response.status_code == 200
+            answer = talk(stream, "update", seq=2, objects=["desk"])
+            assert answer["model"]["version"] == "1.1.0"
+            assert answer["full"] is True
+            found = AnswerMessage.model_validate(answer)
+            scene = {"objects": ["bed", "lamp", "desk"]}
+            assert applied({}, found.changes, ()) == posted(service.client, scene, ASK)
+            assert talk(stream, "update", seq=3, objects=["sofa"])["full"] is False
+            talk(stream, "close")
+    finally:
+        service.client.close()
+        service.process.terminate()
+        service.process.wait(timeout=30)
+
+
+# -------------------------------------------------------------------------------- who may
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    """A service with keys, with pages of one other origin, and of little patience and room."""
+    folder = tmp_path_factory.mktemp("guarded")
+    with running(
+        make_store(folder / "store"),
+        folder / "log",
+        api_key=API_KEY,
+        cors_origins=PAGE,
+        client_timeout="2",
+        stream_idle="1.5",
+        max_streams="3",
+        max_body_bytes="20000",
+    ) as service:
+        yield service
+
+
+KEY = {"X-API-Key": API_KEY}
+
+
+def refused(service: LiveService, **arguments: Any) -> tuple[dict[str, Any], httpx.Headers]:
+    """The problem that a handshake is answered with, and its headers."""
+    with pytest.raises(InvalidStatus) as found, opened(service, **arguments):
+        pass
+    response = found.value.response
+    headers = httpx.Headers(list(response.headers.raw_items()))
+    assert headers["content-type"] == "application/problem+json"
+    document = json.loads(response.body or b"null")
+    assert document["request_id"] == headers["x-request-id"]
+    assert document["status"] == response.status_code
+    return document, headers
+
+
+def test_a_stream_needs_the_key_and_takes_it_as_any_request(guarded: LiveService) -> None:
+    for wrong in ({}, {"X-API-Key": API_KEY[:-1]}, {"Authorization": f"Basic {API_KEY}"}):
+        document, headers = refused(guarded, additional_headers=wrong)
+        is_document(document, 401, "unauthorized")
+        assert headers["www-authenticate"] == "Bearer"
+    for headers in (KEY, {"Authorization": f"Bearer {API_KEY}"}):
+        with opened(guarded, additional_headers=headers) as stream:
+            assert talk(stream, "open")["type"] == "opened"
+            talk(stream, "close")
+
+
+@pytest.mark.parametrize(
+    ("origin", "allowed"),
+    [
+        (None, True),
+        (PAGE, True),
+        ("http://127.0.0.1:{port}", True),
+        ("https://127.0.0.1:{port}", True),
+        ("http://127.0.0.1", False),
+        ("http://127.0.0.1:1", False),
+        ("http://localhost:{port}", False),
+        ("https://other.example", False),
+        (PAGE + ".other.example", False),
+        ("http://panel.example", False),
+        ("null", False),
+        ("ftp://127.0.0.1:{port}", False),
+        ("127.0.0.1:{port}", False),
+        ("http://", False),
+    ],
+)
+def test_pages_of_other_origins_open_no_stream(
+    guarded: LiveService, origin: str | None, allowed: bool
+) -> None:
+    page = None if origin is None else origin.format(port=guarded.port)
+    arguments: dict[str, Any] = {"origin": page, "additional_headers": KEY}
+    if allowed:
+        with opened(guarded, **arguments) as stream:
+            talk(stream, "open")
+            talk(stream, "close")
+    else:
+        document, _ = refused(guarded, **arguments)
+        is_document(document, 403, "origin-refused")
+
+
+def test_a_client_is_told_why_it_has_no_stream(guarded: LiveService) -> None:
+    async def connect(url: str) -> None:
+        async with StreamClient(url):
+            pass
+
+    with pytest.raises(ProblemError) as refusal:
+        asyncio.run(connect(f"http://127.0.0.1:{guarded.port}"))
+    assert (refusal.value.status, refusal.value.type) == (401, "/problems/unauthorized")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with pytest.raises(UnreachableError):
+        asyncio.run(connect(f"http://127.0.0.1:{port}"))
+
+
+def test_no_more_streams_than_there_is_room_for(guarded: LiveService) -> None:
+    with ExitStack() as streams:
+        for _ in range(3):
+            streams.enter_context(opened(guarded, additional_headers=KEY))
+        document, headers = refused(guarded, additional_headers=KEY)
+        is_document(document, 503, "too-many-streams")
+        assert int(headers["retry-after"]) > 0
+        # Requests have nothing to do with it.
+        response = guarded.client.post("/missing", json={"objects": ["bed"]}, headers=KEY)
+        assert response.status_code == 200
+    for _ in range(100):
+        try:
+            with opened(guarded, additional_headers=KEY) as stream:
+                talk(stream, "open")
+                talk(stream, "close")
+            break
+        except InvalidStatus:
+            time.sleep(0.05)
+    else:
+        pytest.fail("a place is lost")
+
+
+def test_who_is_silent_loses_the_place_and_may_come_again(guarded: LiveService) -> None:
+    with opened(guarded, additional_headers=KEY) as stream:
+        is_problem(hear(stream), 408, "stream-idle")
+        assert closed(stream) == (1008, "stream-idle")
+    with opened(guarded, additional_headers=KEY) as stream:
+        session = talk(stream, "open", objects=["bed"])["session"]
+        hear(stream)
+        for _ in range(4):
+            time.sleep(0.7)
+            assert talk(stream, "ping") == {"type": "pong"}
+        is_problem(hear(stream), 408, "stream-idle")
+        assert closed(stream) == (1008, "stream-idle")
+    with opened(guarded, additional_headers=KEY) as stream:
+        assert talk(stream, "open", session=session)["resumed"] is True
+        hear(stream)
+        talk(stream, "close")
+
+
+def test_a_message_may_be_as_large_as_a_body(guarded: LiveService) -> None:
+    with opened(guarded, additional_headers=KEY) as stream:
+        assert talk(stream, "open")["limits"]["max_message_bytes"] == 20_000
+        text = json.dumps({"type": "update", "seq": 1, "objects": ["bed"]})
+        stream.send(text + " " * (20_000 - len(text)))
+        assert hear(stream)["seq"] == 1
+        stream.send(" " * 20_001)
+        assert closed(stream)[0] == 1009
+
+
+def test_a_message_may_not_come_in_endless_pieces(guarded: LiveService) -> None:
+    with opened(guarded, additional_headers=KEY) as stream:
+        talk(stream, "open")
+        stream.send(part for part in ('{"type"', ': "ping', '"}'))
+        assert hear(stream) == {"type": "pong"}
+
+        def endless() -> Iterator[str]:
+            yield '{"type": "ping"}'
+            while True:
+                yield ""
+
+        with pytest.raises(ConnectionClosed):
+            stream.send(endless())
+        assert closed(stream)[0] == 1008
+
+
+def test_a_text_frame_that_is_no_text_ends_the_stream(guarded: LiveService) -> None:
+    with opened(guarded, additional_headers=KEY) as stream:
+        talk(stream, "open")
+        stream.send(b'{"type": "\xff"}', text=True)
+        assert closed(stream)[0] == 1007
+    assert "Traceback" not in guarded.log.read_text()
+
+
+@pytest.mark.anyio
+async def test_who_does_not_read_is_cut_off_and_nobody_waits_for_him(
+    guarded: LiveService,
+) -> None:
+    """His answers are not kept: what has been replaced meanwhile is never sent."""
+    url = f"ws://127.0.0.1:{guarded.port}/stream"
+    before = memory(guarded)
+    async with connect(
+        url, additional_headers=KEY, proxy=None, compression=None, max_queue=1, ping_interval=None
+    ) as deaf:
+        ask = {"relations": {"top_k": 4096, "include_opposites": True}, "missing": {"top_k": 16}}
+        await deaf.send(json.dumps({"type": "open", "ask": ask}))
+        await deaf.recv()
+        deaf.transport.pause_reading()
+        seq = 0
+        began = time.monotonic()
+        with suppress(ConnectionClosed):
+            while time.monotonic() - began < 60:
+                seq += 1
+                objects = [{"id": f"{k}", "label": "bed"} for k in range(seq % 40, 60)]
+                await deaf.send(json.dumps({"type": "scene", "seq": seq, "objects": objects}))
+                await asyncio.sleep(0.01)
+            pytest.fail("he is still there")
+        assert time.monotonic() - began > 1
+    assert memory(guarded) - before < 32 * 2**20
+    line = await _end_of_stream(guarded)
+    # Most of what he sent has been merged, and few of the answers were made.
+    assert line["messages"] > 2 * line["answers"]
+
+
+async def _end_of_stream(service: LiveService) -> dict[str, Any]:
+    """The newest line of the log about a stream."""
+    for _ in range(100):
+        lines = [json.loads(line) for line in service.log.read_text().splitlines()]
+        found = [line for line in lines if line.get("route") == "/stream" and "answers" in line]
+        if found and found[-1]["messages"] > 20:
+            return found[-1]
+        await asyncio.sleep(0.1)
+    raise AssertionError("no line")
+
+
+# ---------------------------------------------------------------------------------- the end
+
+
+@pytest.mark.parametrize("seconds", ["0", "1"])
+def test_a_service_that_ends_takes_its_leave(tmp_path: Path, seconds: str) -> None:
+    service = launch(make_store(tmp_path / "store"), tmp_path / "log", SCENE_DRAIN_SECONDS=seconds)
+    with opened(service) as stream, opened(service) as unopened:
+        talk(stream, "open")
+        talk(stream, "update", seq=1, objects=["bed"])
+        began = time.monotonic()
+        service.process.send_signal(signal.SIGTERM)
+        farewell = hear(stream)
+        is_problem(farewell, 503, "draining")
+        assert farewell["retry_after"] > 0
+        assert closed(stream) == (1001, "draining")
+        assert closed(unopened) == (1001, "draining")
+    service.client.close()
+    service.process.wait(timeout=30)
+    assert service.process.returncode == -signal.SIGTERM
+    assert time.monotonic() - began < 15
+    log = service.log.read_text()
+    assert "Application shutdown complete" in log
+    assert "Traceback" not in log
+    assert "timeout graceful shutdown" not in log
+
+
+DEFECTIVE = """
+import sys
+from app.__main__ import main
+from app.serving import questions
+
+def fail(*_, **__):
+    raise ZeroDivisionError("of course")
+
+questions.missing = fail
+sys.exit(main())
+"""
+
+
+def test_a_defect_ends_its_stream_alone(shared_store: Path, tmp_path: Path) -> None:
+    service = launch(shared_store, tmp_path / "log", program=("-c", DEFECTIVE))
+    try:
+        with opened(service) as other, opened(service) as stream:
+            talk(other, "open", ask={"outliers": {}})
+            request = stream.response.headers["x-request-id"]  # type: ignore[union-attr]
+            talk(stream, "open")
+            say(stream, "update", seq=1, objects=["bed"])
+            assert closed(stream) == (1011, "")
+            assert talk(other, "update", seq=1, objects=["bed"])["type"] == "answer"
+            talk(other, "close")
+        log = service.log.read_text()
+        assert log.count("of course") == 1
+        (line,) = [
+            entry
+            for entry in map(json.loads, log.splitlines())
+            if entry.get("request_id") == request and entry.get("route") == "/stream"
+        ]
+        assert line["outcome"] == "internal-error"
+    finally:
+        service.client.close()
+        service.process.terminate()
+        service.process.wait(timeout=30)
+
+
+# ----------------------------------------------------------------------------------- HTTP
+
+
+def test_who_does_not_ask_for_a_websocket_is_told_to(live: LiveService) -> None:
+    for headers in ({}, {"Connection": "upgrade", "Upgrade": "h2c"}):
+        response = live.client.get("/stream", headers=headers)
+        problem(response, 426, "upgrade-required")
+        assert response.headers["upgrade"] == "websocket"
+    response = live.client.get("/stream", headers={"Connection": "upgrade", "Upgrade": "websocket"})
+    problem(response, 400, "bad-request")
+    problem(live.client.post("/stream", json={}), 405, "method-not-allowed")
+
+
+def test_a_handshake_behind_other_requests_waits_for_nobody(live: LiveService) -> None:
+    """On a connection that owes an answer there is no WebSocket: both would write at once."""
+    from tests.chaos.wire import Wire, exchange
+
+    handshake = (
+        b"GET /stream HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    )
+    first = b"GET /models HTTP/1.1\r\nHost: x\r\n\r\n"
+    answers, _ = exchange(live.port, Wire("", [first + handshake], None))
+    assert [answer.status for answer in answers] == [200, 426]
+
+
+# ------------------------------------------------------------------------------- what is told
+
+
+def counted(service: LiveService) -> dict[tuple[str, ...], float]:
+    text = service.client.get("/metrics").text
+    return {
+        (sample.name, *sample.labels.values()): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+        if sample.name.startswith(("scene_stream", "scene_requests"))
+    }
+
+
+def test_streams_are_counted_and_logged(tmp_path: Path) -> None:
+    service = launch(make_store(tmp_path / "store"), tmp_path / "log")
+    try:
+        with opened(service) as stream:
+            talk(stream, "open")
+            for seq in (1, 2):
+                talk(stream, "update", seq=seq, objects=["bed"])
+            talk(stream, "update", seq=3, objects=["gizmo"])
+            stream.send('{"type": "noise"}')
+            hear(stream)
+            assert counted(service)["scene_streams",] == 1
+            talk(stream, "close")
+            closed(stream)
+        found = counted(service)
+        assert found["scene_streams",] == 0
+        messages = {key[:0:-1]: value for key, value in found.items() if "messages_total" in key[0]}
+        assert messages == {
+            ("open", "success"): 1,
+            ("update", "success"): 2,
+            ("update", "unknown-labels"): 1,
+            ("-", "invalid-request"): 1,
+            ("close", "success"): 1,
+        }
+        assert found["scene_stream_answers_total", "success"] == 2
+        assert found["scene_stream_superseded_total",] == 0
+        assert found["scene_requests_total", "GET", "success", "/stream"] == 1
+        (line,) = [
+            entry
+            for entry in map(json.loads, service.log.read_text().splitlines())
+            if entry.get("route") == "/stream"
+        ]
+        assert (line["status"], line["outcome"], line["close_code"]) == (101, "success", 1000)
+        assert (line["messages"], line["answers"], line["superseded"]) == (6, 2, 0)
+        assert (line["model"], line["version"]) == ("home", "1.0.0")
+        assert line["compute_ms"] > 0
+    finally:
+        service.client.close()
+        service.process.terminate()
+        service.process.wait(timeout=30)
