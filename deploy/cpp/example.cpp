@@ -1,0 +1,61 @@
+// Asks a running service the four questions about a bedroom: ./example [URL [SECONDS]]
+#include <cstdio>
+#include <cstdlib>
+#include <iostream>
+
+#include "scene_client.hpp"
+
+using scene::json;
+
+int main(int argc, char** argv) {
+  scene::Options options;
+  if (argc > 1) options.url = argv[1];
+  char* end = nullptr;
+  options.timeout = scene::Seconds(argc > 2 ? std::strtod(argv[2], &end) : 0.5);
+  if (argc > 2 && (end == argv[2] || *end != '\0')) {
+    std::cerr << "SECONDS must be a number, not '" << argv[2] << "'\n";
+    return 2;
+  }
+
+  const json lamp = {{"id", "lamp_1"}, {"label", "lamp"}, {"confidence", 0.92}};
+  const json on = {{"subject", "lamp_1"}, {"relation", "on-top"}, {"object", "nightstand"}};
+  json room;
+  room["objects"] = {"bed", "nightstand", lamp};
+  room["relations"] = json::array({on});
+
+  try {
+    scene::Client service(options);  // throws where the URL is none
+    json question = room;
+    question["top_k"] = 3;
+    std::cout << "Missing:\n";
+    const json missing = service.missing(question);
+    for (const auto& entry : missing["missing"])
+      std::printf("  %-20s %.3f\n", entry["label"].get<std::string>().c_str(),
+                  entry["probability"].get<double>());
+
+    std::cout << "How they stand:\n";
+    const json relations = service.relations(question);
+    for (const auto& entry : relations["relations"])
+      std::cout << "  " << entry["subject"].get<std::string>() << " "
+                << entry["relation"].get<std::string>() << " "
+                << entry["object"].get<std::string>() << " " << entry["probability"] << "\n";
+
+    std::cout << "Least fitting first:\n";
+    const json outliers = service.outliers(room);
+    for (const auto& entry : outliers["outliers"])
+      std::cout << "  " << entry["object"].get<std::string>() << " " << entry["probability"]
+                << (entry["is_outlier"].get<bool>() ? " does not belong here" : "") << "\n";
+
+    std::cout << "A scene like it:\n";
+    question = {{"objects", {"bed"}}, {"seed", 7}};
+    const json drawn = service.generate(question);
+    std::cout << "  " << drawn["scenes"][0]["objects"].dump() << "\n";
+  } catch (const scene::ProblemError& problem) {
+    std::cerr << problem.what() << "\n";  // problem.type says which kind; problem.errors, where
+    return 1;
+  } catch (const scene::Error& error) {
+    std::cerr << error.what() << "\n";  // too late, or nobody there: the robot goes on without
+    return 2;
+  }
+  return 0;
+}

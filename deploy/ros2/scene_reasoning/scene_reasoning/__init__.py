@@ -1,0 +1,1 @@
+"""A robot's detections, put to the scene-reasoning service."""

@@ -1,0 +1,19 @@
+from setuptools import setup
+
+NAME = "scene_reasoning"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    packages=[NAME],
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", ["launch/scene.launch.py"]),
+        (f"share/{NAME}/config", ["config/scene.yaml"]),
+    ],
+    install_requires=["setuptools", "scene-boltzmann"],
+    zip_safe=True,
+    description="Asks a scene-reasoning service about a robot's detections",
+    entry_points={"console_scripts": [f"scene = {NAME}.node:main"]},
+)

@@ -1,0 +1,100 @@
+"""A live service over a store of small machines, and every client of it."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from tests.client import callers
+from tests.client.callers import Caller
+from tests.client.peers import Peer
+from tests.http.conftest import LiveService, launch
+from tests.http.stores import make_store
+
+
+@pytest.fixture(scope="session")
+def client_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store that no test changes."""
+    return make_store(tmp_path_factory.mktemp("store"))
+
+
+@pytest.fixture(scope="session")
+def service(client_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    """The service as a process of its own."""
+    service = launch(client_store, tmp_path_factory.mktemp("live") / "log")
+    yield service
+    service.client.close()
+    service.process.terminate()
+    service.process.wait(timeout=30)
+
+
+@pytest.fixture(scope="session")
+def url(service: LiveService) -> str:
+    """Where the service is."""
+    return f"http://127.0.0.1:{service.port}"
+
+
+@pytest.fixture(scope="session")
+def bridge(
+    tmp_path_factory: pytest.TempPathFactory, require_system_tool: Callable[[str], Path]
+) -> Path:
+    """The program that puts calls to the C++ client."""
+    source = Path(__file__).parent / "bridge.cpp"
+    program = tmp_path_factory.mktemp("bridge") / "bridge"
+    compiler, pkg_config = require_system_tool("g++"), require_system_tool("pkg-config")
+    return callers.compiled(source, program, compiler, pkg_config)
+
+
+@pytest.fixture
+def peer() -> Iterator[Callable[[Callable[[socket.socket], None]], Peer]]:
+    """Starts services that do with each connection what they are told; see `peers`."""
+    with ExitStack() as stack:
+
+        def start(behave: Callable[[socket.socket], None]) -> Peer:
+            started = Peer(behave)
+            stack.callback(started.close)
+            return started
+
+        yield start
+
+
+# Every client there is: whoever adds one adds it here, and the contract is asked of it too.
+OVER_HTTP = ("sync", "async", pytest.param("cpp", marks=pytest.mark.system))
+EVERY = (*OVER_HTTP, "offline")
+
+
+@pytest.fixture
+def open_caller(request: pytest.FixtureRequest) -> Callable[..., AbstractContextManager[Caller]]:
+    """Opens a client of the kind that the test is parametrised with, at a URL."""
+    match request.param:
+        case "sync":
+            return callers.sync_caller
+        case "async":
+            return callers.async_caller
+        case "cpp":
+            return partial(callers.cpp_caller, request.getfixturevalue("bridge"))
+        case other:
+            raise AssertionError(other)
+
+
+@pytest.fixture(scope="session")
+def caller(request: pytest.FixtureRequest, url: str) -> Iterator[Caller]:
+    """A client of the kind that the test is parametrised with, of the live service."""
+    match request.param:
+        case "sync":
+            opened: AbstractContextManager[Caller] = callers.sync_caller(url)
+        case "async":
+            opened = callers.async_caller(url)
+        case "offline":
+            opened = callers.offline_caller(request.getfixturevalue("client_store"))
+        case "cpp":
+            opened = callers.cpp_caller(request.getfixturevalue("bridge"), url)
+        case other:
+            raise AssertionError(other)
+    with opened as found:
+        yield found

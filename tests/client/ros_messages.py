@@ -1,0 +1,115 @@
+"""ROS messages for tests: the published layouts, read by the parser that reads bags.
+
+`Layout.current` is that of vision_msgs from Humble on, `Layout.former` that of
+Foxy. Messages are plain dataclasses; `blank` makes one with ROS's defaults, as rclpy's constructors
+do, and `to_json` writes one as rosbridge does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+_COMMON = {
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections",
+    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nDetection2D[] detections",
+    "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name",
+    "vision_msgs/msg/LabelInfo": (
+        "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold"
+    ),
+}
+_CURRENT = _COMMON | {
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
+    ),
+    "vision_msgs/msg/Point2D": "float64 x\nfloat64 y",
+    "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
+    "vision_msgs/msg/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+    "vision_msgs/msg/Detection3D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id"
+    ),
+    "vision_msgs/msg/Detection2D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox2D bbox\nstring id"
+    ),
+}
+_FORMER = _COMMON | {
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose"
+    ),
+    "vision_msgs/msg/BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+    "vision_msgs/msg/Detection3D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\n"
+        "sensor_msgs/PointCloud2 source_cloud\nbool is_tracking\nstring tracking_id"
+    ),
+    "vision_msgs/msg/Detection2D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox2D bbox\n"
+        "sensor_msgs/Image source_img\nbool is_tracking\nstring tracking_id"
+    ),
+}
+
+
+def _store(definitions: dict[str, str]) -> Typestore:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types: dict[str, Any] = {}
+    for name, definition in definitions.items():
+        types.update(get_types_from_msg(definition, name))
+    store.register(types)
+    return store
+
+
+class Layout:
+    """The message types of two generations of vision_msgs."""
+
+    current = _store(_CURRENT)
+    former = _store(_FORMER)
+
+
+def blank(store: Typestore, name: str, /, **values: Any) -> Any:
+    """A message with ROS's defaults, and the fields given."""
+    made = {}
+    for field, (kind, detail) in store.fielddefs[name][1]:
+        made[field] = _blank_field(store, int(kind), detail)
+    if name == "geometry_msgs/msg/Quaternion":
+        made["w"] = 1.0
+    return store.types[name](**(made | values))
+
+
+def _blank_field(store: Typestore, kind: int, detail: Any) -> Any:
+    if kind == 1:
+        return {"string": "", "bool": False, "float64": 0.0, "float32": 0.0}.get(detail[0], 0)
+    if kind == 2:
+        return blank(store, detail)
+    (inner, inner_detail), length = detail
+    if int(inner) == 2 or inner_detail[0] == "string":
+        return []
+    return np.zeros(length if kind == 3 else 0, dtype=inner_detail[0])
+
+
+def through_cdr(store: Typestore, message: Any) -> Any:
+    """The message after a journey over the wire of ROS 2; fails where it breaks its type."""
+    name = message.__msgtype__
+    return store.deserialize_cdr(store.serialize_cdr(message, name), name)
+
+
+def to_json(message: Any) -> Any:
+    """The message as rosbridge sends it: numbers that JSON lacks are null."""
+    if is_dataclass(message) and not isinstance(message, type):
+        return {
+            field.name: to_json(getattr(message, field.name))
+            for field in fields(message)
+            if field.name != "__msgtype__"
+        }
+    if isinstance(message, np.ndarray):
+        return message.tolist()
+    if isinstance(message, list):
+        return [to_json(entry) for entry in message]
+    if isinstance(message, float) and not math.isfinite(message):
+        return None
+    return message

@@ -1,0 +1,306 @@
+"""``scene``, as people type it and scripts branch on it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner, Result
+
+from app import __version__
+from app.client import Client, tables
+from app.client.command import app
+from tests.client.peers import answer, read_head
+
+SCENE = {"objects": ["bed", "lamp"], "relations": [], "top_k": 2}
+
+
+@pytest.fixture
+def scene(url: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Runs ``scene`` against the live service."""
+    monkeypatch.setenv("SCENE_URL", url)
+    monkeypatch.delenv("SCENE_API_KEY", raising=False)
+
+    def run(*arguments: str, stdin: str | None = None) -> Result:
+        return CliRunner().invoke(app, list(arguments), input=stdin)
+
+    return run
+
+
+def test_what_is_missing_is_a_table(scene: Any, url: str) -> None:
+    done = scene("missing", "bed", "nightstand", "--at", "on-top nightstand", "--top-k", "2")
+    assert done.exit_code == 0
+    with Client(url) as client:
+        found = client.missing(["bed", "nightstand"], at=("on-top", "nightstand"), top_k=2).missing
+    assert len(found) == 2
+    for entry in found:
+        assert entry.label in done.stdout
+        assert f"{entry.probability:.3f}" in done.stdout
+        place = entry.placements[0]
+        assert f"{place.relation} {place.object} {place.probability:.3f}" in done.stdout
+    # No colours where nobody looks.
+    assert "\x1b" not in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "method", "fields"),
+    [
+        (("missing", "bed", "--candidate", "lamp"), "missing", {"candidates": ["lamp"]}),
+        (
+            (
+                "relations",
+                "bed",
+                "garbage bin",
+                "--relation",
+                "garbage bin left bed",
+                "--opposites",
+            ),
+            "relations",
+            {"relations": [("garbage bin", "left", "bed")], "include_opposites": True},
+        ),
+        (("outliers", "bed", "--room", "office"), "outliers", {"room_type": "office"}),
+        (("outliers", "bed", "--threshold", "0.2"), "outliers", {"threshold": 0.2}),
+        (
+            (
+                "generate",
+                "bed",
+                "--count",
+                "2",
+                "--seed",
+                "5",
+                "--temperature",
+                "0.5",
+                "--steps",
+                "3",
+            ),
+            "generate",
+            {"count": 2, "seed": 5, "temperature": 0.5, "steps": 3},
+        ),
+        (("missing", "bed", "--model", "plain"), "missing", {"model": "plain"}),
+    ],
+)
+def test_json_is_the_service_s_answer(
+    scene: Any, url: str, arguments: tuple[str, ...], method: str, fields: dict[str, Any]
+) -> None:
+    done = scene(*arguments, "--json")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    objects = ["bed", "garbage bin"] if "garbage bin" in arguments else ["bed"]
+    with Client(url) as client:
+        expected = getattr(client, method)(objects, **fields)
+    assert found == {
+        **json.loads(expected.model_dump_json(exclude_none=True)),
+        "request_id": found["request_id"],
+    }
+
+
+def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_go_before_it(
+    scene: Any, tmp_path: Path
+) -> None:
+    # A path is known by its slashes, whatever the file is called.
+    path = tmp_path / "scene"
+    path.write_text(json.dumps(SCENE))
+    from_file = json.loads(scene("--json", "missing", str(path)).stdout)
+    piped = json.loads(scene("--json", "missing", "-", stdin=json.dumps(SCENE)).stdout)
+    assert len(from_file["missing"]) == 2
+    assert from_file["missing"] == piped["missing"]
+    one = json.loads(scene("missing", str(path), "--top-k", "1", "--json").stdout)
+    assert [entry["label"] for entry in one["missing"]] == [piped["missing"][0]["label"]]
+    listed = json.loads(scene("outliers", "-", "--json", stdin='["bed", "lamp"]').stdout)
+    assert {entry["object"] for entry in listed["outliers"]} == {"bed", "lamp"}
+
+
+@pytest.mark.parametrize(
+    "arguments", [("models",), ("vocabulary",), ("contexts",), ("outliers", "bed", "toilet")]
+)
+def test_everything_has_a_table(scene: Any, arguments: tuple[str, ...]) -> None:
+    done = scene(*arguments)
+    assert done.exit_code == 0
+    words = {
+        "models": ("home@1.0.0", "default", "triway", "ready"),
+        "vocabulary": ("garbage bin", "trash can, waste basket", "structure"),
+        "contexts": ("layer", "unit"),
+        "outliers": ("toilet", "because"),
+    }
+    for word in words[arguments[0]]:
+        assert word in done.stdout
+
+
+def test_answers_without_a_service_are_the_same(scene: Any, client_store: Path) -> None:
+    over_http = json.loads(scene("missing", "bed", "--json").stdout)
+    done = scene("missing", "bed", "--json", "--offline", str(client_store))
+    offline = json.loads(done.stdout)
+    assert {**offline, "request_id": ""} == {**over_http, "request_id": ""}
+
+
+def test_scenes_are_drawn(scene: Any, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "out.png"
+    done = scene("generate", "--room", "office", "--count", "2", "--plot", str(path))
+    assert done.exit_code == 0, done.stderr
+    assert path.read_bytes().startswith(b"\x89PNG")
+    done = scene("generate", "--plot", str(tmp_path / "out.doc"))
+    assert done.exit_code == 2
+    assert "no picture" in done.stderr
+
+
+def test_without_matplotlib_nothing_is_asked_and_the_way_out_is_said(
+    scene: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.client.command.find_spec", lambda _: None)
+    done = scene("generate", "--plot", str(tmp_path / "out.png"))
+    assert done.exit_code == 2
+    assert "pip install '.[training]' in the repository" in done.stderr
+    assert done.stdout == ""
+
+
+def test_a_refusal_is_1_and_says_what_was_meant(scene: Any) -> None:
+    done = scene("missing", "bed", "nightstnad")
+    assert (done.exit_code, done.stdout) == (1, "")
+    assert "/problems/unknown-labels" in done.stderr
+    assert "did you mean nightstand" in done.stderr
+    assert scene("missing", "bed", "nightstnad", "--ignore-unknown").exit_code == 0
+    assert scene("missing", "bed", "--model", "nonsuch").exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("missing",), "name what is there: labels"),
+        (("missing", "bed", "--at", "over bed"), "--at must be one of left, right"),
+        (("missing", "bed", "--at", "nightstand"), '"on-top desk"'),
+        (("missing", "bed", "--relation", "bed over lamp"), "--relation"),
+        (("missing", "nowhere.json"), "nowhere.json"),
+        (("missing", "scenes/nowhere"), "scenes/nowhere: No such file"),
+        (("missing", "bed", "nowhere.json"), "nowhere.json must stand alone"),
+        (("missing", "-"), "no JSON"),
+        (("missing", "bed", "--timeout", "0"), "the timeout must be"),
+        (("missing", "bed", "--no-such-option"), "no-such-option"),
+        (("--url", "robot", "missing", "bed"), "http://"),
+        (("missing", "bed", "--offline", "nowhere"), "directory"),
+    ],
+)
+def test_a_command_without_sense_is_2(scene: Any, arguments: tuple[str, ...], word: str) -> None:
+    done = scene(*arguments, stdin="{")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert word in done.stderr
+    # A place in a request is said where the fault is in one.
+    assert "#" not in done.stderr
+
+
+def test_nobody_there_is_3_and_too_late_is_4(scene: Any) -> None:
+    # Port 9 is "discard": nothing listens there, and connecting fails at once.
+    assert scene("missing", "bed", "--url", "http://127.0.0.1:9").exit_code == 3
+    done = scene("generate", "--count", "64", "--steps", "2000", "--timeout", "0.01")
+    assert done.exit_code == 4
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "code"),
+    [(b"503 No", b"{}", 5), (b"429 No", b"{}", 5), (b"500 No", b"{}", 6), (b"200 OK", b"{}", 6)],
+)
+def test_busy_is_5_and_anything_else_6(
+    scene: Any, peer: Any, status: bytes, body: bytes, code: int
+) -> None:
+    started = peer(
+        lambda connection: (read_head(connection), answer(connection, body, status, b"60"))
+    )
+    done = scene("models", "--url", started.url)
+    assert (done.exit_code, done.stdout) == (code, "")
+
+
+def test_readiness_is_told_by_the_exit_status(scene: Any, peer: Any) -> None:
+    assert scene("ready").exit_code == 0
+    assert scene("ready", "--url", "http://127.0.0.1:9").exit_code == 3
+    silent = peer(lambda connection: (read_head(connection), connection.recv(1)))
+    assert scene("ready", "--url", silent.url, "--timeout", "0.1").exit_code == 4
+    starting = peer(
+        lambda connection: (read_head(connection), answer(connection, b"{}", b"503 No"))
+    )
+    assert scene("ready", "--url", starting.url).exit_code == 5
+    # Asked once: whoever waits for a service asks in a loop of their own.
+    assert starting.connections == 1
+
+
+def test_the_version_is_told_without_a_service(scene: Any) -> None:
+    done = scene("--version")
+    assert (done.exit_code, done.stdout) == (0, f"scene {__version__}\n")
+
+
+def test_the_key_is_taken_from_the_environment(
+    scene: Any, peer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heads = []
+
+    def listen(connection: Any) -> None:
+        heads.append(read_head(connection).lower())
+        answer(connection, b'{"models":[],"aliases":{}}')
+
+    monkeypatch.setenv("SCENE_API_KEY", "k" * 16)
+    assert scene("models", "--url", peer(listen).url).exit_code == 0
+    assert b"x-api-key: " + b"k" * 16 in heads[0]
+
+
+def test_it_is_a_program(repository: Path, url: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "app.client", "outliers", "bed", "lamp"],
+        cwd=repository,
+        env={**os.environ, "SCENE_URL": url},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "because" in done.stdout
+
+
+def shown(renderable: Any) -> str:
+    console = Console(width=200, markup=False)
+    with console.capture() as capture:
+        console.print(renderable)
+    return capture.get()
+
+
+def test_offsets_reasons_and_disagreements_are_shown_where_an_answer_has_them() -> None:
+    point, spread = SimpleNamespace(x=0.1, y=-0.2, z=0.3), SimpleNamespace(x=0.01, y=0.02, z=0.03)
+    placement = SimpleNamespace(
+        relation="on-top",
+        object="desk",
+        probability=0.5,
+        offset=SimpleNamespace(mean=point, std=spread),
+    )
+    because = [SimpleNamespace(object="bed", log_odds_change=1.5)]
+    entry = SimpleNamespace(
+        label="lamp", probability=0.25, log_odds=-1.0, placements=[placement], because=because
+    )
+    text = shown(tables.missing(SimpleNamespace(missing=[entry])))  # type: ignore[arg-type]
+    assert "on-top desk 0.500 (x +0.10±0.01, y -0.20±0.02, z +0.30±0.03 m)" in text
+    assert "bed +1.50" in text
+    doubt = SimpleNamespace(
+        subject="lamp",
+        object="desk",
+        observed=["left", "above"],
+        expected="on-top",
+        probability=0.9,
+        observed_probability=0.05,
+    )
+    given = SimpleNamespace(relations=[], disagreements=[doubt])
+    text = shown(tables.relations(given))  # type: ignore[arg-type]
+    assert "disagreements" in text
+    assert "left, above" in text
+    assert "on-top 0.900" in text
+
+
+def test_words_of_a_service_cannot_dress_themselves_up() -> None:
+    hostile = SimpleNamespace(object="[red]x[/red]", label=":bed:", probability=0.1, log_odds=0.0)
+    hostile.is_outlier, hostile.because = False, []
+    found = SimpleNamespace(outliers=[hostile], misplaced=[])
+    text = shown(tables.outliers(found))  # type: ignore[arg-type]
+    assert "[red]x[/red]" in text

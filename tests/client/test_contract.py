@@ -1,0 +1,238 @@
+"""What every client promises, asked of each of them: the service's answers, and its problems."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.client import (
+    Client,
+    DeadlineError,
+    InvalidRequestError,
+    OfflineClient,
+    ProblemError,
+)
+from app.schemas import _BEDROOM, _POSES, Answer
+from tests.client.callers import Caller
+from tests.client.conftest import EVERY
+from tests.conftest import REPOSITORY
+from tests.http.conftest import ADMIN_KEY, LiveService, launch
+from tests.http.stores import make_store
+
+every_client = pytest.mark.parametrize("caller", EVERY, indirect=True)
+
+POSED: dict[str, Any] = {**_POSES, "objects": _POSES["objects"][:2]}
+QUESTIONS: list[tuple[str, dict[str, Any]]] = [
+    ("relations", {"objects": ["bed", "lamp", "chair", "chair"], "top_k": 5}),
+    ("relations", {**_BEDROOM, "include_opposites": True, "min_probability": 0.1}),
+    (
+        "relations",
+        {"objects": ["bed", "lamp"], "pairs": [{"subject": "bed", "object": "lamp"}]},
+    ),
+    ("missing", {**_BEDROOM, "top_k": 3}),
+    ("missing", {"objects": ["desk"], "at": {"relation": "on-top", "object": "desk"}}),
+    ("missing", {"objects": ["desk", "bed"], "candidates": ["lamp", "TV"], "model": "plain"}),
+    ("missing", {"objects": ["desk", "unheard-of"], "unknown_labels": "ignore"}),
+    ("missing", POSED),
+    ("outliers", {**_BEDROOM, "threshold": 0.25}),
+    ("outliers", {"objects": ["bed"], "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}),
+    ("generate", {"objects": ["bed"], "count": 3, "seed": 7, "temperature": 0.5}),
+    ("generate", {"objects": [], "room_type": "office", "seed": 1, "steps": 5, "model": "deep"}),
+]
+
+
+def _same(answer: dict[str, Any], other: dict[str, Any]) -> bool:
+    return {**answer, "request_id": ""} == {**other, "request_id": ""}
+
+
+@every_client
+@pytest.mark.parametrize("number", range(len(QUESTIONS)))
+def test_every_question_is_answered_as_the_service_answers_it(
+    caller: Caller, service: LiveService, number: int
+) -> None:
+    question, request = QUESTIONS[number]
+    response = service.client.post(f"/{question}", json=request)
+    assert response.status_code == 200
+    answer = caller(question, request)
+    assert answer["request_id"]
+    # Every probability to its last digit.
+    assert _same(answer, response.json())
+
+
+@pytest.mark.parametrize("number", range(len(QUESTIONS)))
+def test_typed_answers_keep_every_byte(
+    service: LiveService, url: str, client_store: Path, number: int
+) -> None:
+    question, request = QUESTIONS[number]
+    sent = service.client.post(f"/{question}", json=request, headers={"X-Request-Id": "r"})
+    with Client(url) as client:
+        answer: Answer = getattr(client, question)(request)
+        renamed = answer.model_copy(update={"request_id": "r"})
+        assert renamed.model_dump_json(exclude_none=True) == sent.text
+
+
+@every_client
+def test_a_batch_is_answered_in_order_each_entry_by_itself(
+    caller: Caller, service: LiveService
+) -> None:
+    scenes = [{"objects": ["bed"]}, {"objects": ["nonsuch"]}, {"objects": ["desk", "lamp"]}]
+    for question in ("relations", "missing", "outliers"):
+        found = caller(f"{question}_batch", scenes)["results"]
+        assert [entry["status"] for entry in found] == [200, 422, 200]
+        assert found[1]["problem"]["type"] == "/problems/unknown-labels"
+        response = service.client.post(f"/{question}", json=scenes[2]).json()
+        assert _same(found[2]["result"], response)
+
+
+@every_client
+def test_models_are_listed(caller: Caller, service: LiveService) -> None:
+    assert caller("models") == service.client.get("/models").json()
+
+
+@every_client
+def test_readiness_is_told(caller: Caller) -> None:
+    assert caller("is_ready") is True
+
+
+@every_client
+def test_an_unknown_label_is_a_problem_with_suggestions(caller: Caller) -> None:
+    with pytest.raises(ProblemError) as raised:
+        caller("missing", {"objects": ["bed", "nightstnad"]})
+    problem = raised.value
+    assert (problem.type, problem.status) == ("/problems/unknown-labels", 422)
+    (error,) = problem.errors
+    assert error.pointer == "#/objects/1"
+    assert error.suggestions[0] == "nightstand"
+    assert problem.request_id
+    assert problem.title
+    assert "1 fault" in problem.detail
+    assert problem.retry_after is None
+
+
+@every_client
+def test_an_unknown_model_is_a_problem(caller: Caller) -> None:
+    for reference in ("nonsuch", "home@9.9.9"):
+        with pytest.raises(ProblemError) as raised:
+            caller("outliers", {"objects": ["bed"], "model": reference})
+        assert (raised.value.type, raised.value.status) == ("/problems/model-not-found", 404)
+
+
+@every_client
+def test_a_contradiction_is_a_problem(caller: Caller) -> None:
+    relation = {"subject": "bed", "relation": "left", "object": "bed"}
+    with pytest.raises(ProblemError) as raised:
+        caller("relations", {"objects": ["bed"], "relations": [relation]})
+    assert raised.value.type == "/problems/contradictory-evidence"
+    assert raised.value.errors[0].pointer.startswith("#/relations/0")
+
+
+@every_client
+def test_who_cannot_wait_is_told_so_and_may_ask_again(caller: Caller) -> None:
+    long = {"objects": [], "count": 64, "steps": 2000, "temperature": 5.0}
+    for timeout in (0.001, 0.02):
+        with pytest.raises(DeadlineError):
+            caller("generate", long, timeout=timeout)
+    assert caller("missing", {"objects": ["bed"]})["missing"]
+
+
+def test_clients_without_a_service_answer_the_whole_catalogue_alike(
+    url: str, client_store: Path
+) -> None:
+    with Client(url) as online, OfflineClient(client_store) as offline:
+        for ask in (
+            lambda client: client.model("home"),
+            lambda client: client.model("home", "1.0.0"),
+            lambda client: client.vocabulary(),
+            lambda client: client.vocabulary("plain"),
+            lambda client: client.contexts("deep@0.1.0"),
+            lambda client: client.is_live(),
+        ):
+            assert ask(online) == ask(offline)
+
+
+UNCLOSED = """
+import sys
+from app.client import DeadlineError, OfflineClient
+scene = OfflineClient(sys.argv[1])
+try:
+    scene.generate(count=64, steps=2000, timeout=0.01)
+except DeadlineError:
+    print("late")
+"""
+
+
+def test_an_offline_client_that_nobody_closes_keeps_no_program_from_ending(
+    client_store: Path,
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", UNCLOSED, client_store],
+        cwd=REPOSITORY,
+        # What the environment says of a service does not concern it.
+        env={**os.environ, "SCENE_API_KEY": "short", "SCENE_STORE": "/nowhere"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "late\n", "")
+
+
+def test_a_store_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidRequestError, match="directory"):
+        OfflineClient(tmp_path / "nowhere")
+
+
+def test_a_store_without_a_usable_default_is_not_ready(tmp_path: Path) -> None:
+    with OfflineClient(tmp_path, timeout=1.0) as scene:
+        assert scene.is_live()
+        assert not scene.is_ready()
+        with pytest.raises(ProblemError) as raised:
+            scene.missing(["bed"])
+    assert raised.value.type == "/problems/not-ready"
+
+
+def test_what_is_served_is_changed_alike_with_a_service_and_without(tmp_path: Path) -> None:
+    store = make_store(tmp_path / "store")
+    service = launch(store, tmp_path / "log")
+    try:
+        with Client(f"http://127.0.0.1:{service.port}", admin_key=ADMIN_KEY) as scene:
+            change(scene)
+        with Client(f"http://127.0.0.1:{service.port}") as scene:
+            with pytest.raises(ProblemError) as raised:
+                scene.refresh()
+            assert raised.value.type == "/problems/unauthorized"
+    finally:
+        service.client.close()
+        service.process.terminate()
+        service.process.wait(timeout=30)
+    with OfflineClient(store) as scene:
+        change(scene)
+
+
+def change(scene: Client) -> None:
+    moved = scene.promote("default", "home@1.1.0", expected="home@1.0.0")
+    assert (moved.previous, moved.model) == ("home@1.0.0", "home@1.1.0")
+    assert scene.missing(["bed"]).model.version == "1.1.0"
+    with pytest.raises(ProblemError) as raised:
+        scene.promote("default", "home@1.0.0", expected="home@1.0.0")
+    assert raised.value.type == "/problems/alias-conflict"
+    assert scene.refresh().default.version == "1.1.0"
+    scene.promote("default", "home@1.0.0")
+    assert scene.missing(["bed"]).model.version == "1.0.0"
+
+
+def test_answers_read_as_their_classes(url: str) -> None:
+    with Client(url) as client:
+        answer = client.relations(
+            ["bed", {"label": "lamp", "id": "l"}],
+            relations=[("l", "on-top", "bed")],
+            room_type="bedroom",
+        )
+        assert answer.model.name == "home"
+        assert 0 <= answer.relations[0].probability <= 1
+        assert json.loads(answer.model_dump_json(exclude_none=True))["ignored"] == []

@@ -1,0 +1,122 @@
+"""Pictures of scenes: nothing overlaps, and what can be drawn as stated is."""
+
+from __future__ import annotations
+
+import struct
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.client.layout import HEIGHT, Box, arrange, extent
+from app.schemas import GenerateAnswer, GeneratedScene, ModelReference, Relation
+
+NAMES = ["bed", "desk", "lamp", "book", "a rather long name", "x", "chair", "mug"]
+RELATIONS = ["left", "right", "front", "behind", "on-top", "under", "above", "below"]
+
+
+def stated(*relations: tuple[str, str, str]) -> list[Relation]:
+    return [
+        Relation.model_validate({"subject": a, "relation": r, "object": b}) for a, r, b in relations
+    ]
+
+
+def boxes(objects: list[str], *relations: tuple[str, str, str]) -> dict[str, Box]:
+    return {box.label: box for box in arrange(objects, stated(*relations))}
+
+
+objects = st.lists(st.sampled_from(NAMES), unique=True, max_size=8)
+triples = st.tuples(st.sampled_from(NAMES), st.sampled_from(RELATIONS), st.sampled_from(NAMES))
+
+
+@given(objects=objects, relations=st.lists(triples, max_size=30))
+def test_every_object_is_drawn_once_and_none_overlaps_another(
+    objects: list[str], relations: list[tuple[str, str, str]]
+) -> None:
+    found = arrange(objects, stated(*relations))
+    assert sorted(box.label for box in found) == sorted(objects)
+    for place, one in enumerate(found):
+        assert one.x >= 0
+        assert one.y >= 0
+        for other in found[:place]:
+            apart = (
+                one.x >= other.x + other.width - 1e-9
+                or other.x >= one.x + one.width - 1e-9
+                or one.y >= other.y + other.height - 1e-9
+                or other.y >= one.y + one.height - 1e-9
+            )
+            assert apart, (one, other)
+
+
+@given(order=st.permutations(NAMES))
+def test_a_row_from_left_to_right_is_drawn_as_one(order: list[str]) -> None:
+    row = [(a, "left", b) for a, b in pairwise(order)]
+    found = boxes(NAMES, *row)
+    for a, _, b in row:
+        assert found[a].x + found[a].width < found[b].x
+
+
+def test_near_is_below_and_left_is_left_whichever_way_it_is_said() -> None:
+    said = boxes(["bed", "desk", "lamp"], ("bed", "left", "desk"), ("lamp", "front", "desk"))
+    meant = boxes(["bed", "desk", "lamp"], ("desk", "right", "bed"), ("desk", "behind", "lamp"))
+    assert said == meant
+    assert said["bed"].x + said["bed"].width < said["desk"].x
+    assert said["lamp"].y + said["lamp"].height < said["desk"].y
+
+
+def test_what_lies_on_something_is_drawn_on_it() -> None:
+    found = boxes(
+        ["desk", "lamp", "book", "x"], ("lamp", "on-top", "desk"), ("desk", "under", "book")
+    )
+    desk = found["desk"]
+    for name in ("lamp", "book"):
+        assert found[name].y == desk.y + HEIGHT
+        assert desk.x <= found[name].x
+        assert found[name].x + found[name].width <= desk.x + desk.width
+    assert boxes(["desk", "lamp"], ("lamp", "above", "desk"))["lamp"].y > desk.y + HEIGHT
+
+
+def test_of_what_contradicts_itself_the_first_said_is_drawn() -> None:
+    found = boxes(["bed", "desk"], ("bed", "left", "desk"), ("desk", "left", "bed"))
+    assert found["bed"].x < found["desk"].x
+    found = boxes(["bed", "desk"], ("bed", "on-top", "desk"), ("desk", "on-top", "bed"))
+    assert found["bed"].y > found["desk"].y
+
+
+def test_nothing_takes_no_room() -> None:
+    assert extent(arrange([], [])) == (0.0, 0.0)
+
+
+def answer(*scenes: GeneratedScene) -> GenerateAnswer:
+    model = ModelReference(name="home", version="1.0.0", variant="rbm", digest="0")
+    return GenerateAnswer(model=model, request_id="r", seed=7, scenes=list(scenes))
+
+
+def scene(objects: list[str], *relations: tuple[str, str, str]) -> GeneratedScene:
+    return GeneratedScene(objects=objects, relations=stated(*relations), log_score=-1.0, context={})
+
+
+@pytest.mark.parametrize("count", [1, 3, 16])
+def test_every_scene_is_in_the_picture(tmp_path: Path, count: int) -> None:
+    plot = pytest.importorskip("app.client.plot")
+    room = scene(
+        ["desk", "lamp", "$chair$"], ("lamp", "on-top", "desk"), ("lamp", "left", "$chair$")
+    )
+    path = tmp_path / "scenes.svg"
+    plot.draw(answer(*[room] * count), path)
+    text = path.read_text()
+    assert text.count("<!-- desk -->") == count
+    assert f"scene {count} of seed 7" in text
+
+
+def test_a_picture_of_the_largest_answer_stays_within_bounds(tmp_path: Path) -> None:
+    plot = pytest.importorskip("app.client.plot")
+    names = [f"thing {number}" for number in range(200)]
+    row = [(a, "left", b) for a, b in pairwise(names)]
+    path = tmp_path / "scenes.png"
+    plot.draw(answer(scene(names, *row), scene([])), path)
+    width, height = struct.unpack(">II", path.read_bytes()[16:24])
+    assert 1000 < width <= 6000
+    assert height <= 6000

@@ -1,0 +1,220 @@
+"""What the clients send: the body, the headers, and what is not sent at all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import pytest
+
+from app.client import AsyncClient, Client, InvalidRequestError, ProblemError
+from app.schemas import (
+    Anchor,
+    Detection,
+    MissingRequest,
+    Position,
+    Relation,
+    RelationsRequest,
+    SceneRequest,
+)
+
+MODEL = {"name": "a", "version": "1.0.0", "variant": "rbm", "digest": "0"}
+EVERYTHING: dict[str, Any] = {
+    "model": MODEL,
+    "request_id": "r",
+    "relations": [],
+    "disagreements": [],
+    "missing": [],
+    "outliers": [],
+    "misplaced": [],
+    "seed": 1,
+    "scenes": [],
+    "results": [],
+}
+
+
+class Recorder:
+    """A service that finds nothing, and remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.requests: list[httpx.Request] = []
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        self.requests.append(request)
+        return httpx.Response(200, json=EVERYTHING)
+
+    @property
+    def body(self) -> Any:
+        return json.loads(self.requests[-1].content)
+
+
+@pytest.fixture
+def recorder() -> Recorder:
+    return Recorder()
+
+
+@pytest.fixture
+def scene(recorder: Recorder) -> Client:
+    return Client("http://robot/api/", transport=httpx.MockTransport(recorder))
+
+
+def test_only_what_was_said_is_sent(scene: Client, recorder: Recorder) -> None:
+    scene.missing(["bed", "nightstand"], at=("on-top", "nightstand"), top_k=5)
+    assert recorder.body == {
+        "objects": ["bed", "nightstand"],
+        "at": {"relation": "on-top", "object": "nightstand"},
+        "top_k": 5,
+    }
+    request = recorder.requests[-1]
+    assert str(request.url) == "http://robot/api/missing"
+    assert request.headers["content-type"] == "application/json"
+    # A little of the ten seconds has gone already.
+    assert 5000 < int(request.headers["x-request-timeout-ms"]) <= 10_000
+
+
+def test_short_and_long_forms_say_the_same(scene: Client, recorder: Recorder) -> None:
+    lamp = Detection(label="lamp", id="l", position=Position(x=1.0, y=0.0, z=0.5))
+    plain = {"label": "lamp", "id": "l", "position": {"x": 1.0, "y": 0.0, "z": 0.5}}
+    stated = {"subject": "l", "relation": "on-top", "object": "desk"}
+    bodies = []
+    for detection, relation, at in (
+        (lamp, Relation(**stated), Anchor(relation="left", object="desk")),  # type: ignore[arg-type]
+        (plain, stated, {"relation": "left", "object": "desk"}),
+        (plain, ("l", "on-top", "desk"), ("left", "desk")),
+    ):
+        scene.missing(("desk", detection), relations=[relation], at=at)  # type: ignore[list-item, arg-type]
+        bodies.append(recorder.body)
+    assert bodies[0] == bodies[1] == bodies[2]
+    assert bodies[0]["objects"] == ["desk", plain]
+
+
+def test_a_whole_request_is_sent_as_it_is(scene: Client, recorder: Recorder) -> None:
+    request = MissingRequest(objects=["bed"], candidates=["lamp"])
+    scene.missing(request)
+    assert recorder.body == {"objects": ["bed"], "candidates": ["lamp"]}
+    scene.missing({"objects": ["bed"], "candidates": ["lamp"]})
+    assert recorder.body == {"objects": ["bed"], "candidates": ["lamp"]}
+    scene.generate()
+    assert recorder.body == {"objects": []}
+
+
+def test_pairs_may_be_tuples(scene: Client, recorder: Recorder) -> None:
+    scene.relations(["bed", "lamp"], pairs=[("bed", "lamp")])
+    assert recorder.body["pairs"] == [{"subject": "bed", "object": "lamp"}]
+
+
+def test_batches_hold_scenes_of_every_form(scene: Client, recorder: Recorder) -> None:
+    scene.relations_batch([["bed"], {"objects": ["lamp"]}, RelationsRequest(objects=["desk"])])
+    scenes = [{"objects": ["bed"]}, {"objects": ["lamp"]}, {"objects": ["desk"]}]
+    assert recorder.body == {"scenes": scenes}
+    assert recorder.requests[-1].url.path == "/api/relations/batch"
+
+
+def test_the_client_s_model_is_asked_where_a_request_names_none(recorder: Recorder) -> None:
+    scene = Client("http://robot", model="plain", transport=httpx.MockTransport(recorder))
+    scene.relations(["bed"])
+    assert recorder.body["model"] == "plain"
+    scene.relations(["bed"], model="home")
+    assert recorder.body["model"] == "home"
+    scene.relations_batch([["bed"], {"objects": ["bed"], "model": "home"}])
+    assert [entry["model"] for entry in recorder.body["scenes"]] == ["plain", "home"]
+
+
+@pytest.mark.parametrize(
+    ("ask", "pointer", "word"),
+    [
+        (lambda scene: scene.missing([]), "#/objects", "at least 1"),
+        (lambda scene: scene.missing("bed"), "#/objects", "array"),
+        (lambda scene: scene.missing([1]), "#/objects/0", "label"),
+        (lambda scene: scene.missing(["bed"], topk=5), "#/topk", "top_k"),
+        (lambda scene: scene.missing([{"label": "bed", "pose": 1}]), "#/objects/0/pose", "unknown"),
+        (lambda scene: scene.missing(["bed"], top_k="5"), "#/top_k", "integer"),
+        (lambda scene: scene.missing(["bed"], at=("over", "bed")), "#/at/relation", "left"),
+        (lambda scene: scene.missing(["\ud800"]), "#/objects/0", "string"),
+        (lambda scene: scene.generate(temperature=float("nan")), "#/temperature", "number"),
+        (lambda scene: scene.missing(SceneRequest(objects=["bed"]), top_k=1), "#", "top_k"),
+        (lambda scene: scene.missing_batch([["bed"], []]), "#/scenes/1/objects", "at least 1"),
+        (lambda scene: scene.missing_batch([]), "#/scenes", "256"),
+        (lambda scene: scene.missing(["bed"], timeout=0.0), "#", "timeout"),
+        (lambda scene: scene.missing(["bed"], timeout=float("nan")), "#", "timeout"),
+        (lambda scene: scene.missing(["bed"], timeout=601), "#", "timeout"),
+        (lambda scene: scene.vocabulary(".."), "#", "name"),
+        (lambda scene: scene.model("home", ""), "#", "name"),
+        (lambda scene: scene.promote("default", ""), "#/model", "at least 1"),
+    ],
+)
+def test_what_the_service_would_refuse_is_not_sent(
+    scene: Client, recorder: Recorder, ask: Callable[[Client], Any], pointer: str, word: str
+) -> None:
+    with pytest.raises(InvalidRequestError, match=word) as raised:
+        ask(scene)
+    assert pointer in [error.pointer for error in raised.value.errors]
+    assert recorder.requests == []
+
+
+@pytest.mark.parametrize("url", ["", "robot:8000", "ftp://robot", "http://", "http://robot?a=b"])
+def test_an_address_that_is_none_is_refused_at_once(url: str) -> None:
+    with pytest.raises(InvalidRequestError, match="URL"):
+        Client(url)
+    with pytest.raises(InvalidRequestError, match="URL"):
+        AsyncClient(url)
+
+
+def test_keys_go_where_they_are_needed_and_nowhere_else(recorder: Recorder) -> None:
+    transport = httpx.MockTransport(recorder)
+    scene = Client("http://robot", api_key="a" * 16, admin_key="b" * 16, transport=transport)
+    scene.missing(["bed"])
+    assert recorder.requests[-1].headers["x-api-key"] == "a" * 16
+    assert "x-admin-key" not in recorder.requests[-1].headers
+    assert "aaaa" not in repr(scene.options)
+    assert "bbbb" not in repr(scene.options)
+
+
+def test_moving_an_alias_says_what_it_expects_only_if_told() -> None:
+    bodies: list[Any] = []
+    keys: list[str | None] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        bodies.append(json.loads(request.content))
+        keys.append(request.headers.get("x-admin-key"))
+        return httpx.Response(200, json={"request_id": "r", "alias": "a/b", "model": "home"})
+
+    scene = Client("http://robot", admin_key="b" * 16, transport=httpx.MockTransport(answer))
+    scene.promote("default", "home")
+    scene.promote("default", "home", expected=None)
+    scene.promote("default", "home", expected="home@1.0.0")
+    assert bodies == [
+        {"model": "home"},
+        {"model": "home", "expected": None},
+        {"model": "home", "expected": "home@1.0.0"},
+    ]
+    assert keys == ["b" * 16] * 3
+
+
+def test_names_are_quoted_in_addresses() -> None:
+    paths: list[bytes] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        paths.append(request.url.raw_path)
+        return httpx.Response(404)
+
+    scene = Client("http://robot", transport=httpx.MockTransport(answer))
+    for name in ("a/b", "ä b", "home@1.0.0", "../x"):
+        with pytest.raises(ProblemError):
+            scene.vocabulary(name)
+    assert paths == [
+        b"/models/a%2Fb/vocabulary",
+        b"/models/%C3%A4%20b/vocabulary",
+        b"/models/home%401.0.0/vocabulary",
+        b"/models/..%2Fx/vocabulary",
+    ]
+
+
+def test_redirections_are_not_followed(recorder: Recorder) -> None:
+    def answer(_: httpx.Request) -> httpx.Response:
+        return httpx.Response(307, headers={"Location": "http://elsewhere/missing"})
+
+    with pytest.raises(ProblemError, match="307"):
+        Client("http://robot", transport=httpx.MockTransport(answer)).missing(["bed"])

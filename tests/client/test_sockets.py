@@ -1,0 +1,270 @@
+"""The clients over real sockets: one connection for many calls, and deadlines that hold."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import subprocess
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import httpcore
+import pytest
+
+from app.client import (
+    AnswerError,
+    AsyncClient,
+    Client,
+    DeadlineError,
+    ProblemError,
+    UnreachableError,
+    asynchronous,
+    deadline,
+    sync,
+)
+from tests.client.conftest import OVER_HTTP
+from tests.client.peers import answer, read_head
+
+
+def serve(connection: socket.socket) -> None:
+    while True:
+        read_head(connection)
+        answer(connection)
+
+
+def drip(connection: socket.socket) -> None:
+    """Send something every 20 ms, for ever: no single wait is long."""
+    read_head(connection)
+    connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000\r\n\r\n")
+    pause = threading.Event()
+    while True:
+        connection.sendall(b" ")
+        pause.wait(0.02)
+
+
+def drip_head(connection: socket.socket) -> None:
+    read_head(connection)
+    connection.sendall(b"HTTP/1.1 200 OK\r\n")
+    pause = threading.Event()
+    for number in range(10**6):
+        connection.sendall(b"X-%d: y\r\n" % number)
+        pause.wait(0.02)
+
+
+def say_nothing(connection: socket.socket) -> None:
+    read_head(connection)
+    connection.recv(1)
+
+
+def flood(connection: socket.socket) -> None:
+    """Send as fast as it is read: no wait is one at all."""
+    read_head(connection)
+    connection.sendall(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n")
+    while True:
+        connection.sendall(b"400\r\n" + b" " * 1024 + b"\r\n")
+
+
+def break_off(connection: socket.socket) -> None:
+    read_head(connection)
+    connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 100\r\n\r\n{")
+
+
+every_client = pytest.mark.parametrize("open_caller", OVER_HTTP, indirect=True)
+
+
+@every_client
+def test_many_calls_share_one_connection(peer: Any, open_caller: Any) -> None:
+    started = peer(serve)
+    with open_caller(started.url) as call:
+        for _ in range(20):
+            assert call("is_ready") is True
+    assert started.connections == 1
+
+
+@every_client
+@pytest.mark.parametrize("behave", [drip, drip_head, say_nothing, flood])
+def test_no_service_can_keep_anybody_beyond_the_deadline(
+    peer: Any,
+    open_caller: Any,
+    behave: Callable[[socket.socket], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sync, "MAX_ANSWER", 2**50)
+    monkeypatch.setattr(asynchronous, "MAX_ANSWER", 2**50)
+    # Nothing here is timed: were a wait longer than the deadline, it would never end.
+    started = peer(behave)
+    with open_caller(started.url, timeout=0.2) as call:
+        for _ in range(2):
+            with pytest.raises(DeadlineError):
+                call("models")
+        assert call("is_ready") is False
+
+
+def test_nothing_is_sent_after_the_deadline(peer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    heads = []
+
+    def listen(connection: socket.socket) -> None:
+        while True:
+            heads.append(read_head(connection))
+            answer(connection)
+
+    clock = SimpleNamespace(stands=0.0)
+    connect = httpcore.SyncBackend.connect_tcp
+
+    def connect_for_long(*arguments: Any, **named: Any) -> Any:
+        stream = connect(*arguments, **named)
+        clock.stands += 3600.0  # the process was stopped between connecting and sending
+        return stream
+
+    monkeypatch.setattr(deadline, "monotonic", lambda: clock.stands)
+    monkeypatch.setattr(httpcore.SyncBackend, "connect_tcp", connect_for_long)
+    started = peer(listen)
+    with Client(started.url, timeout=5.0) as scene:
+        with pytest.raises(DeadlineError):
+            scene.models()
+        # What is sent in time is, over a connection of its own: the late one was closed.
+        monkeypatch.setattr(httpcore.SyncBackend, "connect_tcp", connect)
+        assert scene.is_ready()
+    assert started.connections == 2
+    assert len(heads) == 1
+
+
+@every_client
+def test_a_connection_that_breaks_is_unreachable_in_the_end(peer: Any, open_caller: Any) -> None:
+    started = peer(break_off)
+    with open_caller(started.url, retries=2) as call, pytest.raises(UnreachableError):
+        call("models")
+    assert started.connections == 3
+
+
+@every_client
+def test_nobody_listening_is_unreachable_and_not_ready(open_caller: Any) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with open_caller(f"http://127.0.0.1:{port}", retries=1) as call:
+        assert call("is_ready") is False
+        with pytest.raises(UnreachableError):
+            call("models")
+
+
+@every_client
+def test_a_busy_service_is_asked_again(peer: Any, open_caller: Any) -> None:
+    statuses = iter([b"503 No", b"429 No", b"200 OK"])
+
+    def busy_at_first(connection: socket.socket) -> None:
+        while True:
+            read_head(connection)
+            answer(connection, b'{"models":[],"aliases":{}}', next(statuses))
+
+    with open_caller(peer(busy_at_first).url) as call:
+        assert call("models")["aliases"] == {}
+    assert next(statuses, None) is None
+
+
+@every_client
+def test_who_asks_for_more_time_than_there_is_is_not_waited_for(
+    peer: Any, open_caller: Any
+) -> None:
+    asked = []
+
+    def busy(connection: socket.socket) -> None:
+        while True:
+            asked.append(read_head(connection))
+            answer(connection, b"{}", b"503 No", retry_after=b"60")
+
+    started = peer(busy)
+    with open_caller(started.url, timeout=30.0) as call, pytest.raises(ProblemError) as raised:
+        call("models")
+    assert (raised.value.status, raised.value.retry_after) == (503, 60.0)
+    assert len(asked) == 1
+
+
+@every_client
+def test_the_key_and_the_time_left_are_told(peer: Any, open_caller: Any) -> None:
+    heads = []
+
+    def listen(connection: socket.socket) -> None:
+        while True:
+            heads.append(read_head(connection))
+            answer(connection)
+
+    with open_caller(peer(listen).url + "/robot/", api_key="k" * 16, timeout=5.0) as call:
+        call("is_ready")
+    (head,) = heads
+    assert head.startswith(b"GET /robot/health/ready HTTP/1.1\r\n")
+    lines = dict(line.lower().split(b": ", 1) for line in head.split(b"\r\n")[1:] if line)
+    assert lines[b"x-api-key"] == b"k" * 16
+    assert 2000 < int(lines[b"x-request-timeout-ms"]) <= 5000
+    # What is unpacked could be of any size.
+    assert lines[b"accept-encoding"] == b"identity"
+
+
+@pytest.mark.system
+@every_client
+def test_over_tls_only_who_is_trusted_is_asked_and_deadlines_hold(
+    peer: Any,
+    open_caller: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    require_system_tool: Callable[[str], Path],
+) -> None:
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    command = [
+        *(require_system_tool("openssl"), "req", "-x509", "-newkey", "ec"),
+        *("-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"),
+        *("-subj", "/CN=robot", "-addext", "subjectAltName=IP:127.0.0.1"),
+        *("-keyout", key, "-out", certificate),
+    ]
+    subprocess.run(command, check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+
+    def secured(behave: Callable[[socket.socket], None]) -> str:
+        def behave_secured(connection: socket.socket) -> None:
+            with context.wrap_socket(connection, server_side=True) as stream:
+                behave(stream)
+
+        return str(peer(behave_secured).url.replace("http:", "https:"))
+
+    with open_caller(secured(serve), retries=0) as call, pytest.raises(UnreachableError):
+        call("models")
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    with open_caller(secured(serve)) as call:
+        assert call("is_ready") is True
+        assert call("is_ready") is True
+    with open_caller(secured(drip), timeout=0.5) as call, pytest.raises(DeadlineError):
+        call("models")
+
+
+@pytest.mark.anyio
+async def test_an_answer_without_end_is_not_kept(
+    peer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sync, "MAX_ANSWER", 1000)
+    monkeypatch.setattr(asynchronous, "MAX_ANSWER", 1000)
+    started = peer(lambda connection: (read_head(connection), answer(connection, b" " * 2000)))
+    with Client(started.url) as scene, pytest.raises(AnswerError, match="too long"):
+        scene.models()
+    async with AsyncClient(started.url) as scene_async:
+        with pytest.raises(AnswerError, match="too long"):
+            await scene_async.models()
+
+
+def test_one_client_serves_many_threads(peer: Any) -> None:
+    started = peer(serve)
+    found: list[bool] = []
+    with Client(started.url) as scene:
+
+        def ask() -> None:
+            found.extend(scene.is_ready() for _ in range(10))
+
+        threads = [threading.Thread(target=ask) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert found == [True] * 80
+    assert started.connections <= 8

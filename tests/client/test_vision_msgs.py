@@ -1,0 +1,630 @@
+"""Detections to requests: what is taken over, what is left out, and that both routes agree."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys.store import Typestore
+from typer.testing import CliRunner
+
+from app.client.command import app
+from app.client.label_maps import COCO
+from app.client.messages import MessageError
+from app.client.vision_msgs import (
+    MAX_OBJECTS,
+    MAX_RELATIONS,
+    SceneFields,
+    from_detection2d_array,
+    from_detection3d_array,
+    from_message,
+    is_message,
+)
+from app.registry import Store
+from app.schemas import SceneRequest
+from tests.client.ros_messages import Layout, blank, through_cdr, to_json
+from tests.http.stores import publish
+
+UNTURNED = (0.0, 0.0, 0.0, 1.0)
+
+
+def pose(position: Any = (0.0, 0.0, 0.0), turn: Any = UNTURNED) -> dict[str, Any]:
+    return {
+        "position": dict(zip("xyz", position, strict=True)),
+        "orientation": dict(zip("xyzw", turn, strict=True)),
+    }
+
+
+def result(class_id: Any, score: Any = 0.9, where: Any = None) -> dict[str, Any]:
+    return {
+        "hypothesis": {"class_id": class_id, "score": score},
+        "pose": {"pose": where or pose(), "covariance": [0.0] * 36},
+    }
+
+
+def seen(
+    *results: dict[str, Any],
+    at: Any = (1.0, 0.0, 0.5),
+    size: Any = (0.5, 0.5, 0.5),
+    turn: Any = UNTURNED,
+    name: str = "",
+    frame: str = "",
+) -> dict[str, Any]:
+    return {
+        "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame},
+        "results": list(results),
+        "bbox": {"center": pose(at, turn), "size": dict(zip("xyz", size, strict=True))},
+        "id": name,
+    }
+
+
+def array(*detections: dict[str, Any], frame: str = "base_link", **header: Any) -> dict[str, Any]:
+    stamp = {"sec": 3, "nanosec": 4}
+    return {
+        "header": {"stamp": stamp, "frame_id": frame, **header},
+        "detections": list(detections),
+    }
+
+
+def only(fields: SceneFields) -> dict[str, Any]:
+    (thing,) = fields["objects"]
+    assert isinstance(thing, dict)
+    return thing
+
+
+def reasons(fields: SceneFields) -> list[tuple[int | None, str]]:
+    return [(note.detection, note.reason) for note in fields.notes]
+
+
+# ---------------------------------------------------------------------------------- 3D, by hand
+
+
+def test_a_detection_becomes_an_object_with_a_pose() -> None:
+    quarter = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+    fields = from_detection3d_array(
+        array(
+            seen(result("lamp", 0.75), at=(1, 2, 3), size=(0.1, 0.2, 0.3), turn=quarter, name="t7")
+        )
+    )
+    assert fields == {
+        "objects": [
+            {
+                "id": "t7",
+                "label": "lamp",
+                "confidence": 0.75,
+                "position": {"x": 1.0, "y": 2.0, "z": 3.0},
+                "size": {"x": 0.1, "y": 0.2, "z": 0.3},
+                "orientation": dict(zip("xyzw", quarter, strict=True)),
+            }
+        ],
+        "frame_id": "base_link",
+        "stamp": {"sec": 3, "nanosec": 4},
+        "unknown_labels": "ignore",
+    }
+    assert fields.notes == ()
+
+
+def test_the_likeliest_hypothesis_counts_wherever_it_stands_in_the_list() -> None:
+    results = [result("cat", 0.2), result("dog", 0.7), result("cow", math.nan), result("ant", None)]
+    thing = only(from_detection3d_array(array(seen(*results))))
+    assert (thing["label"], thing["confidence"]) == ("dog", 0.7)
+
+
+@pytest.mark.parametrize(
+    ("results", "reason"),
+    [
+        ([], "no-hypothesis"),
+        ([result("bed", math.nan)], "no-hypothesis"),
+        ([result("bed", None)], "no-hypothesis"),
+        ([result("bed", 0.0)], "low-score"),
+        ([result("bed", -1.0)], "low-score"),
+        ([result("bed", 0.29)], "low-score"),
+        ([result("", 0.9)], "no-label"),
+        ([result("a\nb", 0.9)], "no-label"),
+        ([result("x" * 101, 0.9)], "no-label"),
+        ([result("12", 0.9)], "no-label"),
+        ([result("7", 0.9)], "unwanted"),
+    ],
+)
+def test_what_names_nothing_surely_is_left_out_and_reported(results: Any, reason: str) -> None:
+    fields = from_detection3d_array(
+        array(seen(*results), seen(result("lamp"))), {"7": None}, min_score=0.3
+    )
+    assert only(fields)["label"] == "lamp"
+    assert reasons(fields) == [(0, reason)]
+
+
+def test_a_score_in_per_cent_is_clipped_and_reported() -> None:
+    fields = from_detection3d_array(array(seen(result("bed", 87.0))))
+    assert only(fields)["confidence"] == 1.0
+    assert reasons(fields) == [(0, "high-score")]
+
+
+@pytest.mark.parametrize("size", [(0, 0, 0), (1, 0, 1), (1, -1, 1), (1, 1, math.nan), (1, 1, 1e5)])
+def test_extents_that_are_none_are_left_out(size: Any) -> None:
+    thing = only(from_detection3d_array(array(seen(result("bed"), size=size))))
+    assert "size" not in thing
+    assert thing["position"] == {"x": 1.0, "y": 0.0, "z": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("turn", "expected"),
+    [
+        ((0, 0, 0, 2), (0.0, 0.0, 0.0, 1.0)),
+        ((0, 0, 3, 4), (0.0, 0.0, 0.6, 0.8)),
+        ((0, 0, 0, 0), None),
+        ((1e-9, 0, 0, 0), None),
+        ((0, 0, 0, math.nan), None),
+        ((1e308, 1e308, 1e308, 1e308), None),
+    ],
+)
+def test_quaternions_are_brought_to_length_one_and_unset_ones_left_out(
+    turn: Any, expected: Any
+) -> None:
+    found = only(from_detection3d_array(array(seen(result("bed"), turn=turn)))).get("orientation")
+    assert found == (expected and dict(zip("xyzw", expected, strict=True)))
+
+
+@pytest.mark.parametrize("at", [(math.nan, 0, 0), (0, math.inf, 1), (None, 1, 2), (1e9, 0, 0)])
+def test_a_thing_at_no_finite_place_is_still_there(at: Any) -> None:
+    fields = from_detection3d_array(array(seen(result("bed"), at=at)))
+    assert set(only(fields)) == {"id", "label", "confidence"}
+    assert reasons(fields) == [(0, "no-position")]
+
+
+def test_a_box_that_was_never_filled_in_gives_way_to_the_pose_of_the_hypothesis() -> None:
+    where = pose((1, 2, 3))
+    empty = {"at": (0, 0, 0), "size": (0, 0, 0)}
+    fields = from_detection3d_array(
+        array(
+            seen(result("cup", 0.1, pose((9, 9, 9))), result("bed", 0.8, where), **empty),
+            seen(result("bed"), **empty),
+            seen(result("bed", 0.8, where), at=(0, 0, 0)),
+        )
+    )
+    positions = [thing.get("position") for thing in fields["objects"]]
+    # A box with a size was filled in, wherever it lies.
+    assert positions == [where["position"], None, {"x": 0.0, "y": 0.0, "z": 0.0}]
+    assert reasons(fields) == [(1, "no-position")]
+
+
+def test_boxes_in_pixels_can_be_left_aside() -> None:
+    where = pose((1, 2, 3))
+    message = array(seen(result("bed", 0.8, where), at=(320, 200, 0), size=(90, 60, 0.01)))
+    thing = only(from_message(message, boxes=False))
+    assert thing["position"] == where["position"]
+    assert "size" not in thing
+
+
+def test_ids_are_the_detectors_own_or_numbered_labels() -> None:
+    fields = from_detection3d_array(
+        array(
+            seen(result("chair")),
+            seen(result("lamp"), name="chair_1"),
+            seen(result("chair")),
+            seen(result("lamp"), name="chair_1"),
+            seen(result("bed"), name=" \n "),
+            seen(result("bed"), name="a\nb"),
+        )
+    )
+    ids = [thing["id"] for thing in fields["objects"]]
+    assert ids == ["chair_2", "chair_1", "chair_3", "lamp_1", "bed_1", "bed_2"]
+    assert reasons(fields) == [(3, "renamed"), (5, "renamed")]
+
+
+def test_the_most_confident_of_too_many_are_kept_in_their_order() -> None:
+    n = MAX_OBJECTS + 40
+    scores = [0.1 + 0.8 * (k * 101 % n) / n for k in range(n)]
+    fields = from_detection3d_array(
+        array(*(seen(result("cup", score), name=str(k)) for k, score in enumerate(scores)))
+    )
+    kept = [int(thing["id"]) for thing in fields["objects"]]
+    floor = sorted(scores)[-MAX_OBJECTS]
+    assert kept == [k for k in range(n) if scores[k] >= floor]
+    assert [reason for _, reason in reasons(fields)] == ["too-many"] * 40
+    SceneRequest(**fields)
+
+
+@pytest.mark.parametrize(
+    ("frame", "sent"),
+    [
+        ("base_link", "base_link"),
+        ("/camera_optical_frame", "camera_optical_frame"),
+        ("//robot/map", "robot/map"),
+        ("", None),
+        ("/", None),
+    ],
+)
+def test_frames_lose_their_leading_slash(frame: str, sent: str | None) -> None:
+    assert from_detection3d_array(array(seen(result("bed")), frame=frame)).get("frame_id") == sent
+
+
+def test_the_frame_of_the_detections_serves_where_the_message_names_none() -> None:
+    fields = from_detection3d_array(
+        array(
+            seen(result("bed"), frame="/odom"),
+            seen(result("cup")),
+            seen(result("lamp"), frame="base_link"),
+            frame="",
+        )
+    )
+    assert fields["frame_id"] == "odom"
+    assert ["position" in thing for thing in fields["objects"]] == [True, True, False]
+    assert reasons(fields) == [(2, "no-position")]
+
+
+@pytest.mark.parametrize(
+    ("stamp", "sent"),
+    [
+        ({"sec": 5, "nanosec": 6}, {"sec": 5, "nanosec": 6}),
+        ({"secs": 5, "nsecs": 6}, {"sec": 5, "nanosec": 6}),  # ROS 1
+        ({"sec": 5, "nanosec": 1_000_000_000}, None),
+        ({"sec": None, "nanosec": 0}, None),
+    ],
+)
+def test_stamps(stamp: Any, sent: Any) -> None:
+    fields = from_detection3d_array(array(seen(result("bed")), stamp=stamp))
+    assert fields.get("stamp") == sent
+    assert reasons(fields) == ([] if sent else [(None, "no-stamp")])
+
+
+@pytest.mark.parametrize("viewpoint", [(1.0, -2.0, 0.5), {"x": 1.0, "y": -2.0, "yaw": 0.5}])
+def test_a_viewpoint_is_passed_on(viewpoint: Any) -> None:
+    fields = from_detection3d_array(array(seen(result("bed"))), viewpoint=viewpoint)
+    assert SceneRequest(**fields).viewpoint.model_dump() == {"x": 1.0, "y": -2.0, "yaw": 0.5}  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"viewpoint": (1.0, 2.0)},
+        {"viewpoint": (1.0, 2.0, math.nan)},
+        {"viewpoint": (1.0, 2.0, 1e4)},
+        {"viewpoint": {"x": 1.0, "y": 1.0}},
+        {"min_score": math.nan},
+        {"unknown_labels": "maybe"},
+        {"label_map": "imagenet"},
+        {"label_map": 3},
+        {"label_map": {"1": 2}},
+        {"label_map": {"class_map": 2}},
+    ],
+)
+def test_wrong_arguments_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(MessageError):
+        from_detection3d_array(array(seen(result("bed"))), **wrong)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        None,
+        [],
+        "bed",
+        {},
+        {"objects": ["bed"]},
+        {"detections": "bed"},
+        {"detections": [{"results": {}}]},
+        {"header": {"frame_id": "a\nb"}, "detections": []},
+    ],
+)
+def test_what_is_no_message_is_refused(message: Any) -> None:
+    with pytest.raises(MessageError):
+        from_message(message)
+
+
+def test_a_view_of_nothing_is_an_empty_scene() -> None:
+    assert from_detection3d_array(array())["objects"] == []
+
+
+# --------------------------------------------------------------------------------- label maps
+
+
+@pytest.mark.parametrize(
+    "label_map",
+    [
+        {"56": "chair", "0": None},
+        {56: "chair", 0: None},
+        [*(["thing"] * 56), "chair"],
+        "coco",
+        {"class_map": [{"class_id": 56, "class_name": "chair"}]},
+        blank(
+            Layout.current,
+            "vision_msgs/msg/LabelInfo",
+            class_map=[
+                blank(
+                    Layout.current, "vision_msgs/msg/VisionClass", class_id=56, class_name="chair"
+                )
+            ],
+        ),
+    ],
+)
+@pytest.mark.parametrize("class_id", ["56", 56, " 56 "])
+def test_numbers_become_labels(label_map: Any, class_id: Any) -> None:
+    fields = from_detection3d_array(array(seen(result(class_id)), seen(result("lamp"))), label_map)
+    assert [thing["label"] for thing in fields["objects"]] == ["chair", "lamp"]
+
+
+def test_numbers_without_a_label_map_are_an_error_that_says_what_to_do() -> None:
+    with pytest.raises(MessageError, match="label_map"):
+        from_detection3d_array(array(seen(result("56")), seen(), seen(result("3", 0.0))))
+    # With one, a class that it lacks is left out.
+    fields = from_detection3d_array(array(seen(result("57")), seen(result("56"))), {"56": "chair"})
+    assert reasons(fields) == [(0, "no-label")]
+
+
+def test_the_default_model_knows_most_of_cocos_indoor_classes(repository: Path) -> None:
+    store = Store(repository / "model_store")
+    vocabulary = store.load(*store.resolve("default")).vocabulary
+    known = {label for label in COCO if vocabulary.index(label) is not None}
+    assert len(COCO) == len(set(COCO)) == 80
+    assert {"chair", "couch", "dining table", "cell phone", "refrigerator", "potted plant"} <= known
+
+
+# ----------------------------------------------------------------------------------------- 2D
+
+
+def flat(
+    class_id: str, u: float, v: float, width: float = 40.0, height: float = 40.0, **rest: Any
+) -> dict[str, Any]:
+    entry = seen(result(class_id, rest.pop("score", 0.9)), **rest)
+    centre = {"position": {"x": u, "y": v}, "theta": 0.0}
+    return entry | {"bbox": {"center": centre, "size_x": width, "size_y": height}}
+
+
+def lefts(fields: SceneFields) -> set[tuple[str, str]]:
+    assert {entry["relation"] for entry in fields["relations"]} <= {"left"}
+    return {(entry["subject"], entry["object"]) for entry in fields["relations"]}
+
+
+def test_an_image_tells_left_from_right_of_neighbours_and_nothing_else() -> None:
+    fields = from_detection2d_array(
+        array(
+            flat("cup", 100, 100),
+            flat("bed", 160, 110),  # right of the cup
+            flat("lamp", 165, 30),  # above both: says nothing
+            flat("door", 900, 100),  # far off
+            flat("rug", 102, 101),  # where the cup is
+            frame="camera_optical_frame",
+        )
+    )
+    assert lefts(fields) == {("cup_1", "bed_1"), ("rug_1", "bed_1")}
+    assert fields["frame_id"] == "camera_optical_frame"
+    assert "relations_complete" not in fields
+    assert all(set(thing) == {"id", "label", "confidence"} for thing in fields["objects"])
+
+
+def test_a_turned_box_counts_as_the_upright_one_around_it() -> None:
+    def apart(theta: float) -> bool:
+        # 200 px long and thin, end to end with a gap; turned by a quarter they are far apart.
+        first, second = flat("cup", 0, 0, 200, 2), flat("bed", 320, 0, 200, 2)
+        for entry in (first, second):
+            entry["bbox"]["center"]["theta"] = theta
+        return not lefts(from_detection2d_array(array(first, second)))
+
+    assert not apart(0.0)
+    assert apart(math.pi / 2)
+
+
+def test_boxes_that_are_none_are_reported() -> None:
+    fields = from_detection2d_array(
+        array(
+            flat("cup", 100, 100),
+            flat("bed", math.nan, 100),
+            flat("lamp", 120, 100, 0, 0),
+            flat("rug", 150, 100, frame="other_camera"),
+        )
+    )
+    assert lefts(fields) == set()
+    assert reasons(fields) == [(1, "no-box"), (2, "no-box"), (3, "no-box")]
+
+
+def test_no_more_relations_than_a_request_holds_and_those_of_the_surest() -> None:
+    n = 120
+    fields = from_detection2d_array(
+        array(*(flat("cup", 10 * k, 0, 2000, 10, score=1 - k / 200, name=str(k)) for k in range(n)))
+    )
+    assert len(fields["relations"]) == MAX_RELATIONS
+    assert reasons(fields) == [(None, "too-many")]
+    surest = {entry["id"] for entry in fields["objects"][:60]}
+    within = [pair for pair in lefts(fields) if set(pair) <= surest]
+    everything = from_detection2d_array(
+        array(*(flat("cup", 10 * k, 0, 2000, 10, name=str(k)) for k in range(60)))
+    )
+    assert set(within) == lefts(everything)
+
+
+# ----------------------------------------------------------------------------- the two routes
+
+
+finite = st.floats(-50, 50, width=32)
+awkward = st.one_of(finite, st.sampled_from([0.0, math.nan, math.inf, -1.0, 1e300]))
+scores = st.one_of(st.floats(0, 1), awkward)
+names = st.one_of(st.sampled_from(["chair", "56", "0", "", " lamp", "a\nb"]), st.text(max_size=5))
+# CDR carries UTF-8: what no UTF-8 text holds cannot come over it.
+ids = names.filter(lambda name: name.isprintable() or name.isspace())
+
+
+def built(store: Typestore, name: str, values: dict[str, Any]) -> Any:
+    return blank(store, f"vision_msgs/msg/{name}", **values)
+
+
+@st.composite
+def messages(draw: st.DrawFn, *, flat: bool, former: bool) -> Any:
+    """A message of either kind in either layout, as an object."""
+    store = Layout.former if former else Layout.current
+    kind = "2D" if flat else "3D"
+
+    def header() -> Any:
+        frame = draw(st.sampled_from(["base_link", "", "/map", "camera_optical_frame"]))
+        stamp = blank(store, "builtin_interfaces/msg/Time", sec=draw(st.integers(-9, 9)), nanosec=7)
+        return blank(store, "std_msgs/msg/Header", frame_id=frame, stamp=stamp)
+
+    def where() -> Any:
+        turn = dict(zip("xyzw", (draw(awkward) for _ in range(4)), strict=True))
+        point = dict(zip("xyz", (draw(awkward) for _ in range(3)), strict=True))
+        return blank(
+            store,
+            "geometry_msgs/msg/Pose",
+            position=blank(store, "geometry_msgs/msg/Point", **point),
+            orientation=blank(store, "geometry_msgs/msg/Quaternion", **turn),
+        )
+
+    def hypothesis() -> Any:
+        placed = blank(store, "geometry_msgs/msg/PoseWithCovariance", pose=where())
+        name, score = draw(ids), draw(scores)
+        if former:
+            rated = {"id": name, "score": score}
+        else:
+            guess = built(store, "ObjectHypothesis", {"class_id": name, "score": score})
+            rated = {"hypothesis": guess}
+        return built(store, "ObjectHypothesisWithPose", {**rated, "pose": placed})
+
+    def box() -> Any:
+        if not flat:
+            size = dict(zip("xyz", (draw(awkward) for _ in range(3)), strict=True))
+            vector = blank(store, "geometry_msgs/msg/Vector3", **size)
+            return built(store, "BoundingBox3D", {"center": where(), "size": vector})
+        x, y, theta = draw(awkward), draw(awkward), draw(awkward)
+        if former:
+            centre = blank(store, "geometry_msgs/msg/Pose2D", x=x, y=y, theta=theta)
+        else:
+            point = built(store, "Point2D", {"x": x, "y": y})
+            centre = built(store, "Pose2D", {"position": point, "theta": theta})
+        extents = {"size_x": draw(awkward), "size_y": draw(awkward)}
+        return built(store, "BoundingBox2D", {"center": centre, **extents})
+
+    def detection() -> Any:
+        results = [hypothesis() for _ in range(draw(st.integers(0, 2)))]
+        values = {"header": header(), "results": results, "bbox": box()}
+        return built(
+            store, f"Detection{kind}", {**values, "tracking_id" if former else "id": draw(ids)}
+        )
+
+    listed = [detection() for _ in range(draw(st.integers(0, 4)))]
+    return built(store, f"Detection{kind}Array", {"header": header(), "detections": listed})
+
+
+@pytest.mark.parametrize("former", [False, True], ids=["current", "former"])
+@pytest.mark.parametrize("flat", [False, True], ids=["3d", "2d"])
+def test_rosbridge_and_the_wire_of_ros_give_one_scene_that_is_a_request(
+    flat: bool, former: bool
+) -> None:
+    store = Layout.former if former else Layout.current
+    convert = from_detection2d_array if flat else from_detection3d_array
+
+    @given(messages(flat=flat, former=former), st.sampled_from([{56: "chair"}, "coco"]))
+    def check(message: Any, label_map: Any) -> None:
+        by_wire = convert(through_cdr(store, message), label_map)
+        bridged = json.loads(json.dumps({"op": "publish", "msg": to_json(message)}))
+        by_bridge = from_message(bridged, label_map)
+        if message.detections:
+            assert by_bridge == by_wire
+            assert by_bridge.notes == by_wire.notes
+        SceneRequest(**by_wire)
+        json.dumps(by_wire, allow_nan=False)
+
+    check()
+
+
+# ------------------------------------------------------------------------------------ anything
+
+json_values = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(),
+        st.floats(),
+        st.text(st.characters(), max_size=6),
+    ),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(), inner)),
+    max_leaves=5,
+)
+
+
+def broken(part: dict[str, Any]) -> st.SearchStrategy[Any]:
+    """A message in which any field may be anything, or not be there."""
+    entries = {
+        name: broken(value) if isinstance(value, dict) else _broken_list(value)
+        for name, value in part.items()
+    }
+    whole = st.fixed_dictionaries({}, optional=entries)
+    return st.one_of(whole, whole, whole, json_values)
+
+
+def _broken_list(value: Any) -> st.SearchStrategy[Any]:
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return st.one_of(st.lists(broken(value[0]), max_size=3), json_values)
+    return st.one_of(st.just(value), json_values)
+
+
+@given(
+    st.one_of(
+        broken(array(seen(result("56"), name="t1"))),
+        broken(array(flat("chair", 1.0, 2.0))),
+        st.fixed_dictionaries(
+            {"detections": st.lists(broken(flat("chair", 1.0, 2.0) | {"header": {}}), max_size=4)}
+        ),
+    ),
+    st.sampled_from([None, "coco", {"56": "chair"}]),
+)
+def test_any_message_is_a_request_or_an_error_of_this_module(message: Any, label_map: Any) -> None:
+    for convert in (from_message, from_detection3d_array, from_detection2d_array):
+        try:
+            fields = convert(message, label_map)
+        except MessageError:
+            continue
+        SceneRequest(**fields)
+        json.dumps(fields, allow_nan=False).encode()
+        ids = [thing["id"] for thing in fields["objects"]]
+        assert len(set(ids)) == len(ids)
+
+
+# --------------------------------------------------------------------------------- the example
+
+
+def test_the_recorded_message_is_a_scene_with_one_detection_left_out(repository: Path) -> None:
+    recorded = json.loads((repository / "deploy/ros2/detections.json").read_text())
+    assert is_message(recorded)
+    assert not is_message({"objects": ["bed"]})
+    fields = from_message(recorded)
+    assert len(fields["objects"]) == len(recorded["msg"]["detections"]) - 1
+    assert reasons(fields) == [(8, "no-hypothesis")]
+    book = fields["objects"][-1]
+    assert "size" not in book
+    assert "orientation" not in book
+
+
+def test_the_command_takes_a_recorded_message_for_a_scene(repository: Path, tmp_path: Path) -> None:
+    publish(tmp_path, "home", "1.0.0", alias="default")
+    recorded = str(repository / "deploy/ros2/detections.json")
+    runner = CliRunner()
+    done = runner.invoke(app, ["--offline", str(tmp_path), "--json", "outliers", recorded])
+    assert done.exit_code == 0, done.output
+    answer = json.loads(done.stdout)
+    assert {thing["object"] for thing in answer["outliers"]} == {
+        *("track_3", "track_5", "track_7", "toilet_1", "book_1")
+    }
+    assert done.stderr == f"{recorded}: detection 8: no hypothesis has a score\n"
+
+    numbers = tmp_path / "numbers.json"
+    numbers.write_text(json.dumps(array(seen(result("56")))))
+    done = runner.invoke(app, ["missing", str(numbers)])
+    assert done.exit_code == 2
+    assert "the class ids are numbers" in done.stderr
+
+
+def test_a_robot_needs_neither_arrays_nor_ros_for_it() -> None:
+    program = (
+        "import sys, app.client.vision_msgs\n"
+        "heavy = {'torch', 'numpy', 'numba', 'fastapi', 'rclpy'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,173 @@
+"""As much of ROS 2 as the example node needs: rclpy's surface, and the published message types.
+
+Messages are those of the parser that reads bags. Every one that is published is written in CDR and
+read back, so one that does not fit its type fails here as it would in ROS.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.client.ros_messages import Layout, blank, through_cdr
+
+STORE = Layout.current
+PACKAGE = Path(__file__).resolve().parents[2] / "deploy" / "ros2" / "scene_reasoning"
+
+
+def message_type(name: str) -> Any:
+    """A class as rclpy has it: called without arguments it is filled with defaults."""
+    constants = {key: value for key, _, value in STORE.fielddefs[name][0]}
+    if name.endswith("DiagnosticStatus"):
+        # rclpy has a type `byte` as bytes of length one.
+        constants = {key: bytes([value]) for key, value in constants.items()}
+
+    def new(_: type, **values: Any) -> Any:
+        return blank(STORE, name, **values)
+
+    return type(name.rpartition("/")[2], (), {**constants, "__new__": new, "ros_name": name})
+
+
+@dataclass
+class Publisher:
+    """What was published, each message as it came over the wire."""
+
+    kind: Any
+    sent: list[Any] = field(default_factory=list)
+
+    def publish(self, message: Any) -> None:
+        assert message.__msgtype__ == self.kind.ros_name
+        for status in getattr(message, "status", ()):
+            assert isinstance(status.level, bytes)
+            status.level = status.level[0]
+        self.sent.append(through_cdr(STORE, message))
+
+
+@dataclass
+class Ros:
+    """One process with one node.
+
+    Attributes:
+        given: parameters, as from a file.
+        declared: those that the node asked for.
+        subscriptions: topic to (message type, callback).
+        publishers: topic to what was published there.
+        timers: (period in seconds, callback).
+    """
+
+    given: dict[str, Any]
+    declared: dict[str, Any] = field(default_factory=dict)
+    subscriptions: dict[str, tuple[Any, Callable[[Any], None]]] = field(default_factory=dict)
+    publishers: dict[str, Publisher] = field(default_factory=dict)
+    timers: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
+    spun: list[Any] = field(default_factory=list)
+    destroyed: bool = False
+
+    def node_type(self) -> type:
+        """The base class of nodes, bound to this process."""
+        ros = self
+
+        class Node:
+            def __init__(self, name: str) -> None:
+                self.name = name
+
+            def get_name(self) -> str:
+                return self.name
+
+            def declare_parameter(self, name: str, default: Any) -> Any:
+                value = ros.given.get(name, default)
+                assert type(value) is type(default), f"{name} changed its type"
+                ros.declared[name] = value
+                return SimpleNamespace(value=value)
+
+            def create_subscription(
+                self, kind: Any, topic: str, callback: Callable[[Any], None], qos: Any
+            ) -> None:
+                ros.subscriptions[topic] = kind, callback
+
+            def create_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
+                return ros.publishers.setdefault(topic, Publisher(kind))
+
+            def create_timer(self, period: float, callback: Callable[[], None]) -> None:
+                ros.timers.append((period, callback))
+
+            def get_clock(self) -> Any:
+                stamp = blank(STORE, "builtin_interfaces/msg/Time", sec=77)
+                return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: stamp))
+
+            def destroy_node(self) -> None:
+                ros.destroyed = True
+
+        return Node
+
+    def modules(self) -> dict[str, ModuleType]:
+        """What the node imports, by name."""
+        found: dict[str, ModuleType] = {}
+
+        def module(name: str, **content: Any) -> None:
+            found[name] = ModuleType(name)
+            vars(found[name]).update(content)
+
+        module(
+            "rclpy",
+            init=lambda: None,
+            try_shutdown=lambda: None,
+            spin=self.spun.append,
+            __path__=[],
+        )
+        module("rclpy.node", Node=self.node_type())
+        module(
+            "rclpy.executors",
+            ExternalShutdownException=type("ExternalShutdownException", (Exception,), {}),
+        )
+        module(
+            "rclpy.qos",
+            qos_profile_sensor_data=object(),
+            QoSProfile=lambda **settings: settings,
+            DurabilityPolicy=SimpleNamespace(TRANSIENT_LOCAL=1, VOLATILE=2),
+        )
+        types: dict[str, list[str]] = {
+            "std_msgs": ["String"],
+            "geometry_msgs": ["PoseWithCovarianceStamped"],
+            "vision_msgs": ["Detection3DArray", "Detection2DArray", "LabelInfo"],
+            "visualization_msgs": ["Marker", "MarkerArray"],
+            "diagnostic_msgs": ["DiagnosticArray", "DiagnosticStatus", "KeyValue"],
+        }
+        for package, names in types.items():
+            module(package, __path__=[])
+            module(
+                f"{package}.msg",
+                **{name: message_type(f"{package}/msg/{name}") for name in names},
+            )
+        return found
+
+
+def load_package(monkeypatch: pytest.MonkeyPatch, ros: Ros | None = None) -> None:
+    """Make the example package importable, anew, and this ROS with it."""
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    for name in [name for name in sys.modules if name.split(".")[0] == "scene_reasoning"]:
+        monkeypatch.delitem(sys.modules, name)
+    for name, module in (ros.modules() if ros else {}).items():
+        monkeypatch.setitem(sys.modules, name, module)
+
+
+def from_json(name: str, values: Any) -> Any:
+    """A message from the JSON of rosbridge."""
+    fields: dict[str, Any] = {}
+    for field_name, (kind, detail) in STORE.fielddefs[name][1]:
+        value = values[field_name]
+        if int(kind) == 2:
+            value = from_json(detail, value)
+        elif int(kind) == 4 and int(detail[0][0]) == 2:
+            value = [from_json(detail[0][1], entry) for entry in value]
+        elif int(kind) == 3:
+            value = np.asarray(value, dtype=detail[0][1][0])
+        fields[field_name] = value
+    return STORE.types[name](**fields)

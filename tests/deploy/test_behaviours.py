@@ -1,0 +1,190 @@
+"""Conditions of behaviour trees, in py_trees itself, against a running service."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import py_trees
+import pytest
+from py_trees.common import Status
+
+from app.client import Client, UnreachableError
+from app.client.vision_msgs import SceneFields, from_message
+from tests.deploy.ros import load_package
+from tests.http.conftest import LiveService
+
+
+@pytest.fixture(scope="module")
+def client(service: LiveService) -> Iterator[Client]:
+    with Client(f"http://127.0.0.1:{service.port}", timeout=20.0) as client:
+        yield client
+
+
+@pytest.fixture
+def scene(repository: Path) -> SceneFields:
+    return from_message(json.loads((repository / "deploy/ros2/detections.json").read_text()))
+
+
+@pytest.fixture
+def behaviours(monkeypatch: pytest.MonkeyPatch) -> Any:
+    load_package(monkeypatch)
+    return importlib.import_module("scene_reasoning.behaviours")
+
+
+Plant = Callable[[Any], Any]
+
+
+@pytest.fixture
+def plant() -> Iterator[Plant]:
+    """Make a tree of one condition, which is taken down at the end."""
+    trees = []
+
+    def make(condition: Any) -> Any:
+        root = py_trees.composites.Sequence("root", memory=True, children=[condition])
+        trees.append(py_trees.trees.BehaviourTree(root))
+        return trees[-1]
+
+    yield make
+    for tree in trees:
+        tree.shutdown()
+
+
+def settle(tree: Any) -> Status:
+    """Tick until the tree has a result."""
+    until = time.monotonic() + 30
+    tree.tick()
+    while tree.root.status is Status.RUNNING:
+        assert time.monotonic() < until
+        time.sleep(0.005)
+        tree.tick()
+    return tree.root.status
+
+
+def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
+    behaviours: Any, client: Client, scene: SceneFields, plant: Plant
+) -> None:
+    best = client.missing(**scene).missing
+    highest = max(best, key=lambda thing: thing.log_odds)
+    for margin, expected in ((0.01, Status.SUCCESS), (-0.01, Status.FAILURE)):
+        condition = behaviours.SceneComplete(
+            "complete", client, lambda: scene, timeout=30.0, log_odds=highest.log_odds + margin
+        )
+        assert settle(plant(condition)) is expected
+        assert condition.answer.missing == best
+        assert (highest.label in condition.feedback_message) is (expected is Status.FAILURE)
+
+
+def test_the_question_can_be_narrowed(
+    behaviours: Any, client: Client, scene: SceneFields, plant: Plant
+) -> None:
+    condition = behaviours.SceneComplete(
+        "lit",
+        client,
+        lambda: scene,
+        timeout=30.0,
+        log_odds=-1e3,
+        candidates=["lamp"],
+        at={"relation": "on-top", "object": "desk"},
+    )
+    assert settle(plant(condition)) is Status.FAILURE
+    assert condition.feedback_message == "missing: lamp"
+
+
+@pytest.mark.parametrize("thing", ["toilet_1", "toilet"])
+def test_a_thing_belongs_unless_it_is_an_outlier(
+    behaviours: Any, client: Client, scene: SceneFields, plant: Plant, thing: str
+) -> None:
+    (toilet,) = (entry for entry in client.outliers(**scene).outliers if entry.object == "toilet_1")
+    for margin, expected in ((0.001, Status.SUCCESS), (-0.001, Status.FAILURE)):
+        condition = behaviours.ObjectBelongs(
+            "belongs",
+            client,
+            lambda: scene,
+            thing,
+            timeout=30.0,
+            threshold=toilet.probability + margin,
+        )
+        assert settle(plant(condition)) is expected
+        assert condition.feedback_message.startswith("toilet_1: an outlier with probability 0.")
+
+
+def test_what_was_not_seen_does_not_belong(
+    behaviours: Any, client: Client, scene: SceneFields, plant: Plant
+) -> None:
+    condition = behaviours.ObjectBelongs("belongs", client, lambda: scene, "sofa", timeout=30.0)
+    assert settle(plant(condition)) is Status.FAILURE
+    assert condition.feedback_message == "no sofa was seen"
+
+
+@pytest.mark.parametrize("fields", [None, {"objects": []}])
+def test_nothing_seen_is_no_complete_scene(
+    behaviours: Any, client: Client, plant: Plant, fields: Any
+) -> None:
+    condition = behaviours.SceneComplete("complete", client, lambda: fields, timeout=30.0)
+    assert settle(plant(condition)) is Status.FAILURE
+    assert condition.feedback_message == "nothing was seen"
+
+
+class Slow:
+    """A client that answers when it is told to."""
+
+    def __init__(self) -> None:
+        self.answering, self.asked = threading.Event(), threading.Semaphore(0)
+        self.scenes: list[Any] = []
+
+    def missing(self, **fields: Any) -> Any:
+        self.scenes.append(fields["objects"])
+        self.asked.release()
+        assert self.answering.wait(30)
+        return SimpleNamespace(missing=[])
+
+
+def test_a_tick_never_waits_and_a_condition_fails_in_time(behaviours: Any, plant: Plant) -> None:
+    client, clock = Slow(), SimpleNamespace(now=100.0)
+    condition = behaviours.SceneComplete("complete", client, lambda: {"objects": ["bed"]})
+    behaviours.time = SimpleNamespace(monotonic=lambda: clock.now)
+    tree = plant(condition)
+    for clock.now in (100.0, 100.5, 100.99):
+        tree.tick()
+        assert tree.root.status is Status.RUNNING
+    clock.now = 101.01
+    tree.tick()
+    assert tree.root.status is Status.FAILURE
+    assert condition.feedback_message == "no answer in time"
+    client.answering.set()
+
+
+def test_the_next_time_it_asks_about_the_scene_of_that_time(behaviours: Any, plant: Plant) -> None:
+    client, scenes = Slow(), iter([["bed"], ["lamp"], ["sofa"]])
+    condition = behaviours.SceneComplete(
+        "complete", client, lambda: {"objects": next(scenes)}, timeout=30.0
+    )
+    tree = plant(condition)
+    tree.tick()
+    assert client.asked.acquire(timeout=30)
+    # Interrupted twice: the second time its question had not even begun.
+    for _ in range(2):
+        tree.root.stop(Status.INVALID)
+        assert condition.status is Status.INVALID
+        tree.tick()
+        assert condition.status is Status.RUNNING
+    client.answering.set()
+    assert settle(tree) is Status.SUCCESS
+    assert client.scenes == [["bed"], ["lamp"]]
+
+
+def test_a_service_that_is_not_there_fails_the_condition(behaviours: Any, plant: Plant) -> None:
+    class Gone:
+        def missing(self, **fields: Any) -> Any:
+            raise UnreachableError("gone")
+
+    condition = behaviours.SceneComplete("complete", Gone(), lambda: {"objects": ["bed"]})
+    assert settle(plant(condition)) is Status.FAILURE
+    assert condition.feedback_message == "UnreachableError: gone"

@@ -1,0 +1,156 @@
+"""Conditions for BehaviorTree.CPP, compiled against a stand-in of it, against a running service."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.client import Client
+from app.client.vision_msgs import SceneFields, from_message
+from tests.client import callers
+from tests.http.conftest import LiveService
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope="module")
+def program(
+    repository: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    require_system_tool: Callable[[str], Path],
+) -> Path:
+    """Ticks one condition as a tree does."""
+    here = Path(__file__).parent
+    return callers.compiled(
+        here / "conditions.cpp",
+        tmp_path_factory.mktemp("conditions") / "conditions",
+        require_system_tool("g++"),
+        require_system_tool("pkg-config"),
+        repository / "deploy" / "ros2" / "behaviortree_cpp",
+        here,
+    )
+
+
+def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 20.0) -> list[Any]:
+    """What becomes of one condition, ticked to its end with one set of ports after the other."""
+    done = subprocess.run(
+        [program, url, kind, str(timeout)],
+        input="".join(json.dumps(entry) + "\n" for entry in ports),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.fixture
+def url(service: LiveService) -> str:
+    return f"http://127.0.0.1:{service.port}"
+
+
+@pytest.fixture
+def scene(repository: Path) -> SceneFields:
+    return from_message(json.loads((repository / "deploy/ros2/detections.json").read_text()))
+
+
+def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(
+    program: Path, url: str, scene: SceneFields
+) -> None:
+    with Client(url, timeout=20.0) as client:
+        missing = client.missing(**scene).missing
+    highest = max(missing, key=lambda thing: thing.log_odds)
+    above, below, default = tick(
+        program,
+        url,
+        "SceneComplete",
+        {"scene": json.dumps(scene), "log_odds": str(highest.log_odds + 0.01)},
+        {"scene": json.dumps(scene), "log_odds": str(highest.log_odds - 0.01)},
+        {"scene": json.dumps(scene)},
+    )
+    assert above == {
+        "status": "SUCCESS",
+        "because": "nothing is missing",
+        "waited": True,
+        "woken": 1,
+    }
+    assert (below["status"], below["because"]) == ("FAILURE", f"missing: {highest.label}")
+    absent = [thing.label for thing in missing if thing.log_odds >= 0]
+    assert (default["status"] == "FAILURE") is bool(absent)
+    assert all(label in default["because"] for label in absent)
+
+
+def test_a_thing_belongs_unless_it_is_an_outlier(
+    program: Path, url: str, scene: SceneFields
+) -> None:
+    with Client(url, timeout=20.0) as client:
+        outliers = client.outliers(**scene).outliers
+    (toilet,) = (thing for thing in outliers if thing.label == "toilet")
+    strict = json.dumps({**scene, "threshold": toilet.probability - 0.001})
+    mild = json.dumps({**scene, "threshold": toilet.probability + 0.001})
+    found = tick(
+        program,
+        url,
+        "ObjectBelongs",
+        {"scene": mild, "object": "toilet_1"},
+        {"scene": strict, "object": "toilet_1"},
+        {"scene": strict, "object": "toilet"},
+        {"scene": strict, "object": "sofa"},
+        {"scene": strict},
+    )
+    assert [(entry["status"], entry["because"]) for entry in found] == [
+        ("SUCCESS", "toilet_1 belongs"),
+        ("FAILURE", "toilet_1 is an outlier"),
+        ("FAILURE", "toilet_1 is an outlier"),
+        ("FAILURE", "no sofa was seen"),
+        ("FAILURE", "no object was named"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("ports", "because"),
+    [
+        ({}, "there is no scene"),
+        ({"scene": "bed"}, "the scene is no JSON object"),
+        ({"scene": "[]"}, "the scene is no JSON object"),
+        ({"scene": "{}"}, "nothing was seen"),
+        ({"scene": '{"objects": []}'}, "nothing was seen"),
+    ],
+)
+def test_what_is_no_scene_fails_at_once(program: Path, ports: Any, because: str) -> None:
+    (found,) = tick(program, "http://127.0.0.1:9", "SceneComplete", ports)
+    assert (found["status"], found["because"]) == ("FAILURE", because)
+    assert not found["waited"]
+
+
+def test_after_a_halt_the_next_scene_is_asked_about(program: Path, url: str) -> None:
+    unknown = {"scene": '{"objects": ["unheard of"]}', "halt": True}
+    halted, found = tick(
+        program, url, "ObjectBelongs", unknown, {"scene": '{"objects": ["bed"]}', "object": "bed"}
+    )
+    assert halted == {"status": "HALTED"}
+    assert found["because"].startswith("bed ")
+
+
+@contextmanager
+def silent() -> Iterator[str]:
+    """A server that takes connections and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+
+
+def test_a_service_that_does_not_answer_fails_the_condition(program: Path) -> None:
+    scene = {"scene": '{"objects": ["bed"]}'}
+    with silent() as url:
+        (late,) = tick(program, url, "SceneComplete", scene, timeout=0.2)
+    assert (late["status"], late["waited"]) == ("FAILURE", True)
+    assert late["because"] == "no answer in time"
+    (refused,) = tick(program, "http://127.0.0.1:9", "SceneComplete", scene)
+    assert (refused["status"], refused["waited"]) == ("FAILURE", True)

@@ -1,0 +1,119 @@
+"""The example without ROS: a bridge of websockets on one side, the service on the other."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import ServerConnection, serve
+
+from tests.http.conftest import LiveService
+
+
+@contextmanager
+def bridge(*published: Any) -> Iterator[tuple[str, list[Any]]]:
+    """Something that sends these messages at once to whoever subscribes, and hangs up.
+
+    Text and bytes are sent as they are, whatever else as JSON.
+    """
+    heard: list[Any] = []
+
+    def handle(socket: ServerConnection) -> None:
+        try:
+            heard.append(json.loads(socket.recv()))
+            for message in published:
+                socket.send(message if isinstance(message, str | bytes) else json.dumps(message))
+        except ConnectionClosed:
+            pass
+
+    with serve(handle, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}", heard
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
+    script = repository / "deploy" / "ros2" / "over_rosbridge.py"
+    done = subprocess.run(
+        [sys.executable, str(script), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=repository,
+        env={"PYTHONPATH": str(repository), "PATH": "/usr/bin:/bin"},
+    )
+    # A bridge that hangs up is never the end that was wanted: whoever supervises this restarts it.
+    assert done.returncode == 1, done.stderr
+    *errors, last = done.stderr.splitlines()
+    assert last.startswith(("the bridge at ws://", "no bridge at "))
+    return [json.loads(line) for line in done.stdout.splitlines()], errors
+
+
+@pytest.mark.parametrize(("question", "part"), [("missing", "missing"), ("outliers", "outliers")])
+def test_a_published_message_is_answered(
+    repository: Path, service: LiveService, question: str, part: str
+) -> None:
+    recorded = json.loads((repository / "deploy/ros2/detections.json").read_text())
+    at = f"http://127.0.0.1:{service.port}"
+    with bridge({"op": "status", "level": "info"}, recorded) as (url, heard):
+        (answer,), errors = run(
+            repository, url, "/detections_3d", "--service", at, "--question", question
+        )
+    assert heard == [{"op": "subscribe", "topic": "/detections_3d", "queue_length": 1}]
+    assert answer["frame_id"] == "base_link"
+    assert answer[part]
+    assert errors == []
+
+
+def test_what_cannot_be_asked_is_reported_and_does_not_end_the_program(repository: Path) -> None:
+    message = {"op": "publish", "topic": "/x", "msg": {"objects": []}}
+    with bridge(message) as (url, _):
+        answers, errors = run(repository, url, "/x")
+    assert answers == []
+    assert errors == ["MessageError: not a message with detections"]
+
+
+def test_frames_that_say_nothing_are_left_out_and_complaints_are_handed_on(
+    repository: Path,
+) -> None:
+    message = {"op": "publish", "topic": "/x", "msg": {"objects": []}}
+    frames = [
+        "no JSON",
+        b"\x00\xff",
+        [1, 2],
+        "[" * 100_000,
+        {"op": "status", "level": "info", "msg": "hello"},
+        {"op": "status", "level": "error", "msg": "no such\ntype"},
+        {"op": "status", "level": "warning", "msg": "slow"},
+    ]
+    with bridge(*frames, message) as (url, _):
+        answers, errors = run(repository, url, "/x")
+    assert answers == []
+    assert errors == [
+        "left out: text that is no JSON object: 'no JSON'",
+        r"left out: a binary frame that is no JSON object: b'\x00\xff'",
+        "left out: text that is no JSON object: '[1, 2]'",
+        f"left out: text that is no JSON object: {'[' * 40!r}",
+        "bridge: error: no such type",
+        "bridge: warning: slow",
+        "MessageError: not a message with detections",
+    ]
+
+
+@pytest.mark.parametrize("where", ["ws://127.0.0.1:9", "robot:9090", "ws://127.0.0.1:99999"])
+def test_without_a_bridge_it_ends_with_a_line_for_whoever_restarts_it(
+    repository: Path, where: str
+) -> None:
+    assert run(repository, where, "/x") == ([], [])

@@ -1,0 +1,347 @@
+"""The example node against a running service, and its parts alone."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import json
+import math
+import threading
+import time
+import tomllib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from app.client import Client, UnreachableError
+from app.client.vision_msgs import SceneFields
+from tests.client.ros_messages import blank
+from tests.deploy.ros import PACKAGE, STORE, Ros, from_json, load_package
+from tests.http.conftest import LiveService
+
+
+@pytest.fixture
+def recorded(repository: Path) -> Any:
+    envelope = json.loads((repository / "deploy/ros2/detections.json").read_text())
+    return from_json("vision_msgs/msg/Detection3DArray", envelope["msg"])
+
+
+class Running:
+    """The node in a process of its own making: what it hears, and what it says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **parameters: Any) -> None:
+        self.ros = Ros(parameters)
+        load_package(monkeypatch, self.ros)
+        self.node = importlib.import_module("scene_reasoning.node").SceneNode()
+
+    def hear(self, topic: str, message: Any) -> None:
+        kind, callback = self.ros.subscriptions[topic]
+        assert message.__msgtype__ == kind.ros_name
+        callback(message)
+
+    def tick(self) -> None:
+        ((_, callback),) = self.ros.timers
+        callback()
+
+    def tick_until(self, done: Callable[[], Any]) -> None:
+        until = time.monotonic() + 30
+        while not done():
+            assert time.monotonic() < until, "nothing came"
+            self.tick()
+            time.sleep(0.005)
+
+    def said(self, topic: str) -> list[Any]:
+        return self.ros.publishers[topic].sent
+
+    def status(self) -> Any:
+        (status,) = self.said("/diagnostics")[-1].status
+        return status
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Running]]:
+    started: list[Running] = []
+
+    def start(**parameters: Any) -> Running:
+        started.append(Running(monkeypatch, **parameters))
+        return started[-1]
+
+    yield start
+    for running in started:
+        running.node.destroy_node()
+        assert running.ros.destroyed
+
+
+def url(service: LiveService) -> str:
+    return f"http://127.0.0.1:{service.port}"
+
+
+# ----------------------------------------------------------------------------------- the node
+
+
+def test_detections_become_answers_markers_and_a_diagnosis(
+    run: Callable[..., Running], service: LiveService, recorded: Any
+) -> None:
+    running = run(url=url(service), timeout=20.0)
+    running.hear("detections", recorded)
+    running.tick_until(lambda: running.said("~/answers"))
+    (published,) = running.said("~/answers")
+    answer = json.loads(published.data)
+    assert answer["frame_id"] == "base_link"
+    assert answer["stamp"] == {"sec": 1751450412, "nanosec": 183000000}
+    # The machine of this test knows five of the eight things.
+    seen = {entry["object"] for entry in answer["outliers"]["outliers"]}
+    assert seen == {"track_3", "track_5", "track_7", "toilet_1", "book_1"}
+    assert set(answer["missing"]["ignored"]) == {"track_4", "mouse_1", "cup_1"}
+    assert answer["missing"]["observed_relations"]
+    assert [note["reason"] for note in answer["notes"]] == ["no-hypothesis"]
+    (status,) = running.said("/diagnostics")[0].status
+    assert (status.level, status.message) == (0, "answered")
+    clear, *shown = running.said("~/ghosts")[0].markers
+    assert clear.action == 3
+    texts = [marker.text for marker in shown if marker.text]
+    best = answer["missing"]["missing"][0]
+    assert len(texts) == 3
+    assert texts[0].startswith(f"{best['label']}? {best['placements'][0]['relation']} ")
+    assert {marker.header.frame_id for marker in shown} == {"base_link"}
+
+
+class Slow:
+    """A client that does not answer before it is told to, and then fails."""
+
+    def __init__(self) -> None:
+        self.asked: list[int] = []
+        self.started, self.answering = threading.Semaphore(0), threading.Event()
+
+    def missing(self, **fields: Any) -> Any:
+        self.asked.append(fields["stamp"]["sec"])
+        self.started.release()
+        assert self.answering.wait(30)
+        raise UnreachableError("gone")
+
+
+def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
+    run: Callable[..., Running], recorded: Any
+) -> None:
+    running = run()
+    client = running.node.advisor.client = Slow()
+    for second in range(4):
+        message = copy.deepcopy(recorded)
+        message.header.stamp.sec = second
+        running.hear("detections", message)
+        running.tick()  # returns though nobody answers
+        if second == 0:
+            assert client.started.acquire(timeout=30)
+    assert running.said("/diagnostics") == []
+    client.answering.set()
+    running.tick_until(lambda: len(running.said("/diagnostics")) == 2)
+    assert client.asked == [0, 3]
+    first, second_one = (report.status[0] for report in running.said("/diagnostics"))
+    assert first.level == second_one.level == 2
+    assert first.message == "UnreachableError: gone"
+    assert [entry.value for entry in first.values] == ["2"]
+    assert running.said("~/answers") == []
+
+
+def test_a_service_that_is_not_there_is_diagnosed_and_its_return_noticed(
+    run: Callable[..., Running], service: LiveService, recorded: Any
+) -> None:
+    running = run(url="http://127.0.0.1:9", timeout=0.5)
+    running.hear("detections", recorded)
+    running.tick_until(lambda: running.said("/diagnostics"))
+    assert running.status().level == 2
+    assert running.status().message.startswith(("UnreachableError", "DeadlineError"))
+    with Client(url(service), timeout=20.0) as client:
+        running.node.advisor.client = client
+        running.hear("detections", recorded)
+        running.tick_until(lambda: running.said("~/answers"))
+    assert running.status().level == 0
+
+
+def test_a_view_of_nothing_asks_nothing(run: Callable[..., Running]) -> None:
+    running = run(url="http://127.0.0.1:9")
+    running.hear("detections", blank(STORE, "vision_msgs/msg/Detection3DArray"))
+    running.tick_until(lambda: running.said("~/answers"))
+    assert json.loads(running.said("~/answers")[0].data)["notes"] == []
+    assert (running.status().level, running.status().message) == (1, "nothing was seen")
+
+
+def test_numbers_wait_for_their_labels(
+    run: Callable[..., Running], service: LiveService, recorded: Any
+) -> None:
+    numbers = {"desk": "0", "chair": "1"}
+    for detection in recorded.detections:
+        for result in detection.results:
+            name = result.hypothesis.class_id
+            result.hypothesis.class_id = numbers.get(name, "9")
+    running = run(url=url(service), timeout=20.0)
+    running.hear("detections", recorded)
+    running.tick_until(lambda: running.said("/diagnostics"))
+    assert running.status().message.startswith("MessageError: the class ids are numbers")
+    classes = [
+        blank(STORE, "vision_msgs/msg/VisionClass", class_id=int(number), class_name=name)
+        for name, number in numbers.items()
+    ]
+    running.hear("label_info", blank(STORE, "vision_msgs/msg/LabelInfo", class_map=classes))
+    running.hear("detections", recorded)
+    running.tick_until(lambda: running.said("~/answers"))
+    answer = json.loads(running.said("~/answers")[0].data)
+    assert {entry["label"] for entry in answer["outliers"]["outliers"]} == {"desk", "chair"}
+
+
+def test_labels_may_be_listed_in_the_parameters(run: Callable[..., Running]) -> None:
+    assert run(class_names=["desk", "chair"]).node.advisor.label_map == ["desk", "chair"]
+    assert run(label_map="coco").node.advisor.label_map == "coco"
+    with pytest.raises(ValueError, match="imagenet"):
+        run(label_map="imagenet")
+
+
+def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
+    run: Callable[..., Running], service: LiveService, recorded: Any
+) -> None:
+    def horizontal(answer: Any) -> set[str]:
+        found = json.loads(answer.data)["missing"]["observed_relations"]
+        return {entry["relation"] for entry in found} & {"left", "front"}
+
+    running = run(url=url(service), timeout=20.0)
+    for message in (recorded, *recorded.detections):
+        message.header.frame_id = "map"
+    running.hear("detections", recorded)
+    running.tick_until(lambda: len(running.said("~/answers")) == 1)
+    assert horizontal(running.said("~/answers")[0]) == set()
+
+    pose = blank(STORE, "geometry_msgs/msg/PoseWithCovarianceStamped")
+    pose.header.frame_id = "map"
+    pose.pose.pose.position.x = 5.0
+    pose.pose.pose.orientation.z, pose.pose.pose.orientation.w = 1.0, 0.0
+    running.hear("pose", pose)
+    running.hear("detections", recorded)
+    running.tick_until(lambda: len(running.said("~/answers")) == 2)
+    (relation,) = [
+        entry
+        for entry in json.loads(running.said("~/answers")[1].data)["missing"]["observed_relations"]
+        if {entry["subject"], entry["object"]} == {"track_3", "track_7"}
+    ]
+    # From the other side of the desk the chair stands behind it.
+    assert relation == {"subject": "track_3", "relation": "front", "object": "track_7"}
+
+    pose.header.frame_id = "odom"
+    running.hear("pose", pose)
+    running.hear("detections", recorded)
+    running.tick_until(lambda: len(running.said("~/answers")) == 3)
+    assert horizontal(running.said("~/answers")[2]) == set()
+
+
+def test_a_camera_that_stands_still_has_its_viewpoint_in_the_parameters(
+    run: Callable[..., Running],
+) -> None:
+    assert run(viewpoint=[1.0, 2.0, 0.5]).node.viewpoint == (1.0, 2.0, 0.5)
+    assert run(viewpoint=[math.nan] * 3).node.viewpoint is None
+
+
+def test_images_are_heard_where_the_parameters_say_so(
+    run: Callable[..., Running], service: LiveService
+) -> None:
+    running = run(url=url(service), timeout=20.0, kind="2d", questions=["outliers"])
+    names, places = ("bed", "lamp"), (100.0, 160.0)
+    detections = []
+    for name, place in zip(names, places, strict=True):
+        hypothesis = blank(STORE, "vision_msgs/msg/ObjectHypothesis", class_id=name, score=0.9)
+        detection = blank(STORE, "vision_msgs/msg/Detection2D")
+        detection.results = [
+            blank(STORE, "vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis)
+        ]
+        detection.bbox.center.position.x = place
+        detection.bbox.size_x = detection.bbox.size_y = 50.0
+        detections.append(detection)
+    array = blank(STORE, "vision_msgs/msg/Detection2DArray", detections=detections)
+    running.hear("detections", array)
+    running.tick_until(lambda: running.said("~/answers"))
+    answer = json.loads(running.said("~/answers")[0].data)
+    assert [
+        (entry["subject"], entry["relation"], entry["object"])
+        for entry in answer["outliers"]["misplaced"]
+    ] == [("bed_1", "left", "lamp_1")]
+
+
+def test_the_program_spins_one_node_and_takes_it_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    ros = Ros({})
+    load_package(monkeypatch, ros)
+    importlib.import_module("scene_reasoning.node").main()
+    assert len(ros.spun) == 1
+    assert ros.destroyed
+
+
+# ----------------------------------------------------------------------------------- its parts
+
+
+def test_a_ghost_stands_off_its_anchor_by_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
+    load_package(monkeypatch)
+    advisor = importlib.import_module("scene_reasoning.advisor")
+    ghosts = importlib.import_module("scene_reasoning.ghosts").ghosts
+    fields = SceneFields(
+        {
+            "objects": [
+                {"id": "d", "label": "desk", "position": {"x": 1.0, "y": 2.0, "z": 0.4}},
+                {"id": "c", "label": "chair"},
+            ]
+        }
+    )
+    offset = {"mean": {"x": 0.1, "y": -0.2, "z": 0.5}, "std": {"x": 0.2, "y": 0.0, "z": 9.0}}
+    nowhere = {"relation": "front", "object": "c"}
+    there = {"relation": "on-top", "object": "d"}
+    missing = [
+        {"label": "lamp", "placements": [nowhere, there | {"offset": offset}]},
+        {"label": "bed", "placements": [nowhere]},
+        {"label": "cup", "placements": [there]},
+        {"label": "pen", "placements": [there]},
+    ]
+    lamp, cup = ghosts(advisor.Advice(fields, {"missing": {"missing": missing}}), 2)
+    assert lamp.text == "lamp? on-top desk"
+    assert lamp.position == pytest.approx((1.1, 1.8, 0.9))
+    assert lamp.extent == (0.4, 0.05, 1.5)
+    assert (cup.text, cup.position, cup.extent) == ("cup? on-top desk", (1.0, 2.0, 0.4), None)
+
+
+@pytest.mark.parametrize("questions", [[], ["weather"], ["missing", "generate"]])
+def test_questions_that_there_are_none_are_refused(
+    monkeypatch: pytest.MonkeyPatch, questions: list[str]
+) -> None:
+    load_package(monkeypatch)
+    advisor = importlib.import_module("scene_reasoning.advisor")
+    with pytest.raises(ValueError, match="questions must be some of"):
+        advisor.Advisor(None, questions)
+
+
+# ------------------------------------------------------------------------------- the packaging
+
+
+def test_the_parameter_file_is_the_nodes_parameters_and_its_defaults(
+    run: Callable[..., Running],
+) -> None:
+    given = yaml.safe_load((PACKAGE / "config" / "scene.yaml").read_text())
+    parameters = given["scene"]["ros__parameters"]
+    asked = run(**parameters).ros.declared
+    assert set(asked) == set(parameters)
+    defaults = run().ros.declared
+    for name, value in defaults.items():
+        assert str(parameters[name]) == str(value), name
+
+
+def test_the_package_names_what_it_imports(repository: Path) -> None:
+    root = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    needed = {entry.text for entry in root.findall("exec_depend")}
+    node = (PACKAGE / "scene_reasoning" / "node.py").read_text()
+    imported = {
+        line.split()[1].split(".")[0]
+        for line in node.splitlines()
+        if line.startswith(("from ", "import "))
+    }
+    ros = {name for name in imported if name.endswith("_msgs")} | {"rclpy"}
+    assert ros <= needed
+    name = tomllib.loads((repository / "pyproject.toml").read_text())["project"]["name"]
+    assert name in (PACKAGE / "setup.py").read_text()
