@@ -1,0 +1,143 @@
+/** What people do with objects, by mouse, touch or keyboard. */
+
+import { floorUnder, moved, round } from './geometry.js';
+import { openMenu } from './menu.js';
+import { sizesOf } from './questions.js';
+import { FULL, freePlace, MOST_OBJECTS, freshId, sizer } from './scene.js';
+import { SPOKEN } from './words.js';
+
+/** The robot is moved like an object; no object may have this id, for it is not printable. */
+export const ROBOT = '\u0000robot';
+const GRID = 0.1; // metres
+
+/** Where something is, as it is read aloud. */
+export function whereabouts(x, y, viewer = { x: 0, y: 0, yaw: 0 }) {
+  const [dx, dy] = [x - viewer.x, y - viewer.y];
+  const ahead = dx * Math.cos(viewer.yaw) + dy * Math.sin(viewer.yaw);
+  const left = dy * Math.cos(viewer.yaw) - dx * Math.sin(viewer.yaw);
+  const far = `${Math.abs(ahead).toFixed(1)} m ${ahead >= 0 ? 'ahead' : 'behind'}`;
+  return Math.abs(left) < 0.05 ? far : `${far}, ${Math.abs(left).toFixed(1)} m ${left > 0 ? 'left' : 'right'}`;
+}
+
+export function createActions(store, say, menu) {
+  const sized = () => sizer(sizesOf(store.get(), store.get().models[0]));
+  const find = (id) => store.get().things.find((thing) => thing.id === id);
+  const snapped = (value) => (store.get().snap ? round(Math.round(value / GRID) * GRID) : round(value));
+
+  function select(id) {
+    if (store.get().selected !== id) store.set({ selected: id });
+  }
+
+  /** @param {{x: number, y: number}} [at] where it was dropped; else where there is room */
+  function add(label, at) {
+    const { things, viewer } = store.get();
+    if (things.length >= MOST_OBJECTS) {
+      store.set({ complaint: FULL });
+      return;
+    }
+    const id = freshId(things, label);
+    const thing = { id, label, x: 0, y: 0, z: 0, size: null, yaw: 0, confidence: 1 };
+    const boxes = things.map(sized());
+    const box = sized()(thing);
+    const place = at ? { x: snapped(at.x), y: snapped(at.y) } : freePlace(boxes, box.size, viewer);
+    const z = round(floorUnder(boxes, { ...box, ...place }));
+    store.edit({ things: [...things, { ...thing, ...place, z }], selected: id });
+    say(`${id} added, ${whereabouts(place.x, place.y, viewer)}.`);
+  }
+
+  function remove(id) {
+    const { things, at, selected } = store.get();
+    refocus(things.findIndex((thing) => thing.id === id));
+    store.edit({
+      things: things.filter((thing) => thing.id !== id),
+      selected: selected === id ? null : selected,
+      at: at?.object === id ? null : at,
+    });
+    say(`${id} removed.`);
+  }
+
+  /** Whoever removed something goes on at the next one: a keyboard would otherwise begin anew. */
+  function refocus(index) {
+    const all = document.activeElement?.closest('#board') ? '#board .object' : '#list .name';
+    setTimeout(() => {
+      if (document.activeElement !== document.body) return;
+      const left = document.querySelectorAll(all);
+      (left[Math.min(index, left.length - 1)] ?? document.getElementById('search')).focus();
+    }, 50);
+  }
+
+  /** @param {boolean} [again] part of a movement that can be undone already */
+  function place(id, x, y, again = false, exactly = false) {
+    const { things, viewer } = store.get();
+    const [px, py] = exactly ? [round(x), round(y)] : [snapped(x), snapped(y)];
+    const change = id === ROBOT
+      ? { viewer: { ...viewer, x: px, y: py } }
+      : { things: moved(things, id, px, py, sized()) };
+    if (again) store.set(change);
+    else store.edit(change);
+  }
+
+  function change(id, fields, again = false) {
+    const things = store.get().things.map((thing) => (thing.id === id ? { ...thing, ...fields } : thing));
+    if (again) store.set({ things });
+    else store.edit({ things });
+  }
+
+  function turn(id, degrees) {
+    const { viewer } = store.get();
+    if (id === ROBOT) {
+      const whole = 2 * Math.PI;
+      const yaw = round((((viewer.yaw + (degrees * Math.PI) / 180) % whole) + whole) % whole, 4);
+      store.edit({ viewer: { ...viewer, yaw } });
+      return;
+    }
+    const yaw = round((((find(id).yaw + degrees) % 360) + 360) % 360, 2);
+    change(id, { yaw });
+    say(`${id} turned to ${yaw} degrees.`);
+  }
+
+  const STEPS = { ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowLeft: [0, 1], ArrowRight: [0, -1] };
+
+  /** Keys on an object of the board or of the list. */
+  function keys(event, id) {
+    const thing = id === ROBOT ? store.get().viewer : find(id);
+    if (!thing || event.ctrlKey || event.metaKey) return;
+    if (STEPS[event.key]) {
+      const length = event.shiftKey ? 0.5 : event.altKey ? 0.01 : 0.1;
+      const [x, y] = STEPS[event.key];
+      place(id, thing.x + x * length, thing.y + y * length, false, true);
+      const now = id === ROBOT ? store.get().viewer : find(id);
+      say(`${id === ROBOT ? 'Robot' : id}: x ${now.x.toFixed(2)}, y ${now.y.toFixed(2)}.`);
+    } else if (event.key === 'r' || event.key === 'R') {
+      turn(id, event.shiftKey ? -15 : 15);
+    } else if (id !== ROBOT && (event.key === 'Delete' || event.key === 'Backspace')) {
+      remove(id);
+    } else if (id !== ROBOT && (event.key === 'ContextMenu' || (event.key === 'F10' && event.shiftKey))) {
+      open(id, event.currentTarget);
+    } else {
+      return;
+    }
+    event.preventDefault();
+  }
+
+  function ask(relation, id) {
+    store.set({ at: { relation, object: id }, tab: 'missing' });
+    say(`Asking what is missing ${SPOKEN[relation]} ${id}.`);
+  }
+
+  /** Opens the menu of an object beside an element, or where a pointer is. */
+  function open(id, opener, pointer) {
+    const box = opener.getBoundingClientRect();
+    const at = pointer ?? { left: box.left + Math.min(box.width, 40), top: box.bottom };
+    const asks = ['on-top', 'under', 'left', 'right', 'front', 'behind'];
+    select(id);
+    openMenu(menu, opener, at, [
+      ...asks.map((relation) => [`What is missing ${SPOKEN[relation]} it?`, () => ask(relation, id)]),
+      ['Turn by 90°', () => turn(id, 90)],
+      ['One more of these', () => add(find(id).label)],
+      ['Remove', () => remove(id)],
+    ], `What can be done with ${id}`);
+  }
+
+  return { select, add, remove, place, change, turn, keys, ask, open, find, sized, snapped };
+}

@@ -1,0 +1,75 @@
+/**
+ * Asks anew whenever the board or a setting changes: once it has been still for a moment, and what
+ * was asked before is dropped.
+ */
+
+import { call, ProblemError, UnreachableError } from './api.js';
+import { bodyOf, DEPENDS, QUESTIONS } from './questions.js';
+import { changed } from './store.js';
+
+const STILL = 120; // ms
+
+export function startAsking(store) {
+  const under = new Map(); // "column/question" → {text, controller}
+  let timer = 0;
+
+  function put(column, question, entry) {
+    const answers = store.get().answers.map((own, index) =>
+      index === column ? { ...own, [question]: { ...own[question], ...entry } } : own,
+    );
+    store.set({ answers });
+  }
+
+  async function ask(column, question) {
+    const state = store.get();
+    const place = `${column}/${question}`;
+    const body = bodyOf(state, question, state.models[column]);
+    const text = JSON.stringify([body, state.epoch]);
+    if (under.get(place)?.text === text) return;
+    under.get(place)?.controller.abort();
+    const controller = new AbortController();
+    under.set(place, { text, controller });
+    if (!body) {
+      put(column, question, { status: 'none', answer: null, problem: null, body: null });
+      return;
+    }
+    put(column, question, { status: 'asking', body });
+    try {
+      const answer = await call(question, body, controller.signal);
+      put(column, question, { status: 'answered', answer, problem: null, body });
+    } catch (error) {
+      if (controller.signal.aborted) return;
+      fail(column, question, error, place);
+    }
+  }
+
+  function fail(column, question, error, place) {
+    if (error instanceof UnreachableError) {
+      put(column, question, { status: 'down', problem: null });
+      store.set({ down: true });
+    } else if (error instanceof ProblemError) {
+      put(column, question, { status: 'refused', answer: null, problem: error.problem });
+      if (error.retryAfter) {
+        setTimeout(() => {
+          under.delete(place);
+          askAll();
+        }, 1000 * error.retryAfter);
+      }
+    } else {
+      throw error;
+    }
+  }
+
+  function askAll() {
+    for (const question of QUESTIONS) {
+      for (const column of [0, 1]) void ask(column, question);
+    }
+  }
+
+  store.subscribe((state, previous) => {
+    if (!changed(state, previous, ...DEPENDS)) return;
+    clearTimeout(timer);
+    timer = setTimeout(askAll, STILL);
+  });
+  timer = setTimeout(askAll, 0);
+}

@@ -1,0 +1,199 @@
+/** The room seen from above: an SVG that d3 keeps in step with the state. */
+
+import { ROBOT, whereabouts } from './actions.js';
+import { drawEdges } from './edge_drawing.js';
+import { edgesOf } from './edges.js';
+import { drawGhosts } from './ghost_drawing.js';
+import { ghostsOf } from './ghosts.js';
+import { handles } from './handles.js';
+import { labelPlaces, LINE, Places, widthOf } from './labels.js';
+import { sizesOf } from './questions.js';
+import { sizer } from './scene.js';
+import { changed } from './store.js';
+import { fit, gridStep, onScreen } from './view.js';
+
+const FONT = '500 13px system-ui, sans-serif';
+const SEEN = [
+  'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'own', 'observed', 'at', 'models',
+];
+
+/** Ids of the objects that the shown model calls outliers, with their probability. */
+export function outliersOf(state) {
+  const answer = state.answers[state.shown].outliers?.answer;
+  return new Map((answer?.outliers ?? []).map((one) => [one.object, one]));
+}
+
+export function createBoard(node, store, actions, takeGhost) {
+  const svg = d3.select(node);
+  const layer = (name) => svg.append('g').attr('class', name);
+  const [grid, robot, objects, edges, ghosts, labels] = ['grid', 'robot', 'objects', 'edges', 'ghosts', 'labels'].map(layer);
+  edges.attr('aria-hidden', 'true');
+  labels.attr('aria-hidden', 'true');
+  grid.attr('aria-hidden', 'true');
+  const spreads = svg.insert('g', '.objects').attr('class', 'spreads').attr('aria-hidden', 'true');
+  let view = null;
+  let dragging = false;
+  let size = { width: 0, height: 0 };
+
+  const drag = d3
+    .drag()
+    .container(() => node)
+    .filter((event) => !event.button && !event.ctrlKey && !store.get().draft)
+    .subject((event, box) => ({ x: view.across(box.y), y: view.down(box.x), again: false }))
+    .on('start', (event, box) => {
+      dragging = true;
+      actions.select(box.id);
+    })
+    .on('drag', (event, box) => {
+      const { x, y } = view.metres(event.x, event.y);
+      actions.place(box.id, x, y, event.subject.again);
+      event.subject.again = true;
+    })
+    .on('end', () => {
+      dragging = false;
+      draw(store.get());
+    });
+
+  const turnAndResize = handles(store, actions, () => view, (now) => (dragging = now));
+
+  function drawGrid() {
+    const lines = [];
+    const step = gridStep(Math.max(view.width, view.height) / view.scale);
+    const from = view.metres(0, view.height);
+    const to = view.metres(view.width, 0);
+    for (let x = Math.ceil(from.x / step) * step; x <= to.x; x += step) lines.push({ key: `x${x}`, x1: 0, x2: view.width, y1: view.down(x), y2: view.down(x), words: view.down(x) > 16 ? `${x} m` : '', tx: 4, ty: view.down(x) - 3 });
+    for (let y = Math.ceil(to.y / step) * step; y <= from.y; y += step) lines.push({ key: `y${y}`, x1: view.across(y), x2: view.across(y), y1: 0, y2: view.height, words: y ? `${y} m` : '', tx: view.across(y) + 3, ty: view.height - 4 });
+    const each = grid.selectAll('g').data(lines, (line) => line.key).join((enter) => {
+      const g = enter.append('g');
+      g.append('line');
+      g.append('text');
+      return g;
+    });
+    each.select('line').attr('x1', (d) => d.x1).attr('x2', (d) => d.x2).attr('y1', (d) => d.y1).attr('y2', (d) => d.y2);
+    each.select('text').attr('x', (d) => d.tx).attr('y', (d) => d.ty).text((d) => d.words);
+  }
+
+  function drawRobot(state) {
+    const { x, y, yaw } = state.viewer;
+    const g = robot.selectAll('g').data([{ id: ROBOT, x, y }]).join((enter) => {
+      const added = enter.append('g').attr('tabindex', 0).attr('role', 'button');
+      added.append('path').attr('class', 'sight').attr('d', 'M0,0 L-52,-90 A104,104 0 0 1 52,-90 Z');
+      added.append('path').attr('class', 'body').attr('d', 'M0,-13 L10,10 L0,5 L-10,10 Z');
+      return added.call(drag).on('keydown', (event) => actions.keys(event, ROBOT));
+    });
+    g.attr('transform', `translate(${view.across(y)},${view.down(x)}) rotate(${(-yaw * 180) / Math.PI})`)
+      .attr('aria-label', `Robot at x ${x}, y ${y}, turned by ${Math.round((yaw * 180) / Math.PI)} degrees`);
+  }
+
+  function drawObjects(state, boxes, wrong) {
+    const focused = node.contains(document.activeElement) ? document.activeElement : null;
+    const ordered = [...boxes].sort((a, b) => a.z - b.z || b.size.x * b.size.y - a.size.x * a.size.y);
+    const each = objects.selectAll('g.object').data(ordered, (box) => box.id).join((enter) => {
+      const g = enter.append('g').attr('class', 'object').attr('tabindex', 0).attr('role', 'button');
+      g.append('rect').attr('class', 'box');
+      g.append('line').attr('class', 'nose');
+      g.append('title');
+      g.on('focus', (_, box) => actions.select(box.id))
+        .on('keydown', (event, box) => (event.key === 'Enter' ? openAt(event, box) : actions.keys(event, box.id)))
+        .on('contextmenu', (event, box) => openAt(event, box))
+        .on('dblclick', (event, box) => openAt(event, box));
+      return g.call(drag);
+    }).order();
+    each
+      .classed('selected', (box) => box.id === state.selected)
+      .classed('outlier', (box) => !state.draft && Boolean(wrong.get(box.id)?.is_outlier))
+      .classed('new', (box) => Boolean(state.draft?.fresh.has(box.id)))
+      .classed('anchor', (box) => state.at?.object === box.id)
+      .attr('transform', (box) => `translate(${view.across(box.y)},${view.down(box.x)}) rotate(${-box.yaw})`)
+      .attr('aria-pressed', (box) => String(box.id === state.selected))
+      .attr('aria-haspopup', 'menu')
+      .attr('aria-label', (box) => described(box, state, boxes, wrong));
+    each.style('--wrong', (box) => (state.tab === 'outliers' && !state.draft ? (wrong.get(box.id)?.probability ?? 0) : 0));
+    each.select('rect.box')
+      .attr('width', (box) => box.size.y * view.scale).attr('height', (box) => box.size.x * view.scale)
+      .attr('x', (box) => (-box.size.y / 2) * view.scale).attr('y', (box) => (-box.size.x / 2) * view.scale)
+      .attr('rx', (box) => Math.min(5, (Math.min(box.size.x, box.size.y) * view.scale) / 4));
+    each.select('line.nose')
+      .attr('x1', (box) => (-box.size.y / 5) * view.scale).attr('x2', (box) => (box.size.y / 5) * view.scale)
+      .attr('y1', (box) => (-box.size.x / 2) * view.scale + 3).attr('y2', (box) => (-box.size.x / 2) * view.scale + 3);
+    each.select('title').text((box) => described(box, state, boxes, wrong));
+    turnAndResize(objects, state.draft ? null : boxes.find((box) => box.id === state.selected));
+    if (focused && focused !== document.activeElement && focused.isConnected) focused.focus();
+  }
+
+  function openAt(event, box) {
+    event.preventDefault();
+    const pointer = event.type === 'keydown' ? undefined : { left: event.clientX, top: event.clientY };
+    if (!store.get().draft) actions.open(box.id, event.currentTarget, pointer);
+  }
+
+  /** Labels: inside a box where they fit, else beside it; what stands on something goes first. */
+  function drawLabels(state, boxes, places, wrong) {
+    const texts = [];
+    for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {
+      const width = widthOf(box.id, FONT) + 6;
+      const rect = onScreen(box, view);
+      const at = places.take(width, LINE, labelPlaces(rect, width));
+      if (at) texts.push({ id: box.id, ...at, wrong: !state.draft && wrong.get(box.id)?.is_outlier });
+      if (box.z > 0.05) places.reserve(rect);
+    }
+    labels.selectAll('text.name').data(texts, (text) => text.id).join('text')
+      .attr('class', 'name').attr('x', (text) => text.x).attr('y', (text) => text.y)
+      .classed('outlier', (text) => Boolean(text.wrong)).text((text) => text.id);
+    const marks = boxes.filter((box) => !state.draft && wrong.get(box.id)?.is_outlier);
+    const each = labels.selectAll('g.mark').data(marks, (box) => box.id).join((enter) => {
+      const g = enter.append('g').attr('class', 'mark');
+      g.append('circle').attr('r', 9);
+      g.append('text').attr('class', 'sign').text('!');
+      return g;
+    });
+    each.attr('transform', (box) => {
+      const rect = onScreen(box, view);
+      return `translate(${rect.right},${rect.top})`;
+    });
+  }
+
+  function draw(state) {
+    if (!size.width) return;
+    const boxes = (state.draft?.things ?? state.things).map(sizer(sizesOf(state, state.models[0])));
+    const shown = ghostsOf(state);
+    const wrong = outliersOf(state);
+    if (!dragging || !view) view = fit([...boxes, ...shown], state.viewer, size.width, size.height);
+    const places = new Places(size.width, size.height);
+    drawGrid();
+    drawRobot(state);
+    drawObjects(state, boxes, wrong);
+    drawLabels(state, boxes, places, wrong);
+    drawGhosts(ghosts, spreads, shown, view, places, takeGhost);
+    drawEdges(edges, edgesOf(state), boxes, view, places);
+  }
+
+  new ResizeObserver(([entry]) => {
+    size = { width: entry.contentRect.width, height: entry.contentRect.height };
+    draw(store.get());
+  }).observe(node);
+  node.addEventListener('dragover', (event) => event.preventDefault());
+  node.addEventListener('drop', (event) => {
+    event.preventDefault();
+    const box = node.getBoundingClientRect();
+    const label = event.dataTransfer.getData('text/plain');
+    if (label && view) actions.add(label, view.metres(event.clientX - box.left, event.clientY - box.top));
+  });
+  return {
+    render(state, previous) {
+      if (changed(state, previous, ...SEEN)) draw(state);
+    },
+    focus: (id) => objects.selectAll('g.object').filter((box) => box.id === id).node()?.focus(),
+  };
+}
+
+function described(box, state, boxes, wrong) {
+  const parts = [box.id === box.label ? box.id : `${box.id}, ${box.label}`, whereabouts(box.x, box.y, state.viewer)];
+  const below = boxes.find(
+    (other) => other.id !== box.id && box.z > 0.05 && Math.abs(other.z + other.size.z - box.z) < 0.03 &&
+      Math.hypot(other.x - box.x, other.y - box.y) < Math.hypot(other.size.x, other.size.y) / 2,
+  );
+  if (below) parts.push(`on ${below.id}`);
+  if (wrong.get(box.id)?.is_outlier) parts.push('does not belong here');
+  return parts.join(', ');
+}

@@ -1,0 +1,85 @@
+/** Boxes on the floor: what they cover, what rests on what. Metres; x ahead, y to the left. */
+
+/** @typedef {import('./store.js').Thing} Thing */
+
+/** Of what neither the scene nor the model knows a size. */
+export const UNKNOWN_SIZE = { x: 0.4, y: 0.4, z: 0.4 };
+
+export const radians = (degrees) => (degrees * Math.PI) / 180;
+export const round = (value, digits = 3) => Number(value.toFixed(digits));
+
+/**
+ * Half of what a box covers along x and y once it is turned.
+ * @param {{size: import('./store.js').Extents, yaw: number}} box
+ */
+export function halves(box) {
+  const c = Math.abs(Math.cos(radians(box.yaw)));
+  const s = Math.abs(Math.sin(radians(box.yaw)));
+  return { x: (box.size.x * c + box.size.y * s) / 2, y: (box.size.x * s + box.size.y * c) / 2 };
+}
+
+export function covers(box, x, y) {
+  const a = radians(box.yaw);
+  const [dx, dy] = [x - box.x, y - box.y];
+  const along = dx * Math.cos(a) + dy * Math.sin(a);
+  const across = dy * Math.cos(a) - dx * Math.sin(a);
+  return Math.abs(along) <= box.size.x / 2 && Math.abs(across) <= box.size.y / 2;
+}
+
+export function overlap(a, b) {
+  const [p, q] = [halves(a), halves(b)];
+  return Math.abs(a.x - b.x) < p.x + q.x && Math.abs(a.y - b.y) < p.y + q.y;
+}
+
+const area = (box) => box.size.x * box.size.y;
+const NEAR = 0.03;
+
+/** The height of what lies under a box: the highest of the larger boxes under its centre. */
+export function floorUnder(boxes, box) {
+  let height = 0;
+  for (const other of boxes) {
+    if (other.id !== box.id && area(other) > area(box) && covers(other, box.x, box.y)) {
+      height = Math.max(height, other.z + other.size.z);
+    }
+  }
+  return height;
+}
+
+/** The ids of what rests on a box, at any height. */
+function riders(boxes, box, found = new Set()) {
+  for (const other of boxes) {
+    const rests = Math.abs(other.z - (box.z + box.size.z)) < NEAR;
+    if (other.id !== box.id && !found.has(other.id) && rests && area(other) < area(box)) {
+      if (covers(box, other.x, other.y)) {
+        found.add(other.id);
+        riders(boxes, other, found);
+      }
+    }
+  }
+  return found;
+}
+
+/**
+ * The things after one was moved: what rests on it comes along, and it comes to rest again.
+ * @param {Thing[]} things
+ * @param {(thing: Thing) => Thing & {size: import('./store.js').Extents}} sized
+ */
+export function moved(things, id, x, y, sized) {
+  const boxes = things.map(sized);
+  const box = boxes.find((other) => other.id === id);
+  const carried = riders(boxes, box);
+  const rested = Math.abs(box.z - floorUnder(boxes, box)) < NEAR;
+  const others = boxes.filter((other) => !carried.has(other.id));
+  const z = rested ? floorUnder(others, { ...box, x, y }) : box.z;
+  const shift = { x: x - box.x, y: y - box.y, z: z - box.z };
+  return things.map((thing) =>
+    thing.id === id || carried.has(thing.id)
+      ? {
+          ...thing,
+          x: round(thing.x + shift.x),
+          y: round(thing.y + shift.y),
+          z: round(thing.z + shift.z),
+        }
+      : thing,
+  );
+}

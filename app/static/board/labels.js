@@ -1,0 +1,68 @@
+/** Texts that do not cover each other: each takes the first of its places that is still free. */
+
+/** Pixels that a label is high. */
+export const LINE = 17;
+
+const canvas = document.createElement('canvas').getContext('2d');
+const widths = new Map();
+
+/** Pixels that a text takes. */
+export function widthOf(text, font) {
+  const key = `${font}/${text}`;
+  if (!widths.has(key)) {
+    canvas.font = font;
+    widths.set(key, canvas.measureText(text).width);
+  }
+  return widths.get(key);
+}
+
+export class Places {
+  #taken = [];
+
+  constructor(width, height) {
+    this.width = width;
+    this.height = height;
+  }
+
+  /** Keeps a rectangle free of texts. */
+  reserve(box) {
+    this.#taken.push(box);
+  }
+
+  /**
+   * The first of some centres around which a text of this size is free, or null.
+   * @param {{x: number, y: number}[]} centres
+   */
+  take(width, height, centres) {
+    for (const centre of centres) {
+      const box = {
+        left: centre.x - width / 2, right: centre.x + width / 2,
+        top: centre.y - height / 2, bottom: centre.y + height / 2,
+      };
+      if (this.#inside(box) && !this.#taken.some((other) => meet(box, other))) {
+        this.#taken.push(box);
+        return centre;
+      }
+    }
+    return null;
+  }
+
+  #inside(box) {
+    return box.left >= 0 && box.top >= 0 && box.right <= this.width && box.bottom <= this.height;
+  }
+}
+
+const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+
+/** Where the text of a box may stand, best first. */
+export function labelPlaces({ left, right, top, bottom, x, y }, width) {
+  const inside = right - left >= width && bottom - top >= LINE
+    ? [{ x, y }, { x, y: bottom - LINE / 2 - 1 }, { x, y: top + LINE / 2 + 1 }]
+    : [];
+  return [
+    ...inside,
+    { x, y: bottom + LINE / 2 + 1 }, { x, y: top - LINE / 2 - 1 },
+    { x: right + width / 2 + 2, y }, { x: left - width / 2 - 2, y },
+    { x, y: bottom + 1.5 * LINE }, { x, y: top - 1.5 * LINE },
+  ];
+}

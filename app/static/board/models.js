@@ -1,0 +1,86 @@
+/** Which models can be asked, and their words. */
+
+import { call } from './api.js';
+import { el } from './dom.js';
+import { changed } from './store.js';
+
+const plain = (text) => text.toLowerCase().replace(/[\s_-]+/g, ' ').trim();
+
+/** Aliases first, then every version that answers. */
+function choices({ models, aliases }) {
+  const versions = models.flatMap(({ name, versions: own }) =>
+    own.filter(({ status }) => status === 'ready').map(({ version, variant }) => ({
+      value: `${name}@${version}`, words: `${name} ${version} (${variant})`,
+    })),
+  );
+  const named = Object.entries(aliases).map(([alias, target]) => ({ value: alias, words: `${alias}: ${target.replace('@', ' ')}` }));
+  return [...named, ...versions];
+}
+
+function words({ objects, room_types: rooms }) {
+  const names = new Map();
+  for (const { label, aliases } of objects) {
+    for (const alias of aliases) names.set(plain(alias), label);
+  }
+  for (const { label } of objects) names.set(plain(label), label);
+  return {
+    objects, rooms,
+    // A map: a label may be “constructor”, and objects have one already.
+    sizes: new Map(objects.filter(({ size }) => size).map(({ label, size }) => [label, size])),
+    canonical: (label) => names.get(plain(label)) ?? label,
+  };
+}
+
+export function createModels(store, first, second, tell) {
+  const asked = new Set();
+
+  async function learn(model, key, path, read) {
+    const place = `${key}/${model}`;
+    if (!model || asked.has(place)) return;
+    asked.add(place);
+    try {
+      const found = read(await call(`models/${encodeURIComponent(model)}/${path}`));
+      store.set({ [key]: { ...store.get()[key], [model]: found } });
+    } catch (error) {
+      asked.delete(place);
+      tell(error);
+    }
+  }
+
+  const options = (found) => found.map(({ value, words: text }) => el('option', { value }, text));
+
+  async function load() {
+    try {
+      const found = choices(await call('models'));
+      first.replaceChildren(...options(found));
+      second.replaceChildren(el('option', { value: '' }, 'none'), ...options(found));
+      [first.value, second.value] = store.get().models;
+      await learnAll(store.get());
+    } catch (error) {
+      tell(error);
+    }
+  }
+
+  function learnAll(state) {
+    const contexts = state.tab === 'generate';
+    return Promise.all(state.models.flatMap((model) => [
+      learn(model, 'words', 'vocabulary', words),
+      contexts && learn(model, 'contexts', 'contexts', ({ layers }) => layers),
+    ]));
+  }
+
+  const choose = () => {
+    const models = [first.value, second.value];
+    const { models: before, answers, shown } = store.get();
+    store.set({
+      models,
+      shown: models[1] ? shown : 0,
+      answers: answers.map((own, column) => (models[column] === before[column] ? own : {})),
+      draft: null,
+    });
+  };
+  first.addEventListener('change', choose);
+  second.addEventListener('change', choose);
+  store.subscribe((state, previous) => changed(state, previous, 'models', 'tab') && void learnAll(state));
+  return { load };
+}

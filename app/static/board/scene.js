@@ -1,0 +1,156 @@
+/** The board as the API's scene, and a scene of the API on the board. */
+
+import { halves, radians, round, UNKNOWN_SIZE } from './geometry.js';
+import { SPOKEN } from './words.js';
+
+/** @typedef {import('./store.js').Thing} Thing */
+
+/** Things with a size to draw: their own, the typical one, or a guess. */
+export const sizer = (sizes) => (thing) => ({
+  ...thing,
+  size: thing.size ?? sizes.get(thing.label) ?? UNKNOWN_SIZE,
+});
+
+/** The name of a further object of a class. */
+export function freshId(things, label) {
+  const taken = new Set(things.map((thing) => thing.id));
+  let id = label;
+  for (let number = 2; taken.has(id); number += 1) id = `${label}_${number}`;
+  return id;
+}
+
+/**
+ * What the service is asked about: what is drawn, sizes that nobody gave among it, so that every model
+ * is asked about the same scene.
+ * @param {{things: Thing[], viewer: object, room: string}} board
+ */
+export function toScene({ things, viewer, room }, sizes) {
+  const sized = sizer(sizes);
+  const objects = things.map((thing) => {
+    const { size } = sized(thing);
+    const half = radians(thing.yaw) / 2;
+    return {
+      id: thing.id,
+      label: thing.label,
+      ...(thing.confidence < 1 && { confidence: thing.confidence }),
+      position: { x: round(thing.x), y: round(thing.y), z: round(thing.z + size.z / 2) },
+      size,
+      ...(thing.yaw && {
+        orientation: { x: 0, y: 0, z: round(Math.sin(half), 6), w: round(Math.cos(half), 6) },
+      }),
+    };
+  });
+  return {
+    objects,
+    ...(room && { room_type: room }),
+    frame_id: 'map',
+    viewpoint: { x: round(viewer.x), y: round(viewer.y), yaw: round(viewer.yaw, 4) },
+  };
+}
+
+/** What the service takes at most: of a coordinate and an extent in metres, a heading in radians, objects. */
+const FARTHEST = 1e8;
+const LARGEST = 1e4;
+const MOST_TURNED = 1e3;
+export const MOST_OBJECTS = 256;
+export const FULL = `A scene has at most ${MOST_OBJECTS} objects: remove one first.`;
+
+/** What is wrong with a scene, in words. */
+export class SceneError extends Error {}
+
+function fail(condition, words) {
+  if (condition) throw new SceneError(words);
+}
+
+const isNumber = (value) => typeof value === 'number' && Number.isFinite(value);
+const AXES = ['x', 'y', 'z'];
+const isPlace = (value) => isNumber(value) && Math.abs(value) <= FARTHEST;
+const isExtent = (value) => isNumber(value) && value > 0 && value <= LARGEST;
+
+/**
+ * Reads a scene of the API. Things without a position are told by `placed`: false.
+ * @returns {{things: (Thing & {placed: boolean})[], viewer: object, room: string, relations: object[]}}
+ * @throws {SceneError}
+ */
+export function fromScene(scene, sizes) {
+  fail(!scene || typeof scene !== 'object' || Array.isArray(scene), 'A scene is an object: {"objects": [...]}.');
+  fail(!Array.isArray(scene.objects), 'A scene has a list of objects.');
+  fail(scene.objects.length > MOST_OBJECTS, `A scene has at most ${MOST_OBJECTS} objects.`);
+  fail(/_optical(_frame)?$/.test(scene.frame_id ?? ''), 'A camera’s optical frame cannot be drawn from above.');
+  const things = [];
+  scene.objects.forEach((entry, index) => things.push(readThing(entry, index, things, sizes)));
+  const { x = 0, y = 0, yaw = 0 } = scene.viewpoint ?? {};
+  fail(!(isPlace(x) && isPlace(y)), 'The viewpoint needs x and y: numbers within ±100 000 km.');
+  fail(!(isNumber(yaw) && Math.abs(yaw) <= MOST_TURNED), 'The viewpoint needs its yaw in radians, within ±1000.');
+  const relations = scene.relations ?? [];
+  fail(!Array.isArray(relations), 'Relations are a list.');
+  const room = scene.room_type ?? '';
+  fail(typeof room !== 'string', 'The room type is no text.');
+  return { things, viewer: { x, y, yaw }, room, relations: relations.map(readRelation(things)) };
+}
+
+/** Reads relations; their ends may be named by an id or by a label. */
+function readRelation(things) {
+  const names = new Map(things.map((thing) => [thing.label, thing.id]).reverse());
+  for (const { id } of things) names.set(id, id);
+  return (found, index) => {
+    const where = `Relation ${index + 1}`;
+    fail(!found || typeof found !== 'object', `${where} is no object with subject, relation and object.`);
+    const { subject, relation, object } = found;
+    fail(!Object.hasOwn(SPOKEN, relation), `${where} is none of ${Object.keys(SPOKEN).join(', ')}.`);
+    for (const name of [subject, object]) fail(!names.has(name), `${where} names what is not in the scene: ${name}.`);
+    return { subject: names.get(subject), relation, object: names.get(object) };
+  };
+}
+
+function readThing(entry, index, before, sizes) {
+  const found = typeof entry === 'string' ? { label: entry } : entry;
+  const where = `Object ${index + 1}`;
+  fail(!found || typeof found !== 'object', `${where} is neither a label nor an object.`);
+  fail(typeof found.label !== 'string' || !found.label.trim(), `${where} has no label.`);
+  const id = found.id ?? freshId(before, found.label);
+  fail(typeof id !== 'string' || !id, `${where} has an id that is no text.`);
+  fail(before.some((thing) => thing.id === id), `${where} has the id of another one: ${id}.`);
+  const { position, size = null, orientation: q, confidence = 1 } = found;
+  fail(position && !AXES.every((axis) => isPlace(position[axis])), `${where} needs x, y, z as its position: numbers within ±100 000 km.`);
+  fail(size && !AXES.every((axis) => isExtent(size[axis])), `${where} needs three positive metres as its size, at most 10 km.`);
+  fail(!(isNumber(confidence) && confidence > 0 && confidence <= 1), `${where} has a confidence outside (0, 1].`);
+  fail(q && !([q.x, q.y, q.z, q.w].every(isNumber) && Math.abs(Math.hypot(q.x, q.y, q.z, q.w) - 1) <= 0.01), `${where} has an orientation that is no unit quaternion.`);
+  const yaw = q ? (Math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)) * 180) / Math.PI : 0;
+  const thing = { id, label: found.label, size, yaw: round(yaw, 2), confidence, x: 0, y: 0, z: 0 };
+  const height = sizer(sizes)(thing).size.z;
+  const at = position && { x: position.x, y: position.y, z: round(position.z - height / 2) };
+  return { ...thing, ...at, placed: Boolean(position) };
+}
+
+const AROUND = 0.5; // metres that stay free around the robot
+
+/** A free place for a new thing: near the middle of what the robot sees, else wherever there is room. */
+export function freePlace(boxes, size, viewer) {
+  const need = halves({ size, yaw: 0 });
+  const [c, s] = [Math.cos(viewer.yaw), Math.sin(viewer.yaw)];
+  const free = ({ x, y }) =>
+    Math.hypot(Math.max(0, Math.abs(x - viewer.x) - need.x), Math.max(0, Math.abs(y - viewer.y) - need.y)) >= AROUND &&
+    boxes.every((box) => {
+      const half = halves(box);
+      const apart = Math.abs(box.x - x) > half.x + need.x + 0.1;
+      return apart || Math.abs(box.y - y) > half.y + need.y + 0.1;
+    });
+  const ahead = ({ x, y }) => (x - viewer.x) * c + (y - viewer.y) * s > 0;
+  const places = [];
+  for (let ring = 0; ring < 40; ring += 1) {
+    for (let step = 0; step < Math.max(1, ring * 6); step += 1) {
+      const angle = viewer.yaw + (2 * Math.PI * step) / Math.max(1, ring * 6);
+      const [x, y] = [2 * c + ring * 0.3 * Math.cos(angle), 2 * s + ring * 0.3 * Math.sin(angle)];
+      places.push({ x: round(viewer.x + x, 1), y: round(viewer.y + y, 1) });
+    }
+  }
+  const found = places.find((place) => ahead(place) && free(place)) ?? places.find(free);
+  return found ?? beyond(boxes, need, viewer);
+}
+
+/** Farther along x than all there is. */
+function beyond(boxes, need, viewer) {
+  const edge = Math.max(viewer.x + AROUND, ...boxes.map((box) => box.x + halves(box).x));
+  return { x: round(edge + need.x + 0.1, 1), y: viewer.y };
+}

@@ -1,0 +1,51 @@
+/**
+ * The page's state: one plain object, replaced as a whole at every change, so that a view sees by
+ * comparing references whether anything of its own has changed.
+ *
+ * @typedef {{x: number, y: number, z: number}} Extents metres
+ * @typedef {object} Thing an object on the board
+ * @property {string} id
+ * @property {string} label
+ * @property {number} x ahead, metres, of its centre
+ * @property {number} y to the left
+ * @property {number} z of its bottom
+ * @property {Extents | null} size along its own axes; null: typical of its class
+ * @property {number} yaw degrees, from x towards y
+ * @property {number} confidence
+ */
+
+/**
+ * @template {object} State
+ * @param {State} initial
+ */
+export function createStore(initial) {
+  let state = initial;
+  const listeners = new Set();
+  const past = [];
+  return {
+    get: () => state,
+    /** Changes some of the state. @param {Partial<State>} change */
+    set(change) {
+      const previous = state;
+      state = { ...state, ...change };
+      for (const listener of listeners) listener(state, previous);
+    },
+    /** Changes what is on the board, so that `undo` brings back what was there. */
+    edit(change) {
+      past.push({ things: state.things, viewer: state.viewer, room: state.room });
+      if (past.length > 200) past.shift();
+      this.set({ complaint: '', ...change, canUndo: true });
+    },
+    undo() {
+      const before = past.pop();
+      if (before) this.set({ ...before, canUndo: past.length > 0, at: null });
+    },
+    subscribe(listener) {
+      listeners.add(listener);
+    },
+  };
+}
+
+/** Whether any of these parts of the state changed. */
+export const changed = (state, previous, ...keys) =>
+  keys.some((key) => state[key] !== previous[key]);

@@ -1,0 +1,29 @@
+/** What the answers say, in a sentence for the live region. */
+
+import { wrongIn } from './edges.js';
+import { QUESTIONS } from './questions.js';
+import { percent, SPOKEN } from './words.js';
+
+const MOST_SAID = 3; // relations
+
+/** @returns {string | null} null while something is still asked, or nothing was answered */
+export function summary(state) {
+  const own = state.answers[state.shown];
+  if (!QUESTIONS.every((question) => own[question]?.status === 'answered')) return null;
+  const parts = [];
+  const [first] = own.missing.answer.missing;
+  if (first) {
+    const [place] = first.placements;
+    const where = place ? ` ${SPOKEN[place.relation]} ${place.object}` : '';
+    parts.push(`Most likely missing: ${first.label}${where}, ${percent(first.probability)}.`);
+  }
+  const { outliers, misplaced } = wrongIn(own.outliers.answer);
+  if (outliers.length) parts.push(`Does not belong here: ${outliers.map((one) => one.object).join(', ')}.`);
+  if (misplaced.length) {
+    const places = misplaced.map((one) => `${one.subject} ${SPOKEN[one.relation]} ${one.object}`);
+    const rest = places.length > MOST_SAID ? ` and ${places.length - MOST_SAID} more` : '';
+    parts.push(`In the wrong place: ${places.slice(0, MOST_SAID).join(', ')}${rest}.`);
+  }
+  if (!outliers.length && !misplaced.length) parts.push('Nothing looks wrong.');
+  return parts.join(' ');
+}

@@ -1,0 +1,120 @@
+"""The visual page in a browser, before a running service with the shipped models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Page, Route, ViewportSize, sync_playwright
+
+from tests.browser.driving import Board, link_to
+from tests.http.conftest import LiveService, launch
+
+DESK = {
+    "objects": [
+        {
+            "id": "desk",
+            "label": "desk",
+            "position": {"x": 2, "y": 0, "z": 0.37},
+            "size": {"x": 0.8, "y": 1.6, "z": 0.74},
+        },
+        {
+            "id": "chair",
+            "label": "chair",
+            "position": {"x": 1, "y": 0, "z": 0.45},
+            "size": {"x": 0.5, "y": 0.5, "z": 0.9},
+        },
+    ],
+}
+
+# Whatever a policy forbids is told to the page that tried it.
+_WITNESS = """
+window.violations = [];
+addEventListener('securitypolicyviolation', (event) =>
+  window.violations.push(`${event.violatedDirective} ${event.blockedURI}`));
+"""
+
+
+@pytest.fixture(scope="package")
+def chromium(require_system_tool: Callable[[str], Path]) -> Iterator[Browser]:
+    """One browser for all tests of this folder; its event loop must not outlive them."""
+    program = require_system_tool("chromium")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=str(program), args=["--headless", "--no-sandbox"]
+        )
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="package")
+def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    """The service with the shipped models."""
+    running = launch(repository / "model_store", tmp_path_factory.mktemp("browser") / "log")
+    yield running
+    running.client.close()
+    running.process.terminate()
+    running.process.wait(timeout=30)
+
+
+@pytest.fixture
+def api(service: LiveService) -> httpx.Client:
+    """The same service, asked without a browser."""
+    return service.client
+
+
+@pytest.fixture
+def open_board(chromium: Browser, service: LiveService) -> Iterator[Callable[..., Board]]:
+    """Return a function that opens the page; what must never happen there fails the test."""
+    opened: list[tuple[Page, list[str]]] = []
+
+    def open_page(
+        scene: dict[str, Any] | None = DESK,
+        *,
+        width: int = 1300,
+        allow: tuple[str, ...] = (),
+        home: str | None = None,
+        url: str | None = None,
+        **options: Any,
+    ) -> Board:
+        size: ViewportSize = {"width": width, "height": 900}
+        context = chromium.new_context(viewport=size, **options)
+        context.set_default_timeout(15_000)
+        context.add_init_script(_WITNESS)
+        root = home or str(service.client.base_url)
+        wrong: list[str] = []
+
+        def only_home(route: Route) -> None:
+            address = route.request.url
+            if address.startswith((root, "data:", "blob:")):
+                route.continue_()
+            else:
+                wrong.append(f"asked for {address}")
+                route.abort()
+
+        context.route("**/*", only_home)
+        page = context.new_page()
+        page.on("pageerror", lambda error: wrong.append(f"error: {error}"))
+        page.on(
+            "console",
+            lambda message: (
+                wrong.append(f"console: {message.text}")
+                if message.type in {"error", "warning"}
+                and not any(text in message.text for text in allow)
+                else None
+            ),
+        )
+        opened.append((page, wrong))
+        page.goto(url or root + "/" + (link_to(scene) if scene else ""))
+        board = Board(page)
+        board.settle()
+        return board
+
+    yield open_page
+    for page, wrong in opened:
+        found = [*wrong, *page.evaluate("window.violations")]
+        page.context.close()
+        assert found == []

@@ -1,0 +1,154 @@
+"""What a person does on the page, and what the page shows."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shlex
+import zlib
+from typing import Any
+
+from playwright.sync_api import Locator, Page, expect
+
+STILL = 250
+"""Milliseconds after which the page has asked, whatever changed."""
+
+
+class Board:
+    """The page. Everything goes through what people see: roles, names, texts."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+
+    def settle(self) -> None:
+        """Wait until everything that changed has been asked and answered."""
+        expect(self.page.locator("main[aria-busy=true]")).to_have_count(0, timeout=20_000)
+        self.page.wait_for_timeout(STILL)
+        busy = self.page.locator("article:not([hidden])[aria-busy=true], #drawn[aria-busy=true]")
+        expect(busy).to_have_count(0, timeout=20_000)
+        self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => done()))")
+
+    # ------------------------------------------------------------------------------ doing
+
+    def put(self, text: str) -> None:
+        """Import a scene."""
+        self.page.get_by_role("button", name="Import, export, share").click()
+        self.page.get_by_label("Scene, JSON").fill(text)
+        self.page.get_by_role("button", name="Put on the board").click()
+        self.settle()
+
+    def exported(self) -> dict[str, Any]:
+        """The scene as the dialog shows it."""
+        self.page.get_by_role("button", name="Import, export, share").click()
+        found: dict[str, Any] = json.loads(self.page.get_by_label("Scene, JSON").input_value())
+        self.page.get_by_role("button", name="Close").click()
+        return found
+
+    def add(self, text: str) -> None:
+        """Search for an object and take the first that fits."""
+        box = self.page.get_by_role("combobox", name="Add an object")
+        box.fill(text)
+        box.press("Enter")
+        self.settle()
+
+    def tab(self, name: str) -> None:
+        """Go to a question."""
+        self.page.get_by_role("tab", name=name).click()
+        self.settle()
+
+    def slide(self, label: str, value: int) -> None:
+        """Move a slider."""
+        slider = self.page.get_by_role("slider", name=label)
+        slider.fill(str(value))
+        self.settle()
+
+    def drag(self, what: Locator, right: float, down: float) -> None:
+        """Drag something by so many pixels, in several movements."""
+        box = what.bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
+        for part in (0.2, 0.6, 1.0):
+            self.page.mouse.move(x + right * part, y + down * part)
+        self.page.mouse.up()
+        self.settle()
+
+    # ---------------------------------------------------------------------------- seeing
+
+    def thing(self, name: str) -> Locator:
+        """An object of the board."""
+        return self.page.locator(f'#board .object[aria-label^="{name},"]')
+
+    @property
+    def things(self) -> list[str]:
+        """What the list shows."""
+        return self.page.locator("#list .name b").all_text_contents()
+
+    @property
+    def ghosts(self) -> list[str]:
+        """The suggestions on the board."""
+        return self.page.locator("#board .ghost text").all_text_contents()
+
+    @property
+    def edges(self) -> list[tuple[str, str]]:
+        """Kind and words of each edge."""
+        return [
+            (edge.get_attribute("class") or "", edge.locator("text").text_content() or "")
+            for edge in self.page.locator("#board .edges > g").all()
+        ]
+
+    @property
+    def said(self) -> str:
+        """What a screen reader was told last."""
+        return self.page.locator("#live").text_content() or ""
+
+    def column(self, question: str, number: int = 0) -> Locator:
+        """The answers of one model to a question."""
+        return self.page.locator(f"[data-question={question}] article").nth(number)
+
+    def rows(self, question: str, number: int = 0) -> list[str]:
+        """The entries of an answer, each in one line."""
+        texts = self.column(question, number).locator("ol > li").all_inner_texts()
+        return [re.sub(r"\s+", " ", text).strip() for text in texts]
+
+    def curl(self, question: str, number: int = 0) -> str:
+        """The command that the page shows."""
+        return self.column(question, number).locator("pre").first.text_content() or ""
+
+    def python(self, question: str, number: int = 0) -> str:
+        """The program that the page shows."""
+        return self.column(question, number).locator("pre").nth(1).text_content() or ""
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """The scene of the shown question's command: what any question can be asked about."""
+        shown = self.page.locator("article:visible pre").first.text_content() or ""
+        fields = ("objects", "relations", "room_type", "frame_id", "viewpoint")
+        return {name: value for name, value in body_of(shown).items() if name in fields}
+
+    def body(self, question: str, number: int = 0) -> dict[str, Any]:
+        """The request of that command."""
+        return body_of(self.curl(question, number))
+
+
+def link_to(scene: dict[str, Any]) -> str:
+    """The fragment of an address that holds a scene."""
+    packer = zlib.compressobj(wbits=-15)
+    packed = packer.compress(json.dumps(scene).encode()) + packer.flush()
+    return "#scene=" + base64.urlsafe_b64encode(packed).decode().rstrip("=")
+
+
+def body_of(command: str) -> dict[str, Any]:
+    """What a curl command posts."""
+    words = shlex.split(command)
+    found: dict[str, Any] = json.loads(words[words.index("-d") + 1])
+    return found
+
+
+def percent(probability: float) -> str:
+    """A probability as the page writes it."""
+    if 0 < probability < 0.01:
+        return "< 1 %"
+    return f"{int(100 * probability + 0.5)} %"

@@ -1,0 +1,200 @@
+"""The page for keyboards, screen readers, small screens, light and dark."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import httpx
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import expect
+
+from tests.browser.driving import Board
+
+pytestmark = pytest.mark.system
+
+OpenBoard = Callable[..., Board]
+
+
+def focus(board: Board) -> str:
+    """What has the focus: its name, or its text."""
+    found: str = board.page.evaluate(
+        "document.activeElement.getAttribute('aria-label') ?? document.activeElement.innerText"
+    )
+    return found
+
+
+def complaints(board: Board) -> list[str]:
+    found = Axe().run(board.page).response["violations"]
+    return [f"{one['id']}: {node['html'][:120]}" for one in found for node in one["nodes"]]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> None:
+    board = open_board(scene=None, color_scheme=scheme)
+    page = board.page
+    found = {"example": complaints(board)}
+    page.get_by_label("beside it").select_option(index=3)
+    page.locator("#list .name").first.click()
+    board.settle()
+    board.column("missing").get_by_text("The same from a program").click()
+    found["two models, form, calls"] = complaints(board)
+    page.get_by_role("button", name="What can be done with bed").click()
+    found["menu"] = complaints(board)
+    page.keyboard.press("Escape")
+    for tab in ("Wrong", "Relations", "Imagine"):
+        board.tab(tab)
+        found[tab] = complaints(board)
+    page.get_by_text("Contexts to hold on").click()
+    page.get_by_role("button", name="Draw a scene").click()
+    page.wait_for_timeout(300)
+    board.settle()
+    found["drawn"] = complaints(board)
+    page.get_by_role("button", name="Back to mine").click()
+    page.get_by_role("combobox", name="Add an object").fill("la")
+    found["search"] = complaints(board)
+    page.get_by_role("combobox", name="Add an object").press("Escape")
+    page.get_by_role("button", name="Import, export, share").click()
+    found["dialog"] = complaints(board)
+    page.get_by_role("button", name="Close").click()
+    page.get_by_role("button", name="Clear").click()
+    board.tab("Missing")
+    found["empty"] = complaints(board)
+    assert {state: found[state] for state in found if found[state]} == {}
+
+
+def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
+    board = open_board()
+    page = board.page
+    press = page.keyboard.press
+    page.evaluate("document.activeElement.blur()")
+    press("Tab")
+    assert focus(board) == "Skip to the answers"
+    search = page.get_by_role("combobox", name="Add an object")
+    for _ in range(12):
+        if search.evaluate("(node) => node === document.activeElement"):
+            break
+        press("Tab")
+    page.keyboard.type("lapt")
+    press("ArrowDown")
+    press("Enter")
+    board.settle()
+    assert board.things == ["desk", "chair", "laptop"]
+    # On the board: to the object, move it, turn it, ask from its menu.
+    board.thing("laptop").focus()
+    before = board.scene["objects"][-1]["position"]
+    for key in ("ArrowUp", "ArrowLeft", "Shift+ArrowLeft", "Alt+ArrowDown", "r"):
+        press(key)
+    board.settle()
+    laptop = board.scene["objects"][-1]
+    assert laptop["position"]["x"] == pytest.approx(before["x"] + 0.09, abs=1e-6)
+    assert laptop["position"]["y"] == pytest.approx(before["y"] + 0.6, abs=1e-6)
+    assert laptop["orientation"]["z"] > 0
+    assert focus(board).startswith("laptop, ")
+    press("Enter")
+    assert focus(board) == "What is missing on top of it?"
+    press("ArrowDown")
+    press("ArrowDown")
+    press("Enter")
+    board.settle()
+    assert board.body("missing")["at"] == {"relation": "left", "object": "laptop"}
+    assert focus(board).startswith("laptop, ")
+    press("Delete")
+    board.settle()
+    page.wait_for_timeout(100)
+    assert board.things == ["desk", "chair"]
+    assert focus(board).startswith(("desk, ", "chair, "))
+    press("Control+z")
+    board.settle()
+    assert board.things == ["desk", "chair", "laptop"]
+    # In the list the same keys do the same.
+    page.locator("#list .name", has_text="chair").focus()
+    chair = board.scene["objects"][1]["position"]["x"]
+    press("ArrowDown")
+    board.settle()
+    assert board.scene["objects"][1]["position"]["x"] == pytest.approx(chair - 0.1)
+    assert "chair" in focus(board)
+    press("Delete")
+    board.settle()
+    page.wait_for_timeout(100)
+    assert board.things == ["desk", "laptop"]
+    assert "laptop" in focus(board)
+    # Questions are tabs; suggestions are accepted by Enter.
+    page.get_by_role("tab", name="Missing").focus()
+    press("ArrowRight")
+    expect(page.get_by_role("tab", name="Wrong")).to_have_attribute("aria-selected", "true")
+    press("End")
+    expect(page.get_by_role("tab", name="Imagine")).to_have_attribute("aria-selected", "true")
+    press("Home")
+    board.settle()
+    count = len(board.things)
+    page.locator("[data-question=missing] .icon").first.focus()
+    press("Enter")
+    board.settle()
+    assert len(board.things) == count + 1
+    assert focus(board) != ""
+
+
+def test_answers_and_movements_are_announced(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board()
+    best = api.post("/missing", json=board.scene).json()["missing"][0]["label"]
+    assert f"Most likely missing: {best}" in board.said
+    board.thing("chair").focus()
+    board.page.keyboard.press("ArrowUp")
+    expect(board.page.locator("#live")).to_contain_text("chair: x 1.10, y 0.00")
+    board.page.keyboard.press("r")
+    expect(board.page.locator("#live")).to_contain_text("turned to 15 degrees")
+
+
+def test_the_dialog_keeps_the_focus_and_gives_it_back(open_board: OpenBoard) -> None:
+    board = open_board()
+    board.page.get_by_role("button", name="Import, export, share").click()
+    assert board.page.evaluate("document.activeElement.id") == "json"
+    board.page.keyboard.press("Escape")
+    expect(board.page.locator("#file")).to_be_hidden()
+    assert focus(board) == "Import, export, share"
+
+
+def test_colours_follow_the_system_unless_somebody_chooses(open_board: OpenBoard) -> None:
+    board = open_board(color_scheme="dark")
+    background = "getComputedStyle(document.body).backgroundColor"
+    dark = board.page.evaluate(background)
+    board.page.get_by_label("Colours").select_option("light")
+    light = board.page.evaluate(background)
+    assert light != dark
+    board.page.emulate_media(color_scheme="light")
+    board.page.get_by_label("Colours").select_option("")
+    assert board.page.evaluate(background) == light
+    board.page.get_by_label("Colours").select_option("dark")
+    board.page.reload()
+    board.settle()
+    assert board.page.evaluate(background) == dark
+
+
+def test_it_fits_a_telephone(open_board: OpenBoard) -> None:
+    board = open_board(scene=None, width=375, has_touch=True)
+    for tab in ("Missing", "Wrong", "Relations", "Imagine"):
+        board.tab(tab)
+        wide = board.page.evaluate("document.documentElement.scrollWidth")
+        assert wide <= 375, tab
+    board.page.locator("#list .name").first.tap()
+    board.settle()
+    assert board.page.evaluate("document.documentElement.scrollWidth") <= 375
+
+
+def test_nothing_moves_for_who_wants_no_motion(open_board: OpenBoard) -> None:
+    moving = "getComputedStyle(document.querySelector('.bar rect')).transitionDuration"
+    assert open_board(reduced_motion="no-preference").page.evaluate(moving) != "0s"
+    assert open_board(reduced_motion="reduce").page.evaluate(moving) == "0s"
+
+
+def test_a_narrow_page_does_not_scroll_sideways(open_board: OpenBoard) -> None:
+    board = open_board(scene=None, width=320)
+    for tab in ("Missing", "Wrong", "Relations", "Imagine"):
+        board.tab(tab)
+        wide = board.page.evaluate(
+            "[...document.querySelectorAll('body *')].filter((one) =>"
+            " one.getBoundingClientRect().right > 321 && !one.closest('svg'))"
+            ".map((one) => one.outerHTML.slice(0, 80))"
+        )
+        assert board.page.evaluate("document.documentElement.scrollWidth") <= 320, wide

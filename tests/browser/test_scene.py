@@ -1,0 +1,331 @@
+"""Objects come onto the board, move there and leave it, and the service is asked about them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import httpx
+import pytest
+from playwright.sync_api import expect
+
+from tests.browser.driving import Board
+
+pytestmark = pytest.mark.system
+
+OpenBoard = Callable[..., Board]
+
+
+def place(board: Board, name: str) -> tuple[float, float, float]:
+    """Centre of an object as the service is told."""
+    (found,) = [thing for thing in board.body("missing")["objects"] if thing["id"] == name]
+    return tuple(found["position"][axis] for axis in "xyz")
+
+
+def test_it_opens_with_a_scene_that_is_answered(open_board: OpenBoard) -> None:
+    board = open_board(scene=None)
+    assert "bed" in board.things
+    assert board.rows("missing")
+    assert board.ghosts
+    assert board.said.startswith("Most likely missing: ")
+
+
+@pytest.mark.parametrize("example", ["bedroom", "kitchen", "desk"])
+def test_every_example_is_answered(open_board: OpenBoard, api: httpx.Client, example: str) -> None:
+    board = open_board(scene=None)
+    options = board.page.locator("#example option").all_text_contents()
+    (name,) = [text for text in options if example in text]
+    board.page.get_by_label("Example").select_option(name)
+    board.settle()
+    assert board.rows("missing")
+    vocabulary = api.get("/models/default/vocabulary").json()
+    known = {entry["label"] for entry in vocabulary["objects"]}
+    body = board.body("missing")
+    assert {thing["label"] for thing in body["objects"]} <= known
+    assert body["room_type"] in vocabulary["room_types"]
+
+
+def test_an_object_is_found_by_any_of_its_names(open_board: OpenBoard) -> None:
+    board = open_board()
+    box = board.page.get_by_role("combobox", name="Add an object")
+    box.fill("trash c")
+    options = board.page.locator("#found [role=option]")
+    expect(options.first).to_contain_text("garbage bin trash can")
+    assert box.get_attribute("aria-expanded") == "true"
+    box.press("ArrowDown")
+    assert box.get_attribute("aria-activedescendant") == options.first.get_attribute("id")
+    box.press("Enter")
+    board.settle()
+    assert board.things == ["desk", "chair", "garbage bin"]
+    assert board.body("missing")["objects"][-1]["label"] == "garbage bin"
+    assert box.get_attribute("aria-expanded") == "false"
+
+
+def test_a_word_that_no_model_knows_is_answered_where_it_was_typed(open_board: OpenBoard) -> None:
+    board = open_board()
+    board.add("flux capacitor")
+    expect(board.page.locator("#search-error")).to_contain_text("flux capacitor")
+    assert board.things == ["desk", "chair"]
+
+
+def test_a_second_one_of_a_class_has_a_name_of_its_own(open_board: OpenBoard) -> None:
+    board = open_board()
+    board.add("chair")
+    assert board.things == ["desk", "chair", "chair_2"]
+
+
+def test_an_object_can_be_dropped_where_it_stands(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board()
+    board.page.get_by_role("combobox", name="Add an object").fill("lamp")
+    option = board.page.get_by_role("option", name="lamp", exact=True)
+    desk = board.thing("desk").locator(".box").bounding_box()
+    svg = board.page.locator("#board").bounding_box()
+    assert desk is not None
+    assert svg is not None
+    at = {"x": desk["x"] - svg["x"] + 20, "y": desk["y"] - svg["y"] + desk["height"] / 2}
+    option.drag_to(board.page.locator("#board"), target_position=at)
+    board.settle()
+    x, y, z = place(board, "lamp")
+    assert x == pytest.approx(2, abs=0.1)
+    assert 0.5 < y < 0.8
+    assert z > 0.74
+    answer = api.post("/outliers", json=board.scene).json()
+    assert {"subject": "lamp", "relation": "on-top", "object": "desk"} in answer[
+        "observed_relations"
+    ]
+
+
+def test_what_stands_on_something_moves_with_it(open_board: OpenBoard) -> None:
+    board = open_board()
+    lamp = {"id": "lamp", "label": "lamp", "position": {"x": 2, "y": 0.5, "z": 0.94}}
+    board.put(json.dumps({"objects": [*board.exported()["objects"], lamp]}))
+    before, desk = place(board, "lamp"), place(board, "desk")
+    board.thing("desk").focus()
+    board.page.keyboard.press("Shift+ArrowRight")
+    board.settle()
+    assert place(board, "desk")[1] == pytest.approx(desk[1] - 0.5)
+    assert place(board, "lamp") == pytest.approx((before[0], before[1] - 0.5, before[2]))
+
+
+def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> None:
+    board = open_board()
+    before = place(board, "chair")
+    board.drag(board.thing("chair").locator(".box"), 61, 37)
+    snapped = place(board, "chair")
+    assert snapped[0] < before[0]
+    assert snapped[1] < before[1]
+    assert all(round(10 * value) == pytest.approx(10 * value) for value in snapped[:2])
+    board.page.get_by_label("snap to 10 cm").uncheck()
+    board.drag(board.thing("chair").locator(".box"), 33, 0)
+    free = place(board, "chair")
+    assert round(100 * free[1]) % 10 or round(1000 * free[1]) % 10
+    board.page.get_by_role("button", name="Undo").click()
+    board.page.get_by_role("button", name="Undo").click()
+    board.settle()
+    assert place(board, "chair") == before
+
+
+def test_handles_resize_and_turn(open_board: OpenBoard) -> None:
+    board = open_board()
+    board.thing("desk").focus()
+    board.drag(board.page.locator(".handles .resize"), 30, 20)
+    (desk, _) = board.body("missing")["objects"]
+    assert desk["size"]["x"] > 0.8
+    assert desk["size"]["y"] > 1.6
+    assert desk["size"]["z"] == 0.74
+    board.drag(board.page.locator(".handles .turn"), -300, 200)
+    (desk, _) = board.body("missing")["objects"]
+    assert desk["orientation"]["w"] < 0.95
+
+
+def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
+    board = open_board()
+    board.page.get_by_role("button", name="chair", exact=False).first.click()
+    form = board.page.locator("#properties")
+    form.get_by_label("Name").fill("my chair")
+    form.get_by_label("Name").press("Enter")
+    form.get_by_label("ahead (x)").fill("1.25")
+    form.get_by_label("height").fill("1.1")
+    form.get_by_label("Turned, degrees").fill("90")
+    form.get_by_label("Confidence").fill("0.8")
+    form.get_by_label("Confidence").press("Enter")
+    board.settle()
+    (_, chair) = board.body("missing")["objects"]
+    assert chair["id"] == "my chair"
+    assert chair["position"]["x"] == 1.25
+    assert chair["position"]["z"] == pytest.approx(0.55)
+    assert chair["size"]["z"] == 1.1
+    assert chair["confidence"] == 0.8
+    assert chair["orientation"]["z"] == pytest.approx(0.7071, abs=1e-3)
+
+
+def test_numbers_that_make_no_sense_are_refused_beside_the_field(open_board: OpenBoard) -> None:
+    board = open_board()
+    board.page.locator("#list .name").first.click()
+    field = board.page.locator("#properties").get_by_label("height")
+    field.fill("-1")
+    field.press("Enter")
+    expect(board.page.locator("#properties-error")).not_to_be_empty()
+    assert field.get_attribute("aria-invalid") == "true"
+    board.settle()
+    assert board.body("missing")["objects"][0]["size"]["z"] == 0.74
+
+
+def test_sizes_that_nobody_gave_are_the_models(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board()
+    board.add("laptop")
+    words = api.get("/models/default/vocabulary").json()["objects"]
+    (typical,) = [entry["size"] for entry in words if entry["label"] == "laptop"]
+    assert board.body("missing")["objects"][-1]["size"] == typical
+    expect(board.page.locator("#size-source")).to_have_text("(typical)")
+    shown = board.page.locator("#properties").get_by_label("along x").input_value()
+    assert float(shown) == pytest.approx(typical["x"], abs=1e-3)
+
+
+def test_the_robot_can_stand_elsewhere(open_board: OpenBoard) -> None:
+    board = open_board()
+    board.page.get_by_role("button", name="Robot at x 0").focus()
+    for key in ("Shift+ArrowLeft", "r", "r"):
+        board.page.keyboard.press(key)
+    board.settle()
+    viewpoint = board.scene["viewpoint"]
+    assert viewpoint["y"] == 0.5
+    assert viewpoint["yaw"] == pytest.approx(0.5236, abs=1e-3)
+
+
+def test_a_scene_leaves_and_comes_back_as_the_api_takes_it(
+    open_board: OpenBoard, api: httpx.Client
+) -> None:
+    board = open_board()
+    board.add("monitor")
+    scene = board.exported()
+    answer = api.post("/missing", json=scene)
+    assert answer.status_code == 200
+    board.page.get_by_role("button", name="Clear").click()
+    board.settle()
+    assert board.things == []
+    board.put(json.dumps(scene))
+    assert board.exported() == scene
+
+
+def test_labels_and_relations_alone_are_laid_out(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board()
+    given = [
+        {"subject": "lamp", "relation": "on-top", "object": "nightstand"},
+        {"subject": "nightstand", "relation": "left", "object": "bed"},
+        {"subject": "rug", "relation": "front", "object": "bed"},
+    ]
+    objects = ["bed", "nightstand", "lamp", "rug"]
+    board.put(json.dumps({"objects": objects, "relations": given}))
+    answer = api.post("/relations", json=board.scene).json()
+    # The service reads from the drawn positions what the scene said in words.
+    assert all(relation in answer["observed_relations"] for relation in given)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "not JSON"),
+        ("[]", "A scene is an object"),
+        ('{"objects": [{"label": "bed", "size": {"x": -1, "y": 1, "z": 1}}]}', "positive metres"),
+        ('{"objects": [{"id": "a", "label": "bed"}, {"id": "a", "label": "bed"}]}', "another one"),
+        ('{"objects": [{"label": "bed", "position": {"x": 1e9, "y": 0, "z": 0}}]}', "100 000 km"),
+        ('{"objects": [{"label": "bed", "size": {"x": 2e4, "y": 1, "z": 1}}]}', "10 km"),
+        ('{"objects": ["bed"], "relations": [null]}', "Relation 1 is no object"),
+        (
+            '{"objects": ["bed", "rug"], "relations": '
+            '[{"subject": "rug", "relation": "constructor", "object": "bed"}]}',
+            "none of left, right",
+        ),
+        (
+            '{"objects": ["bed"], "relations": '
+            '[{"subject": "rug", "relation": "under", "object": "bed"}]}',
+            "not in the scene: rug",
+        ),
+        ('{"objects": [], "viewpoint": {"x": 0, "y": 0, "yaw": 2e3}}', "±1000"),
+    ],
+)
+def test_what_is_no_scene_is_refused_in_words(open_board: OpenBoard, text: str, words: str) -> None:
+    board = open_board()
+    board.page.get_by_role("button", name="Import, export, share").click()
+    board.page.get_by_label("Scene, JSON").fill(text)
+    board.page.get_by_role("button", name="Put on the board").click()
+    expect(board.page.locator("#json-error")).to_contain_text(words)
+    board.page.get_by_role("button", name="Close").click()
+    assert board.things == ["desk", "chair"]
+
+
+def test_a_link_holds_the_scene(open_board: OpenBoard) -> None:
+    board = open_board(permissions=["clipboard-read", "clipboard-write"])
+    scene = board.exported()
+    board.page.get_by_role("button", name="Import, export, share").click()
+    board.page.get_by_role("button", name="Copy a link").click()
+    expect(board.page.locator("#share-done")).to_contain_text("copied")
+    link = board.page.evaluate("navigator.clipboard.readText()")
+    assert "#scene=" in link
+    other = open_board(scene=None, url=link)
+    assert other.exported() == scene
+
+
+def test_a_link_that_is_broken_says_so(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board(scene=None, url=f"{api.base_url}/#scene=nonsense")
+    expect(board.page.get_by_role("alert").first).to_contain_text("cannot be read")
+    assert board.things
+
+
+def test_a_huge_room_is_drawn_with_few_lines(open_board: OpenBoard) -> None:
+    board = open_board()
+    far = {"label": "bed", "position": {"x": 9e7, "y": -9e7, "z": 0.3}}
+    board.put(json.dumps({"objects": ["desk", far]}))
+    assert board.things == ["desk", "bed"]
+    assert 4 < board.page.locator("#board .grid line").count() <= 82
+
+
+def test_labels_that_javascript_knows_are_labels_like_others(open_board: OpenBoard) -> None:
+    scene = {"objects": [{"label": name} for name in ("constructor", "__proto__", "bed")]}
+    board = open_board(scene, allow=("422",))
+    assert board.things == ["constructor", "__proto__", "bed"]
+    board.page.locator("#list .name").nth(1).click()
+    expect(board.page.locator("#size-source")).to_have_text("(a guess)")
+
+
+def test_relations_that_positions_replace_are_told(open_board: OpenBoard) -> None:
+    board = open_board()
+    given = [{"subject": "chair", "relation": "left", "object": "desk"}]
+    board.put(json.dumps(board.exported() | {"relations": given}))
+    expect(board.page.locator("#note")).to_have_text(
+        "1 given relation was left out: the board asks by positions."
+    )
+    board.page.get_by_role("button", name="Clear").click()
+    expect(board.page.locator("#note")).to_be_hidden()
+
+
+def test_new_objects_leave_room_for_the_robot(open_board: OpenBoard) -> None:
+    board = open_board()
+    for _ in range(12):
+        board.add("table")
+    for found in board.body("missing")["objects"][2:]:
+        x, y = (
+            max(0, abs(found["position"][axis]) - found["size"][axis] / 2) for axis in ("x", "y")
+        )
+        assert (x**2 + y**2) ** 0.5 >= 0.49
+        assert found["position"]["x"] > 0
+
+
+@pytest.mark.parametrize("width", [1300, 600])
+def test_long_names_leave_room_for_the_buttons(open_board: OpenBoard, width: int) -> None:
+    board = open_board({"objects": [{"id": "b" * 120, "label": "bed"}]}, width=width)
+    section = board.page.locator("#things").bounding_box()
+    remove = board.page.locator("#list").get_by_role("button", name="Remove").bounding_box()
+    assert section is not None
+    assert remove is not None
+    assert remove["x"] + remove["width"] <= section["x"] + section["width"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "label"), [("chairs", "chair"), ("trash cans", "garbage bin"), ("fridgde", "fridge")]
+)
+def test_plurals_and_typos_are_found(open_board: OpenBoard, typed: str, label: str) -> None:
+    board = open_board()
+    board.add(typed)
+    assert board.body("missing")["objects"][-1]["label"] == label

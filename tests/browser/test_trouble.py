@@ -1,0 +1,159 @@
+"""Large scenes, superseded questions, refusals, keys, and a service that goes away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import Route, expect
+
+from tests.browser.driving import Board
+from tests.http.conftest import launch
+
+pytestmark = pytest.mark.system
+
+OpenBoard = Callable[..., Board]
+
+
+def crowd(api: httpx.Client, count: int) -> dict[str, object]:
+    words = api.get("/models/default/vocabulary").json()["objects"]
+    labels = [entry["label"] for entry in words if not entry["structure"]]
+    return {
+        "objects": [
+            {
+                "id": f"{labels[k]} {k}",
+                "label": labels[k],
+                "position": {"x": 0.6 + 0.6 * (k // 16), "y": 0.6 * (k % 16 - 8), "z": 0.2},
+                "size": {"x": 0.4, "y": 0.4, "z": 0.4},
+            }
+            for k in range(count)
+        ]
+    }
+
+
+def test_the_largest_scene_is_drawn_and_answered(open_board: OpenBoard, api: httpx.Client) -> None:
+    board = open_board(crowd(api, 256))
+    expect(board.page.locator("#board .object")).to_have_count(256)
+    assert board.rows("missing")
+    first = board.page.locator("#board .object").first
+    before = board.scene["objects"]
+    board.drag(first.locator(".box"), 40, 20)
+    assert board.scene["objects"] != before
+    board.add("mug")
+    assert len(board.things) == 256
+    expect(board.page.locator("#search-error")).to_contain_text("at most 256 objects")
+    board.page.get_by_role("button", name="Remove", exact=False).first.click()
+    board.settle()
+    expect(board.page.locator("#search-error")).to_be_empty()
+
+
+def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
+    board = open_board()
+    posted: list[str] = []
+    dropped: list[str] = []
+    board.page.on(
+        "request", lambda one: posted.append(one.url) if one.url.endswith("/missing") else None
+    )
+    board.page.on(
+        "requestfailed",
+        lambda one: dropped.append(one.url) if one.url.endswith("/missing") else None,
+    )
+    held: list[Route] = []
+    board.page.route("**/missing", lambda route: held.append(route))
+    board.thing("chair").focus()
+    for _ in range(8):
+        board.page.keyboard.press("ArrowUp")
+    board.page.wait_for_timeout(500)
+    assert len(posted) < 8
+    asked = len(posted)
+    board.page.keyboard.press("ArrowUp")
+    board.page.wait_for_timeout(500)
+    assert len(posted) == asked + 1
+    assert len(dropped) == asked
+    held[-1].continue_()
+    board.settle()
+    assert board.scene["objects"][1]["position"]["x"] == pytest.approx(1.9)
+    assert board.rows("missing")
+
+
+def test_a_refused_room_is_told_beside_the_room(open_board: OpenBoard) -> None:
+    scene = {"objects": ["bed"], "room_type": "submarine"}
+    board = open_board(scene, allow=("422",))
+    expect(board.page.locator("#room-error")).not_to_be_empty()
+    board.page.locator("#room").select_option("bedroom")
+    board.settle()
+    expect(board.page.locator("#room-error")).to_be_empty()
+    assert board.rows("missing")
+
+
+def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> None:
+    board = open_board(allow=("429",))
+    refusals = []
+
+    def refuse_once(route: Route) -> None:
+        if refusals:
+            route.continue_()
+            return
+        refusals.append(route)
+        problem = {
+            "type": "/problems/overloaded",
+            "title": "Overloaded",
+            "status": 429,
+            "detail": "The line is full.",
+            "request_id": "r",
+        }
+        route.fulfill(status=429, json=problem, headers={"Retry-After": "1"})
+
+    board.page.route("**/missing", refuse_once)
+    board.add("laptop")
+    expect(board.column("missing").get_by_role("alert")).to_contain_text("The line is full")
+    expect(board.column("missing").get_by_role("alert")).to_be_hidden(timeout=5000)
+    board.settle()
+    assert board.rows("missing")
+
+
+def test_the_page_outlives_the_service(
+    open_board: OpenBoard, repository: Path, tmp_path: Path
+) -> None:
+    store = repository / "model_store"
+    mortal = launch(store, tmp_path / "log")
+    home = f"http://127.0.0.1:{mortal.port}"
+    try:
+        board = open_board(home=home, allow=("ERR_", "503"))
+        mortal.process.kill()
+        mortal.process.wait()
+        board.add("laptop")
+        expect(board.page.get_by_role("alert").first).to_contain_text("does not answer")
+        assert board.things == ["desk", "chair", "laptop"]
+        mortal.client.close()
+        mortal = launch(store, tmp_path / "log2", port=mortal.port)
+        expect(board.page.locator("#banner")).to_be_hidden(timeout=30_000)
+        board.settle()
+        assert len(board.body("missing")["objects"]) == 3
+        assert board.rows("missing")
+    finally:
+        mortal.client.close()
+        mortal.process.kill()
+        mortal.process.wait()
+
+
+def test_a_service_with_a_key_is_asked_with_it(
+    open_board: OpenBoard, repository: Path, tmp_path: Path
+) -> None:
+    key = "a-key-of-sixteen-letters"
+    guarded = launch(repository / "model_store", tmp_path / "log", SCENE_API_KEY=key)
+    try:
+        board = open_board(home=f"http://127.0.0.1:{guarded.port}", allow=("401",))
+        board.page.get_by_label("API key").first.fill(key)
+        board.page.get_by_label("API key").first.press("Enter")
+        board.page.wait_for_timeout(500)
+        board.settle()
+        assert board.rows("missing")
+        assert '-H "X-API-Key: $SCENE_API_KEY"' in board.curl("missing")
+        assert key not in board.page.content()
+    finally:
+        guarded.client.close()
+        guarded.process.kill()
+        guarded.process.wait()
