@@ -1,0 +1,116 @@
+"""A copy of the repository with the service running in it, as a new engineer would have it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+
+_LEFT_OUT = shutil.ignore_patterns(
+    ".git", ".venv", "build", "dist", "runs", ".hypothesis", ".*_cache"
+)
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """A copy of the repository, and the service that `make run` started in it."""
+
+    folder: Path
+    address: str
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Of a shell there: programs of the environment are on the path."""
+        programs = os.pathsep.join([str(self.folder / ".venv" / "bin"), os.environ["PATH"]])
+        return _without_settings() | {"PATH": programs, "PYTHONPATH": str(self.folder)}
+
+
+@pytest.fixture(scope="session")
+def workplace(
+    repository: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    require_system_tool: Callable[[str], Path],
+) -> Iterator[Workplace]:
+    """`make run` in a fresh copy of the repository.
+
+    All is as in a checkout but for `.venv`, see `install`; compiled loops are copied too.
+    """
+    for tool in ("make", "curl", "bash"):
+        require_system_tool(tool)
+    folder = tmp_path_factory.mktemp("checkout") / "scene"
+    shutil.copytree(repository, folder, ignore=_LEFT_OUT, symlinks=True)
+    install(folder)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    place = Workplace(folder, f"127.0.0.1:{port}")
+    log = folder.parent / "log"
+    with log.open("w") as stream:
+        process = subprocess.Popen(
+            ["make", "run", f"PORT={port}"],
+            cwd=folder,
+            env=place.environment,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    try:
+        _wait_until_ready(process, place, log)
+        yield place
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait(timeout=60)
+
+
+def install(folder: Path) -> None:
+    """Give the copy this interpreter's environment for its `.venv`, and programs of its own.
+
+    With the stamps of an installation: installing anew would take minutes and the internet
+    (tests/system installs for the image).
+    """
+    environment = folder / ".venv"
+    programs = environment / "bin"
+    programs.mkdir(parents=True)
+    for entry in Path(sys.prefix).iterdir():
+        if entry.name != "bin" and not entry.name.startswith(".installed"):
+            (environment / entry.name).symlink_to(entry)
+    scripts = tomllib.loads((folder / "pyproject.toml").read_text())["project"]["scripts"]
+    for entry in (Path(sys.prefix) / "bin").iterdir():
+        if entry.name not in scripts:
+            (programs / entry.name).symlink_to(entry)
+    for name, place in scripts.items():
+        module, _, function = place.partition(":")
+        script = f"#!/usr/bin/env python\nfrom {module} import {function}\n\n{function}()\n"
+        (programs / name).write_text(script)
+        (programs / name).chmod(0o755)
+    for stamp in ("service", "everything"):
+        (environment / f".installed-{stamp}").touch()
+
+
+def _without_settings() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if not name.startswith("SCENE_")}
+
+
+def _wait_until_ready(process: subprocess.Popen[bytes], place: Workplace, log: Path) -> None:
+    # Loops that are compiled anew take a minute or two.
+    deadline = time.monotonic() + 400
+    while time.monotonic() < deadline:
+        try:
+            if httpx.get(f"http://{place.address}/health/ready").status_code == 200:
+                return
+        except httpx.TransportError:
+            if process.poll() is not None:
+                break
+        time.sleep(0.05)
+    raise AssertionError(f"`make run` did not start the service:\n{log.read_text()}")

@@ -1,0 +1,217 @@
+"""Every code block of the documentation does what it says, in the order of its page.
+
+`sh` blocks run through bash in a copy of the repository beside a live service, which stands where
+the pages say 127.0.0.1:8000 or nothing; `python` blocks run one after the other in one namespace,
+held to the house's lint; `json`, `yaml` and `toml` are read. See `tests.docs.blocks` for how a page
+says what is output and what is only shown. After a change of the shipped models,
+
+    pytest tests/docs/test_blocks.py --update-examples
+
+writes outputs anew that have changed, but for those with elisions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+from pytest_examples import CodeExample, EvalExample
+
+from tests.conftest import REPOSITORY
+from tests.docs.blocks import (
+    EXECUTED,
+    Block,
+    agrees,
+    blocks,
+    check_output,
+    filled,
+    rewrite,
+    text_agrees,
+)
+from tests.docs.conftest import Workplace
+
+PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+BLOCKS = {page.relative_to(REPOSITORY).as_posix(): list(blocks(page)) for page in PAGES}
+EVERY = [block for found in BLOCKS.values() for block in found]
+RUN_BY = {"docs/training.md": "tests/training/test_own_scenes.py"}
+"""Pages whose code takes minutes, or a place of its own, and the tests that run it there."""
+WITH_CODE = [
+    name
+    for name, found in BLOCKS.items()
+    if name not in RUN_BY and any(b.language in EXECUTED for b in found)
+]
+READERS = {"json": json.loads, "toml": tomllib.loads, "yaml": yaml.safe_load}
+SHOWN = {"text", "cpp", "cmake", "xml", "html", "javascript", "http"}
+ADDRESS = re.compile(r"\b(127\.0\.0\.1|localhost):8000\b")
+SECONDS = 120
+DEADLINE = re.compile(r"\btimeout=0?\.\d+")
+
+
+@pytest.mark.parametrize("block", EVERY, ids=str)
+def test_every_block_says_what_it_is(block: Block) -> None:
+    assert block.language in EXECUTED | READERS.keys() | SHOWN, f"{block}: {block.language!r}"
+    if block.mark == "not run":
+        assert len(block.reason) > 10, f"{block} is not run: say why"
+    if block.mark == "keeps running":
+        assert block.source.strip() == "make run", f"{block}: only `make run` is kept running"
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        b
+        for found in EVERY
+        for b in (found, found.output)
+        if b is not None and b.language in READERS
+    ],
+    ids=str,
+)
+def test_data_can_be_read(block: Block) -> None:
+    READERS[block.language](block.source)
+
+
+@pytest.mark.parametrize("page", sorted(RUN_BY.keys() & BLOCKS.keys()))
+def test_pages_that_are_run_elsewhere_are(page: str) -> None:
+    assert page in (REPOSITORY / RUN_BY[page]).read_text(encoding="utf-8")
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("page", WITH_CODE)
+def test_a_page_does_what_it_says(
+    workplace: Workplace, page: str, eval_example: EvalExample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])  # a page may add to it
+    # The house's rules, but that pages print, and bind names in one block for the next.
+    eval_example.set_config(
+        target_version="py310",
+        ruff_line_length=100,
+        ruff_ignore=["D", "F401", "F821", "S", "T20"],
+    )
+    names: dict[str, object] = {}
+    outputs: list[tuple[Block, str]] = []
+    for block in BLOCKS[page]:
+        if block.mark or block.language not in EXECUTED:
+            continue
+        if block.language == "python":
+            printed = run_python(block, workplace, eval_example, names)
+        else:
+            printed = run_shell(block, workplace)
+        try:
+            check_output(block, printed)
+        except AssertionError:
+            if not eval_example.update_examples or (text := filled(block, printed)) is None:
+                raise
+            outputs.append((block, text))
+    if outputs:
+        rewrite(REPOSITORY / page, outputs)
+
+
+def run_shell(block: Block, workplace: Workplace) -> str:
+    """What bash prints; a command that fails fails the test."""
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", ADDRESS.sub(workplace.address, block.source)],
+        cwd=workplace.folder,
+        env=workplace.environment | {"SCENE_URL": f"http://{workplace.address}"},
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+    )
+    assert done.returncode == 0, f"{block} ends with {done.returncode}\n{done.stdout}{done.stderr}"
+    return done.stdout.replace(workplace.address, "127.0.0.1:8000")
+
+
+def run_python(
+    block: Block, workplace: Workplace, eval_example: EvalExample, names: dict[str, object]
+) -> str:
+    """What it prints; names that it binds are there for the page's next block."""
+    # Deadlines are a robot's; the machine is shared with other tests.
+    source = DEADLINE.sub("timeout=30", ADDRESS.sub(workplace.address, block.source))
+    example = CodeExample.create(source, path=block.page, start_line=block.line - 1, prefix="py")
+    eval_example.lint_ruff(example)
+    if "#>" in source:
+        names |= eval_example.run_print_check(example, module_globals=names)
+        return ""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.chdir(workplace.folder):
+        names |= eval_example.run(example, module_globals=names)
+    return printed.getvalue().replace(workplace.address, "127.0.0.1:8000")
+
+
+# ------------------------------------------------------------------------- the tests of the tests
+
+
+def page_of(tmp_path: Path, text: str) -> list[Block]:
+    page = tmp_path / "page.md"
+    page.write_text(text, encoding="utf-8")
+    return list(blocks(page))
+
+
+def test_a_block_right_below_an_executed_one_is_its_output(tmp_path: Path) -> None:
+    text = "```sh\necho 1\n```\n\n```text\n1\n```\n\nProse.\n\n```json\n{}\n```\n"
+    first, second = page_of(tmp_path, text)
+    assert first.output is not None
+    assert (first.line, first.output.source) == (2, "1\n")
+    assert (second.language, second.output) == ("json", None)
+
+
+def test_a_comment_marks_the_next_block_alone(tmp_path: Path) -> None:
+    text = "<!-- not run: takes a minute -->\n```sh\na\n```\n\n```sh\nb\n```\n"
+    first, second = page_of(tmp_path, text)
+    assert (first.mark, first.reason, second.mark) == ("not run", "takes a minute", "")
+
+
+@pytest.mark.parametrize(
+    ("expected", "actual", "same"),
+    [
+        ({"p": 0.5}, {"p": 0.50001, "request_id": "x"}, True),
+        ({"p": 0.5}, {"p": 0.51}, False),
+        ({"p": 0.5}, {"p": 0.5, "q": 1}, False),
+        ({"p": 0.5, "...": "..."}, {"p": 0.5, "q": 1}, True),
+        ({"q": 0.5, "...": "..."}, {"p": 0.5}, False),
+        ([1, "..."], [1, 2, 3], True),
+        ([1, 2], [1, 2, 3], False),
+        ({"a": "..."}, {"a": [1]}, True),
+        ({"a": 1}, {"a": True, "b": 2}, False),
+    ],
+)
+def test_answers_agree_but_for_elisions(expected: object, actual: object, same: bool) -> None:
+    assert agrees(expected, actual) == same
+
+
+def test_texts_agree_but_for_elisions() -> None:
+    assert text_agrees("ready in ... s\n", "ready in 3.4 s  \n")
+    assert text_agrees("first\n...\nlast", "first\na\nb\nlast\n")
+    assert not text_agrees("ready", "not ready")
+
+
+def test_another_answer_is_noticed(tmp_path: Path) -> None:
+    (block,) = page_of(tmp_path, '```sh\necho\n```\n```json\n{"p": 1.0}\n```\n')
+    check_output(block, '{"p": 1.0, "request_id": "a"}')
+    with pytest.raises(AssertionError, match=r"page\.md:2 answers"):
+        check_output(block, '{"p": 2.0}')
+
+
+def test_outputs_are_written_anew_and_elisions_stay(tmp_path: Path) -> None:
+    text = (
+        "Top\n```sh\na\n```\n```json\n{}\n```\n\n```sh\nb\n```\n\n```text\nold\nlines\n```\n"
+        "```sh\nc\n```\n```text\nat ...\n```\nEnd\n"
+    )
+    first, second, third = page_of(tmp_path, text)
+    answer = '{"request_id": "x", "found": [{"p": 1}, {"p": 2}], "n": 3}'
+    json_text, lines = filled(first, answer), filled(second, "new\n\n")
+    assert json_text is not None
+    assert lines is not None
+    assert filled(third, "at noon") is None
+    page = tmp_path / "page.md"
+    rewrite(page, [(first, json_text), (second, lines)])
+    expected = text.replace("{}\n", '{"found": [\n  {"p": 1},\n  {"p": 2}],\n "n": 3}\n')
+    assert page.read_text() == expected.replace("old\nlines\n", "new\n")
+    assert [str(block) for block in blocks(page)] == ["page.md:3", "page.md:13", "page.md:20"]

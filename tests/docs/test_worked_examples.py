@@ -1,0 +1,79 @@
+"""The examples of /docs do on the shipped models what they say, for whoever presses the button."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from app.api.example_requests import REQUESTS
+from tests.docs.blocks import blocks
+from tests.docs.conftest import Workplace
+
+pytestmark = pytest.mark.system
+
+
+@pytest.mark.parametrize("operation", sorted(REQUESTS.keys() - {"move_alias"}))
+def test_examples_are_answered_by_the_shipped_models(workplace: Workplace, operation: str) -> None:
+    address = f"http://{workplace.address}/{operation.replace('_', '/')}"
+    for name, case in REQUESTS[operation].items():
+        response = httpx.post(address, json=case.value, timeout=60)
+        if case.problem is None:
+            assert response.status_code == 200, (name, response.text)
+        else:
+            assert response.json()["type"] == case.problem.uri, (name, response.text)
+
+
+def test_every_route_that_only_reads_answers(workplace: Workplace) -> None:
+    """With the parameters that /docs fills in."""
+    document = httpx.get(f"http://{workplace.address}/openapi.json").json()
+    asked = 0
+    for path, operations in document["paths"].items():
+        if "get" not in operations or "{version}" in path:
+            continue
+        response = httpx.get(f"http://{workplace.address}{path.replace('{name}', 'default')}")
+        assert response.status_code == 200, path
+        asked += 1
+    assert asked > 10
+
+
+def test_the_picture_shows_what_the_default_model_answers(
+    workplace: Workplace, repository: Path
+) -> None:
+    picture = (repository / "docs" / "scene.svg").read_text(encoding="utf-8")
+    body = {"objects": ["desk", "monitor", "chair", "toilet"]}
+
+    def ask(question: str) -> Any:
+        return httpx.post(f"http://{workplace.address}/{question}", json=body).json()[question]
+
+    relation, missing, outlier = ask("relations")[0], ask("missing")[0], ask("outliers")[0]
+    assert [relation[end] for end in ("subject", "relation", "object")] == [
+        *("monitor", "on-top", "desk")
+    ]
+    assert "the monitor stands on the desk" in picture
+    place = missing["placements"][0]
+    assert f"a {missing['label']}, {place['relation']} the {place['object']}" in picture
+    assert outlier["because"][0]["log_odds_change"] < 0
+    assert f"the {outlier['object']}, because of the {outlier['because'][0]['object']}" in picture
+
+
+def test_the_log_line_of_the_operations_page_has_the_fields_of_a_real_one(
+    workplace: Workplace, repository: Path
+) -> None:
+    page = repository / "docs" / "operations.md"
+    (shown,) = [json.loads(block.source) for block in blocks(page) if block.language == "json"]
+    request_id = "e7a3b2f0-documentation"
+    httpx.post(
+        f"http://{workplace.address}/missing",
+        json={"objects": ["bed"]},
+        headers={"X-Request-Id": request_id},
+    )
+    lines = (workplace.folder.parent / "log").read_text(encoding="utf-8").splitlines()
+    (line,) = [json.loads(line) for line in lines if request_id in line]
+    assert line.keys() == shown.keys()
+    assert {name: type(value) for name, value in line.items()} == {
+        name: type(value) for name, value in shown.items()
+    }
