@@ -8,16 +8,16 @@ from typing import Any, Final, TypeVar
 
 from fastapi import APIRouter
 from pydantic import ValidationError
+from starlette.responses import Response
 
 from app.api import catalogue
+from app.api.answers import respond
 from app.api.body import JSONRoute
 from app.api.dependencies import SessionDep
 from app.api.openapi import queued
 from app.api.problems import from_exception, report_defect, unfit
 from app.schemas import (
-    Answer,
     BatchAnswer,
-    BatchEntry,
     BatchRequest,
     MissingAnswer,
     MissingRequest,
@@ -28,12 +28,12 @@ from app.schemas import (
     SceneRequest,
 )
 from app.serving import questions
+from app.serving.answers import Answer
 from app.serving.models import DEFAULT
 from app.serving.record import SUCCESS
 from app.serving.session import Session
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
-AnswerT = TypeVar("AnswerT", bound=Answer)
 
 _PROBLEMS: Final = queued(
     catalogue.NOT_JSON,
@@ -51,18 +51,18 @@ async def _answer_each(
     session: Session,
     batch: BatchRequest[RequestT],
     kind: type[RequestT],
-    question: Callable[[Session, RequestT], Awaitable[AnswerT]],
-) -> BatchAnswer[AnswerT]:
+    question: Callable[[Session, RequestT], Awaitable[Answer]],
+) -> Response:
     def count(outcome: str) -> None:
         session.metrics.entry_answered(question.__name__, outcome)
 
-    results: list[BatchEntry[AnswerT]] = []
+    results: list[Answer] = []
     with session.for_batch([_reference(scene) for scene in batch.scenes]) as held:
         for place, scene in enumerate(batch.scenes):
             try:
                 held.ticket.check()
                 result = await question(held, _validated(scene, place, kind))
-                results.append(BatchEntry[AnswerT](status=200, result=result))
+                results.append({"status": 200, "result": result})
                 count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
                 failure = from_exception(error, at=("scenes", place))
@@ -70,10 +70,10 @@ async def _answer_each(
                 if problem.status == 500:
                     report_defect(error, session.request_id)
                 count(failure.kind.slug)
-                results.append(BatchEntry[AnswerT](status=problem.status, problem=problem))
+                results.append({"status": problem.status, "problem": problem})
             # Others are served between two scenes, health checks first of all.
             await asyncio.sleep(0)
-    return BatchAnswer[AnswerT](request_id=session.request_id, results=results)
+    return respond({"request_id": session.request_id, "results": results})
 
 
 def _reference(scene: Any) -> str:
@@ -93,11 +93,9 @@ def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
 @router.post(
     "/relations/batch",
     summary="Relations of many scenes",
-    response_model_exclude_none=True,
+    response_model=BatchAnswer[RelationsAnswer],
 )
-async def relations_batch(
-    request: BatchRequest[RelationsRequest], session: SessionDep
-) -> BatchAnswer[RelationsAnswer]:
+async def relations_batch(request: BatchRequest[RelationsRequest], session: SessionDep) -> Response:
     """As `POST /relations`, for up to 256 scenes."""
     return await _answer_each(session, request, RelationsRequest, questions.relations)
 
@@ -105,11 +103,9 @@ async def relations_batch(
 @router.post(
     "/missing/batch",
     summary="Missing objects of many scenes",
-    response_model_exclude_none=True,
+    response_model=BatchAnswer[MissingAnswer],
 )
-async def missing_batch(
-    request: BatchRequest[MissingRequest], session: SessionDep
-) -> BatchAnswer[MissingAnswer]:
+async def missing_batch(request: BatchRequest[MissingRequest], session: SessionDep) -> Response:
     """As `POST /missing`, for up to 256 scenes."""
     return await _answer_each(session, request, MissingRequest, questions.missing)
 
@@ -117,10 +113,8 @@ async def missing_batch(
 @router.post(
     "/outliers/batch",
     summary="Outliers of many scenes",
-    response_model_exclude_none=True,
+    response_model=BatchAnswer[OutliersAnswer],
 )
-async def outliers_batch(
-    request: BatchRequest[OutliersRequest], session: SessionDep
-) -> BatchAnswer[OutliersAnswer]:
+async def outliers_batch(request: BatchRequest[OutliersRequest], session: SessionDep) -> Response:
     """As `POST /outliers`, for up to 256 scenes."""
     return await _answer_each(session, request, OutliersRequest, questions.outliers)

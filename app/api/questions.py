@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 from fastapi import APIRouter
+from starlette.responses import Response
 
 from app.api import catalogue
+from app.api.answers import respond
 from app.api.body import JSONRoute
 from app.api.dependencies import SessionDep
 from app.api.openapi import queued
@@ -41,45 +43,45 @@ router = APIRouter(tags=["questions"], route_class=JSONRoute, responses=PROBLEMS
 @router.post(
     "/relations",
     summary="How do these objects stand to each other?",
-    response_model_exclude_none=True,
+    response_model=RelationsAnswer,
 )
-async def relations(request: RelationsRequest, session: SessionDep) -> RelationsAnswer:
+async def relations(request: RelationsRequest, session: SessionDep) -> Response:
     """The likeliest relations between the objects of a scene, best first."""
-    return await questions.relations(session, request)
+    return respond(await questions.relations(session, request))
 
 
 @router.post(
     "/missing",
     summary="What else should be here, and where?",
-    response_model_exclude_none=True,
+    response_model=MissingAnswer,
 )
-async def missing(request: MissingRequest, session: SessionDep) -> MissingAnswer:
+async def missing(request: MissingRequest, session: SessionDep) -> Response:
     """The likeliest absent objects, and where each would stand.
 
     A class that is present is never proposed again: how many chairs a table wants is outside the
     models.
     """
-    return await questions.missing(session, request)
+    return respond(await questions.missing(session, request))
 
 
 @router.post(
     "/outliers",
     summary="What does not belong here, or stands in the wrong place?",
-    response_model_exclude_none=True,
+    response_model=OutliersAnswer,
 )
-async def outliers(request: OutliersRequest, session: SessionDep) -> OutliersAnswer:
+async def outliers(request: OutliersRequest, session: SessionDep) -> Response:
     """Every object, least fitting first, and every given relation, least likely first.
 
     Instances of one class are scored alike; only `misplaced` tells them apart.
     """
-    return await questions.outliers(session, request)
+    return respond(await questions.outliers(session, request))
 
 
 @router.post(
     "/generate",
     summary="What would a scene like this look like?",
-    response_model_exclude_none=True,
+    response_model=GenerateAnswer,
 )
-async def generate(request: GenerateRequest, session: SessionDep) -> GenerateAnswer:
+async def generate(request: GenerateRequest, session: SessionDep) -> Response:
     """Scenes drawn from the model that contain the evidence; the same seed draws the same ones."""
-    return await questions.generate(session, request)
+    return respond(await questions.generate(session, request))

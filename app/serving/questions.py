@@ -1,35 +1,22 @@
-"""The four questions: a request in, a scene to the model, an answer in names out."""
+"""The four questions: a request in, a scene to the model, an answer as JSON has it out."""
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Sequence
-from typing import cast
+from collections.abc import Callable
 
 from app import reasoning
 from app.scene.frames import viewer_axes
 from app.scene.relations import opposite
 from app.schemas import (
-    Because,
-    Disagreement,
-    GenerateAnswer,
-    GeneratedScene,
     GenerateRequest,
-    MissingAnswer,
-    MissingObject,
     MissingRequest,
-    Offset,
-    Outlier,
-    OutliersAnswer,
     OutliersRequest,
-    Placement,
-    Relation,
-    RelationName,
-    RelationsAnswer,
     RelationsRequest,
-    ScoredRelation,
-    Vector,
+    SceneRequest,
 )
+from app.serving import answers
+from app.serving.answers import Answer
 from app.serving.errors import Location, Reason
 from app.serving.models import ServedModel
 from app.serving.reading import Faults, Reading, unknown_label
@@ -39,7 +26,7 @@ DRAWN_SEED_BITS = 53
 """Every JSON reader can hand such a seed back: a double holds it exactly."""
 
 
-async def relations(session: Session, request: RelationsRequest) -> RelationsAnswer:
+async def relations(session: Session, request: RelationsRequest) -> Answer:
     """How do these objects stand to each other?
 
     Raises:
@@ -57,24 +44,12 @@ async def relations(session: Session, request: RelationsRequest) -> RelationsAns
         pairs=pairs,
         include_opposites=request.include_opposites,
     )
-    return RelationsAnswer(
-        **session.envelope(request, model, reading),
-        relations=_scored(found, reading),
-        disagreements=[
-            Disagreement(
-                subject=reading.id(entry.subject),
-                object=reading.id(entry.object),
-                observed=[_name(relation) for relation in entry.observed],
-                expected=_name(entry.expected),
-                probability=entry.probability,
-                observed_probability=entry.observed_probability,
-            )
-            for entry in disagreements
-        ],
+    return answers.relations(
+        _envelope(session, request, model, reading), found, disagreements, reading
     )
 
 
-async def missing(session: Session, request: MissingRequest) -> MissingAnswer:
+async def missing(session: Session, request: MissingRequest) -> Answer:
     """What else should be here, and where?
 
     Raises:
@@ -100,32 +75,12 @@ async def missing(session: Session, request: MissingRequest) -> MissingAnswer:
         at=at,
         axes=viewer_axes(request.frame_id, None if viewpoint is None else viewpoint.yaw),
     )
-    envelope = session.envelope(request, model, reading)
+    envelope = _envelope(session, request, model, reading)
     envelope["ignored"] += dropped
-    return MissingAnswer(
-        **envelope,
-        missing=[
-            MissingObject(
-                label=entry.label,
-                probability=entry.probability,
-                log_odds=entry.log_odds,
-                placements=[
-                    Placement(
-                        relation=_name(place.relation),
-                        object=reading.id(place.object),
-                        probability=place.probability,
-                        offset=_offset(place.offset),
-                    )
-                    for place in entry.placements
-                ],
-                because=_because(entry.because, reading),
-            )
-            for entry in found
-        ],
-    )
+    return answers.missing(envelope, found, reading)
 
 
-async def outliers(session: Session, request: OutliersRequest) -> OutliersAnswer:
+async def outliers(session: Session, request: OutliersRequest) -> Answer:
     """What does not belong here, or stands in the wrong place?
 
     Raises:
@@ -136,24 +91,10 @@ async def outliers(session: Session, request: OutliersRequest) -> OutliersAnswer
     found, misplaced = await session.ask(
         model, reasoning.outliers, reading.scene, threshold=request.threshold
     )
-    return OutliersAnswer(
-        **session.envelope(request, model, reading),
-        outliers=[
-            Outlier(
-                object=reading.id(entry.object),
-                label=entry.label,
-                probability=entry.probability,
-                log_odds=entry.log_odds,
-                is_outlier=entry.is_outlier,
-                because=_because(entry.because, reading),
-            )
-            for entry in found
-        ],
-        misplaced=_scored(misplaced, reading),
-    )
+    return answers.outliers(_envelope(session, request, model, reading), found, misplaced, reading)
 
 
-async def generate(session: Session, request: GenerateRequest) -> GenerateAnswer:
+async def generate(session: Session, request: GenerateRequest) -> Answer:
     """What would a scene like this look like?
 
     Raises:
@@ -177,48 +118,13 @@ async def generate(session: Session, request: GenerateRequest) -> GenerateAnswer
         )
 
     drawn = await session.draw(request.count, model, "generate", draw)
-    return GenerateAnswer(
-        **session.envelope(request, model, reading),
-        seed=seed,
-        scenes=[
-            GeneratedScene(
-                objects=list(scene.objects),
-                relations=[
-                    Relation(subject=subject, relation=_name(relation), object=other)
-                    for subject, relation, other in scene.relations
-                ],
-                log_score=scene.log_score,
-                context={layer: list(units) for layer, units in scene.context.items()},
-            )
-            for scene in drawn
-        ],
-    )
+    return answers.generate(_envelope(session, request, model, reading), seed, drawn)
 
 
-def _because(causes: Sequence[reasoning.Because], reading: Reading) -> list[Because]:
-    return [Because(reading.id(cause.object), cause.log_odds_change) for cause in causes]
-
-
-def _name(relation: str) -> RelationName:
-    return cast("RelationName", relation)
-
-
-def _offset(offset: reasoning.Offset | None) -> Offset | None:
-    return offset and Offset(Vector(*offset.mean), Vector(*offset.std), offset.scenes)
-
-
-def _scored(
-    found: Sequence[reasoning.RelationAnswer | reasoning.MisplacedAnswer], reading: Reading
-) -> list[ScoredRelation]:
-    return [
-        ScoredRelation(
-            subject=reading.id(entry.subject),
-            relation=_name(entry.relation),
-            object=reading.id(entry.object),
-            probability=entry.probability,
-        )
-        for entry in found
-    ]
+def _envelope(
+    session: Session, request: SceneRequest, model: ServedModel, reading: Reading
+) -> Answer:
+    return answers.envelope(request, session.request_id, model.reference, reading)
 
 
 def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]] | None:

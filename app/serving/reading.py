@@ -76,9 +76,10 @@ class Reading:
     observed: list[ObservedRelation] | None
     names: Names
 
-    def id(self, position: int) -> str:
-        """The id of an object of the scene."""
-        return self.scene.objects[position].id
+    @property
+    def ids(self) -> list[str]:
+        """The ids of the scene's objects."""
+        return [thing.id for thing in self.scene.objects]
 
 
 class Names:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Concatenate, ParamSpec, TypeVar
 
 from app.registry import Artifact
 from app.scene.scene import Scene
@@ -35,6 +35,7 @@ class Session:
         record: what is known about the request.
         holding: whether rows of the models' queues are held for it already.
         known: what `read` found, where several questions are asked about one scene.
+        gives_way: its questions let those of others go first.
     """
 
     models: ServedModels
@@ -45,6 +46,7 @@ class Session:
     record: RequestRecord
     holding: bool = False
     known: tuple[ServedModel, Reading] | None = None
+    gives_way: bool = False
 
     def read(
         self, request: SceneRequest, *, may_be_empty: bool = False
@@ -93,8 +95,7 @@ class Session:
                 self.ticket,
                 kind=name,
                 size=size,
-                # Of a stream, which has read its scene already.
-                gives_way=self.known is not None,
+                gives_way=self.gives_way,
             )
         return self._noted(model, name, 1, done)
 
@@ -149,16 +150,3 @@ class Session:
                     continue
                 held.enter_context(self._room(model, rows))
             yield replace(self, holding=True)
-
-    def envelope(
-        self, request: SceneRequest, model: ServedModel, reading: Reading
-    ) -> dict[str, Any]:
-        """The fields that every answer carries."""
-        return {
-            "model": model.reference,
-            "request_id": self.request_id,
-            "frame_id": request.frame_id,
-            "stamp": request.stamp,
-            "ignored": list(reading.ignored),
-            "observed_relations": reading.observed,
-        }

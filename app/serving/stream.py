@@ -248,7 +248,7 @@ async def _answer(state: SceneState, view: Session) -> _Found:
             for seen in reading.observed
         ]
     # All questions are about one reading, and have one time.
-    asked = replace(view, known=(model, reading))
+    asked = replace(view, known=(model, reading), gives_way=True)
     for name in ("missing", "outliers", "relations"):
         options = getattr(state.ask, name)
         if options is None:
@@ -259,7 +259,6 @@ async def _answer(state: SceneState, view: Session) -> _Found:
         fields: dict[str, Any] = {"objects": request.objects, **state.fields}
         # No more than was given: what is left out may mean something else than its default.
         fields |= {option: getattr(options, option) for option in options.model_fields_set}
-        answer: Answer
         try:
             if name == "missing":
                 answer = await questions.missing(asked, MissingRequest(**fields))
@@ -270,8 +269,7 @@ async def _answer(state: SceneState, view: Session) -> _Found:
         except RequestError as error:
             found.failures[name] = error
         else:
-            own = _own(type(answer))
-            found.lists.update(answer.model_dump(mode="json", exclude_none=True, include=own))
+            found.lists.update({own: answer[own] for own in _own(_ANSWERS[name])})
     return found
 
 

@@ -23,6 +23,7 @@ from app.schemas import (
     RelationsRequest,
 )
 from app.serving import questions
+from app.serving.answers import written
 from app.serving.errors import RequestError, UnknownModelError
 from app.serving.metrics import Unmeasured
 from app.serving.queue import Ticket
@@ -70,8 +71,8 @@ class Service:
             (RelationsRequest, questions.relations, ASK["relations"]),
         ):
             request = kind.model_validate({"objects": objects, **fields, **own})
-            answer: Answer = self.runner.run(question(self.view(), request))  # type: ignore[operator]
-            lists |= json.loads(answer.model_dump_json(exclude_none=True))
+            answer = self.runner.run(question(self.view(), request))  # type: ignore[operator]
+            lists |= json.loads(written(answer))
         envelope = set(Answer.model_fields) - {"observed_relations"}
         return {name: entries for name, entries in lists.items() if name not in envelope}
 
