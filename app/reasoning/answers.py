@@ -5,8 +5,17 @@ What there are dozens of in an answer is a named tuple, which takes a third of t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
+
+TupleT = TypeVar("TupleT", bound=tuple[Any, ...])
+
+
+def entries(kind: type[TupleT], *columns: Iterable[Any]) -> list[TupleT]:
+    """Named tuples from their fields, column by column: in half the time that calls would take."""
+    return list(map(partial(tuple.__new__, kind), zip(*columns, strict=True)))
 
 
 class RelationAnswer(NamedTuple):

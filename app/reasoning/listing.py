@@ -37,7 +37,9 @@ def likeliest_classes(scores, chosen, count):
 
 @compiled
 def likeliest_places(slopes, forward, backward, log_counts, classes, count, first):
-    """The best places of each candidate, (N, k): numbers of them, and their probabilities.
+    """The best k places of each candidate, one candidate after the other.
+
+    Place (d A + a) m + j is relation a to anchor j, or back if d = 1.
 
     Args:
         slopes: (A, 4), see `RelationSlopes`.
@@ -47,7 +49,8 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
         first: the place that is listed before all others, however likely; -1 for none.
 
     Returns:
-        Place (d A + a) m + j is relation a, back if d = 1, of anchor j.
+        (N k,) the number of the candidate, the relation, whether it leads from the candidate to the
+        anchor, the number of the anchor, and the probability.
     """
     N, A, m = forward.shape
     counts, size = log_counts.reshape(1, m), A * m
@@ -57,17 +60,19 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
     kept, begin = min(count, 2 * size), 0
     if first >= 0:
         usable[first], begin = False, 1
-    places, probabilities = np.empty((N, kept), np.int64), np.empty((N, kept), np.float64)
+    candidate, relation = np.empty(N * kept, np.int64), np.empty(N * kept, np.int64)
+    outgoing, anchor = np.empty(N * kept, np.bool_), np.empty(N * kept, np.int64)
+    probabilities = np.empty(N * kept, np.float64)
     for c in range(N):
         one, other = to[c].reshape(-1), back[c].reshape(-1)
         for e in range(size):
             p[e], p[size + e] = exclusive(one[e], other[e])
-        if first >= 0:
-            places[c, 0], probabilities[c, 0] = first, p[first]
         where = best(p, usable, kept - begin)
-        for k in range(begin, kept):
-            places[c, k], probabilities[c, k] = where[k - begin], p[where[k - begin]]
-    return places, probabilities
+        for k in range(kept):
+            place, at = first if k < begin else where[k - begin], c * kept + k
+            candidate[at], relation[at], anchor[at] = c, place // m % A, place % m
+            outgoing[at], probabilities[at] = place < size, p[place]
+    return candidate, relation, outgoing, anchor, probabilities
 
 
 @compiled

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.reasoning.answers import Offset
+from app.reasoning.answers import Offset, entries
 from app.registry.offsets import NOTHING, Offsets, look_up
 from app.scene.frames import Axes
 from app.scene.relations import FRONT, LEFT
@@ -25,7 +26,7 @@ def offsets_of(
     anchor: NDArray[np.int64],
     outgoing: NDArray[np.bool_],
     axes: Axes | None,
-) -> list[Offset | None]:
+) -> Sequence[Offset | None]:
     """From n anchors to n missing things.
 
     Args:
@@ -40,12 +41,11 @@ def offsets_of(
         mean, spread, scenes = _lay(known.tables, *ends, _UNTURNED, False)
     else:
         mean, spread, scenes = _lay(known.tables, *ends, np.array(axes), True)
-    return [
-        None if count == NOTHING else Offset((x, y, z), (u, v, w), count)
-        for (x, y, z), (u, v, w), count in zip(
-            mean.tolist(), spread.tolist(), scenes.tolist(), strict=True
-        )
-    ]
+    counts = scenes.tolist()
+    found = entries(Offset, map(tuple, mean.tolist()), map(tuple, spread.tolist()), counts)
+    if NOTHING not in counts:
+        return found
+    return [offset if offset.scenes != NOTHING else None for offset in found]
 
 
 @compiled

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning.answers import Offset, Placement
+from app.reasoning.answers import Offset, Placement, entries
 from app.reasoning.listing import likeliest_places
 from app.reasoning.offsets import offsets_of
 from app.reasoning.posterior import Posterior
@@ -49,24 +51,21 @@ def placements(
         if len(found):
             asked = ((0 if outgoing else A) + relation) * len(first) + int(found[0])
             first[found[0]] = object_
-    places, probabilities = likeliest_places(
+    which, relation, outgoing, anchor, probabilities = likeliest_places(
         *(artifact.relation_slopes.placement, forward, backward, present.log_counts[anchors]),
         *(len(present.classes) + 1, PLACES, asked),
     )
-    names = RELATIONS[:A] + _SEEN_FROM_ANCHORS[:A]
-    flat = places.reshape(-1)
-    name, anchor = np.divmod(flat, len(first))
-    offsets: list[Offset | None] = [None] * len(flat)
+    offsets: Sequence[Offset | None] = [None] * len(which)
     if artifact.offsets is not None:
-        missing = np.repeat(candidates, places.shape[1])
-        classes = present.classes[anchors[anchor]]
-        offsets = offsets_of(artifact.offsets, name % A, missing, classes, name < A, axes)
-    listed = [
-        Placement(names[which], first[where], probability, offset)
-        for which, where, probability, offset in zip(
-            *(name.tolist(), anchor.tolist(), probabilities.reshape(-1).tolist(), offsets),
-            strict=True,
-        )
-    ]
-    each = places.shape[1]
+        ends = candidates[which], present.classes[anchors[anchor]]
+        offsets = offsets_of(artifact.offsets, relation, *ends, outgoing, axes)
+    named = zip(relation.tolist(), outgoing.tolist(), strict=True)
+    listed = entries(
+        Placement,
+        [(RELATIONS if out else _SEEN_FROM_ANCHORS)[number] for number, out in named],
+        [first[number] for number in anchor.tolist()],
+        probabilities.tolist(),
+        offsets,
+    )
+    each = len(listed) // len(candidates)
     return [tuple(listed[k : k + each]) for k in range(0, len(listed), each)]

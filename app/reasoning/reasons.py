@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning.answers import Because
+from app.reasoning.answers import Because, entries
 from app.reasoning.listing import strongest
 from app.reasoning.present import Present
 
@@ -32,5 +32,6 @@ def strongest_reasons(
         rows: (N,) places of what is explained among the n; left out where it is absent.
     """
     places, values = strongest(change, rows, REASONS)
-    objects = present.first[places].tolist()
-    return [tuple(map(Because, *both)) for both in zip(objects, values.tolist(), strict=True)]
+    objects = present.first[places.reshape(-1)].tolist()
+    found, kept = entries(Because, objects, values.reshape(-1).tolist()), places.shape[1]
+    return [tuple(found[k : k + kept]) for k in range(0, len(found), kept)]

@@ -16,9 +16,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, thread_time
@@ -39,9 +38,10 @@ _TICK: Final = 2e-3
 _NEWEST: Final = 0.2
 
 
-@dataclass(frozen=True, slots=True)
+# Whatever is made for every request is not frozen: that would take three times as long.
+@dataclass(slots=True)
 class Ticket:
-    """What a request may take.
+    """What a request may take, made once and never changed.
 
     Attributes:
         deadline: by `time.monotonic`; work that has not begun by then is dropped.
@@ -70,17 +70,20 @@ class Ticket:
             raise DisconnectedError("The client has gone.")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Done(Generic[T]):
     """A job that has been done.
 
     Attributes:
         waited, computed: seconds before it was begun, and that it took.
+        processor: seconds that it kept a processor busy. In the worker thread it also waits for the
+            interpreter, and anywhere for other processes.
     """
 
     result: T
     waited: float
     computed: float
+    processor: float
 
 
 def _one_thread(name: str) -> Executor:
@@ -157,9 +160,8 @@ class WorkQueue:
     _draining: bool = False
     _costs: _Costs = field(default_factory=_Costs)
 
-    @contextmanager
-    def holding(self, rows: int) -> Iterator[None]:
-        """Room for so many rows.
+    def take(self, rows: int) -> None:
+        """Take room for so many rows, until they are given back.
 
         Raises:
             QueueFullError: there is not enough.
@@ -167,10 +169,10 @@ class WorkQueue:
         if self.rows + rows > self.limit:
             raise QueueFullError(f"{self.rows} of {self.limit} rows of this model are taken.")
         self.rows += rows
-        try:
-            yield
-        finally:
-            self.rows -= rows
+
+    def give_back(self, rows: int) -> None:
+        """Give back room that was taken."""
+        self.rows -= rows
 
     async def run(
         self,
@@ -194,12 +196,13 @@ class WorkQueue:
             Exception: whatever the job raises.
         """
 
-        def learnt() -> T:
-            began = thread_time()
-            result = call()
-            # What the job itself took: in the worker thread it also waits for the interpreter.
-            self._costs.learn(kind, size, thread_time() - began)
-            return result
+        came = monotonic()
+
+        def learnt() -> Done[T]:
+            # Here, since nobody may be left to hear of a job that took too long.
+            done = _do(call, came)
+            self._costs.learn(kind, size, done.processor)
+            return done
 
         counted = 0 if gives_way else 1
         self.backlog += counted
@@ -207,7 +210,7 @@ class WorkQueue:
             if self._costs.expected(kind, size) > CHEAP:
                 return await _in_thread(lambda _: learnt(), ticket, self.threads.costly)
             line = self._giving_way if gives_way else self._waiting
-            return await self._in_tick(_measured(learnt), ticket, line)
+            return await self._in_tick(learnt, ticket, line)
         finally:
             self.backlog -= counted
 
@@ -221,7 +224,12 @@ class WorkQueue:
         Raises:
             DeadlinePassedError, DisconnectedError, Exception: see `run`.
         """
-        return await _in_thread(call, ticket, self.threads.drawing)
+        came = monotonic()
+
+        def drawn(given_up: Callable[[], bool]) -> Done[T]:
+            return _do(lambda: call(given_up), came)
+
+        return await _in_thread(drawn, ticket, self.threads.drawing)
 
     async def _in_tick(
         self, call: Callable[[], Done[T]], ticket: Ticket, line: deque[_Job]
@@ -250,19 +258,19 @@ class WorkQueue:
 
 
 async def _in_thread(
-    call: Callable[[Callable[[], bool]], T], ticket: Ticket, executor: Executor
+    call: Callable[[Callable[[], bool]], Done[T]], ticket: Ticket, executor: Executor
 ) -> Done[T]:
     ticket.check()
     await ticket.check_there()
     given_up = False
 
-    def unless_given_up() -> T:
+    def unless_given_up() -> Done[T]:
         # The thread's own queue holds what is given up until its turn, and no longer.
         if given_up:
             raise DeadlinePassedError("given up")
         return call(lambda: given_up)
 
-    future = asyncio.get_running_loop().run_in_executor(executor, _measured(unless_given_up))
+    future = asyncio.get_running_loop().run_in_executor(executor, unless_given_up)
     try:
         while True:
             left = ticket.deadline - monotonic()
@@ -277,16 +285,11 @@ async def _in_thread(
         future.cancel()
 
 
-def _measured(call: Callable[[], T]) -> Callable[[], Done[T]]:
-    """The work with what it waited and took."""
-    came = monotonic()
-
-    def measured() -> Done[T]:
-        began = monotonic()
-        result = call()
-        return Done(result, began - came, monotonic() - began)
-
-    return measured
+def _do(call: Callable[[], T], came: float) -> Done[T]:
+    """The work, which came at that time by `time.monotonic`."""
+    began, busy = monotonic(), thread_time()
+    result = call()
+    return Done(result, began - came, monotonic() - began, thread_time() - busy)
 
 
 def _settle(job: _Job) -> None:

@@ -60,9 +60,9 @@ class Faults:
                 raise RequestError(reason, self.found[reason])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Reading:
-    """A request as the models see it.
+    """A request as the models see it, made once and never changed.
 
     Attributes:
         scene: the known objects, what holds between them, and the room.

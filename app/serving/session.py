@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from app.registry import Artifact
@@ -22,9 +23,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Session:
     """What one request sees from beginning to end, whatever is promoted or refreshed meanwhile.
+
+    Made once for every request and never changed.
 
     Attributes:
         models: the snapshot of models.
@@ -89,14 +92,18 @@ class Session:
         # Pairs of objects are what the relation part is computed for, stated relations or not.
         size = (1 + len(scene.objects)) ** 2
         name = question.__name__
-        with self._room(model, 0 if self.holding else 1):
+        rows = 0 if self.holding else 1
+        self._take(model, rows)
+        try:
             done = await model.queue.run(
-                lambda: question(model.artifact, scene, *args, **kwargs),
+                partial(question, model.artifact, scene, *args, **kwargs),
                 self.ticket,
                 kind=name,
                 size=size,
                 gives_way=self.gives_way,
             )
+        finally:
+            self._give_back(model, rows)
         return self._noted(model, name, 1, done)
 
     async def draw(
@@ -111,8 +118,12 @@ class Session:
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
         """
-        with self._room(model, 0 if self.holding else rows):
+        taken = 0 if self.holding else rows
+        self._take(model, taken)
+        try:
             done = await model.queue.draw(draw, self.ticket)
+        finally:
+            self._give_back(model, taken)
         return self._noted(model, name, rows, done)
 
     def _noted(self, model: ServedModel, name: str, rows: int, done: Done[T]) -> T:
@@ -122,15 +133,13 @@ class Session:
         self.record.computed(done.computed)
         return done.result
 
-    @contextmanager
-    def _room(self, model: ServedModel, rows: int) -> Iterator[None]:
-        """Rows of a model's queue, counted as they come and go, however the work ends."""
-        try:
-            with model.queue.holding(rows):
-                self.metrics.pending(model.reference, model.queue.rows)
-                yield
-        finally:
-            self.metrics.pending(model.reference, model.queue.rows)
+    def _take(self, model: ServedModel, rows: int) -> None:
+        model.queue.take(rows)
+        self.metrics.pending(model.reference, model.queue.rows)
+
+    def _give_back(self, model: ServedModel, rows: int) -> None:
+        model.queue.give_back(rows)
+        self.metrics.pending(model.reference, model.queue.rows)
 
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Session]:
@@ -148,5 +157,6 @@ class Session:
                     model = self.models.resolve(reference)
                 except ServingError:
                     continue
-                held.enter_context(self._room(model, rows))
+                self._take(model, rows)
+                held.callback(self._give_back, model, rows)
             yield replace(self, holding=True)
