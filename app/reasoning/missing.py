@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning.answers import Because, MissingAnswer
+from app.reasoning.answers import Because, MissingAnswer, entries
 from app.reasoning.calibration import missing_scores, placed_scores
 from app.reasoning.listing import absent_things, likeliest_classes
 from app.reasoning.placements import placements
@@ -68,17 +68,14 @@ def missing(
     found = absent[where]
     labels = artifact.vocabulary.labels
     return tuple(
-        [
-            MissingAnswer(labels[index], probability, value, standing, because)
-            for index, probability, value, standing, because in zip(
-                found.tolist(),
-                probabilities.tolist(),
-                log_odds[where].tolist(),
-                placements(artifact, given, found, axes, place),
-                _reasons(given, found),
-                strict=True,
-            )
-        ]
+        entries(
+            MissingAnswer,
+            [labels[index] for index in found.tolist()],
+            probabilities.tolist(),
+            log_odds[where].tolist(),
+            placements(artifact, given, found, axes, place),
+            _reasons(given, found),
+        )
     )
 
 

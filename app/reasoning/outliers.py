@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.reasoning.answers import Because, MisplacedAnswer, OutlierAnswer
+from app.reasoning.answers import Because, MisplacedAnswer, OutlierAnswer, entries
 from app.reasoning.calibration import false_log_odds, intruder_line, sigmoid
 from app.reasoning.listing import least_fitting
 from app.reasoning.posterior import Posterior, posterior
@@ -45,25 +45,19 @@ def outliers(
     order, p = least_fitting(
         *intruder_line(calibration, len(log_odds)), log_odds, given.present.row
     )
-    places, probability = order.tolist(), p.tolist()
-    rows, values = given.present.row.tolist(), log_odds.tolist()
-    reasons = _reasons(given, list(dict.fromkeys([rows[k] for k in places[: _affordable(given)]])))
-    labels = artifact.vocabulary.labels
-    classes = given.present.classes.tolist()
-    found = tuple(
-        [
-            OutlierAnswer(
-                object=position,
-                label=labels[classes[row := rows[position]]],
-                probability=probability[row],
-                log_odds=values[row],
-                is_outlier=probability[row] >= threshold,
-                because=reasons.get(row, ()),
-            )
-            for position in places
-        ]
+    row = given.present.row[order]
+    rows, probability, labels = row.tolist(), p[row], artifact.vocabulary.labels
+    reasons = _reasons(given, list(dict.fromkeys(rows[: _affordable(given)])))
+    found = entries(
+        OutlierAnswer,
+        order.tolist(),
+        [labels[index] for index in given.present.classes[row].tolist()],
+        probability.tolist(),
+        log_odds[row].tolist(),
+        (probability >= threshold).tolist(),
+        [reasons.get(one, ()) for one in rows],
     )
-    return found, _misplaced(artifact, given, scene)
+    return tuple(found), _misplaced(artifact, given, scene)
 
 
 def misplaced(artifact: Artifact, scene: Scene) -> tuple[MisplacedAnswer, ...]:
@@ -96,10 +90,13 @@ def _misplaced(artifact: Artifact, given: Posterior, scene: Scene) -> tuple[Misp
     row = given.present.row
     relation, subject, object_ = np.array(stated).T.copy()
     log_odds = given.unit_log_odds(relation, row[subject], row[object_])
-    p = sigmoid(false_log_odds(artifact.calibration, log_odds)).tolist()
+    order = np.argsort(log_odds, kind="stable")
     return tuple(
-        [
-            MisplacedAnswer(stated[k][1], CANONICAL[stated[k][0]], stated[k][2], p[k])
-            for k in np.argsort(log_odds, kind="stable").tolist()
-        ]
+        entries(
+            MisplacedAnswer,
+            subject[order].tolist(),
+            [CANONICAL[number] for number in relation[order].tolist()],
+            object_[order].tolist(),
+            sigmoid(false_log_odds(artifact.calibration, log_odds[order])).tolist(),
+        )
     )

@@ -38,14 +38,14 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
     Raises:
         ValueError: an object outside the machine's classes, or a room type it does not have.
     """
-    for thing in scene.objects:
-        if thing.class_index is None or thing.class_index >= spec.V:
-            raise ValueError(
-                f"class_index of {thing.id!r} is {thing.class_index}, must be below V = {spec.V}"
-            )
+    V, classes = spec.V, [thing.class_index for thing in scene.objects]
+    for place, index in enumerate(classes):
+        if index is None or index >= V:
+            name = scene.objects[place].id
+            raise ValueError(f"class_index of {name!r} is {index}, must be below V = {V}")
     if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
         raise ValueError(f"room_type is {scene.room_type}, must be below C = {spec.C}")
-    indices = np.array([thing.class_index for thing in scene.objects], dtype=np.int64)
+    indices = np.array(classes, dtype=np.int64)
     confidence = np.array([thing.confidence for thing in scene.objects], dtype=np.float64)
     return Present(*_present(indices, confidence))
 

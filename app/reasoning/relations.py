@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning.answers import Disagreement, RelationAnswer
+from app.reasoning.answers import Disagreement, RelationAnswer, entries
 from app.reasoning.disagreements import disagreements
 from app.reasoning.listing import likeliest_relations, pairs_of_things
 from app.reasoning.posterior import posterior, relations_given
@@ -63,13 +63,9 @@ def relations(
     names = CANONICAL[: len(log_odds)]
     names += tuple([OPPOSITES[name] for name in names])
     subjects, objects, kinds, probabilities = (values.tolist() for values in found)
-    answers = tuple(
-        [
-            RelationAnswer(x, names[a], y, probability)
-            for x, y, a, probability in zip(subjects, objects, kinds, probabilities, strict=True)
-        ]
-    )
-    return answers, disagreements(
+    kinds = [names[kind] for kind in kinds]
+    answers = entries(RelationAnswer, subjects, kinds, objects, probabilities)
+    return tuple(answers), disagreements(
         artifact, scene, given, asked, top_k=top_k, min_probability=min_probability
     )
 

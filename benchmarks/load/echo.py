@@ -44,6 +44,9 @@ from app.settings import Settings
 # So many relations a posed object are derived in the rooms that are asked about.
 _DERIVED = 3
 
+# With as many digits as a model's.
+_PROBABILITY, _LOG_ODDS = 0.08022543832794828, -0.659896969795227
+
 _MODEL = ModelReference(name="echo", version="1.0.0", variant="triway", digest="0" * 64)
 
 router = APIRouter(route_class=JSONRoute)
@@ -76,7 +79,7 @@ def _envelope(request: SceneRequest, request_id: str) -> dict[str, Any]:
 
 
 def _because(names: list[str]) -> list[Because]:
-    return [Because(names[k % len(names)], -0.123456789) for k in range(3)]
+    return [Because(names[k % len(names)], _LOG_ODDS) for k in range(3)]
 
 
 @router.post("/relations", response_model_exclude_none=True)
@@ -89,7 +92,7 @@ async def relations(request: RelationsRequest, request_id: RequestId) -> Relatio
                 subject=names[k % len(names)],
                 relation="left",
                 object=names[-1 - k % len(names)],
-                probability=0.123456789,
+                probability=_PROBABILITY,
             )
             for k in range(request.top_k)
         ],
@@ -99,8 +102,8 @@ async def relations(request: RelationsRequest, request_id: RequestId) -> Relatio
                 object=relation.object,
                 observed=[relation.relation],
                 expected="front",
-                probability=0.123456789,
-                observed_probability=0.0123456789,
+                probability=_PROBABILITY,
+                observed_probability=_PROBABILITY,
             )
             for relation in (request.relations or _derived(request) or [])[: request.top_k : 3]
         ],
@@ -115,13 +118,13 @@ async def missing(request: MissingRequest, request_id: RequestId) -> MissingAnsw
         missing=[
             MissingObject(
                 label=names[k % len(names)],
-                probability=0.123456789,
-                log_odds=-1.23456789,
+                probability=_PROBABILITY,
+                log_odds=_LOG_ODDS,
                 placements=[
                     Placement(
                         relation="left",
                         object=names[p % len(names)],
-                        probability=0.123456789,
+                        probability=_PROBABILITY,
                         offset=Offset(Vector(0.123, -1.234, 0.5), Vector(0.4, 0.3, 0.2), 123),
                     )
                     for p in range(3)
@@ -142,8 +145,8 @@ async def outliers(request: OutliersRequest, request_id: RequestId) -> OutliersA
             Outlier(
                 object=name,
                 label=name,
-                probability=0.123456789,
-                log_odds=-1.23456789,
+                probability=_PROBABILITY,
+                log_odds=_LOG_ODDS,
                 is_outlier=False,
                 because=_because(names),
             )
@@ -154,7 +157,7 @@ async def outliers(request: OutliersRequest, request_id: RequestId) -> OutliersA
                 subject=relation.subject,
                 relation=relation.relation,
                 object=relation.object,
-                probability=0.123456789,
+                probability=_PROBABILITY,
             )
             for relation in request.relations or _derived(request) or ()
         ],
