@@ -52,6 +52,7 @@ _LEFT_OUT = 1e-3
 # (docs/decisions/compiled-loops.md).
 _GENTLE = 0.5
 _NOTHING = np.zeros((0, 0, 0), dtype=np.float32)
+_NO_UNITS = _NOTHING.reshape(0), _NOTHING.reshape(0, 0)
 _NONE = np.zeros((0, 0), dtype=np.bool_)
 
 
@@ -116,6 +117,7 @@ class Context:
         y: (H1,) given the relations as well.
         given: the relations; None where there are none.
         slopes: (E,).
+        z: (E, K + 1) the factors (S_i * O_j, 1) of the given units, filled up as the loops need it.
     """
 
     classes: Places
@@ -125,6 +127,7 @@ class Context:
     y: Floats
     given: Given | None
     slopes: Floats
+    z: Floats
 
 
 class WithoutEach(NamedTuple):
@@ -210,11 +213,11 @@ class ClosedForm:
         bias = self.c1 if room is None or not len(self.Q) else self.c1 + self.Q[room]
         x = object_kernels.hidden_logits(bias, self.W, classes, presence)
         if given is None or not len(given.a):
-            return Context(classes, presence, log_counts, x, x, None, _NOTHING.reshape(0))
-        y, slopes = given_kernels.fixed_point(
+            return Context(classes, presence, log_counts, x, x, None, *_NO_UNITS)
+        y, slopes, z = given_kernels.fixed_point(
             x, self._weights, classes, log_counts, *_lists(given), given.r, given.g, SWEEPS
         )
-        return Context(classes, presence, log_counts, x, y, given, slopes)
+        return Context(classes, presence, log_counts, x, y, given, slopes, z)
 
     def between(self, context: Context) -> Between:
         """What `relation_log_odds` and `log_odds_apart` need."""
@@ -329,7 +332,7 @@ class ClosedForm:
             share = context.presence[:, None] * self.W[classes]
         else:
             share = given_kernels.shares(
-                *(self._weights, self.W, classes, context.presence, context.log_counts),
+                *(self._weights.G, self.W, classes, context.presence, context.z),
                 *(*_lists(context.given), context.slopes),
             )
         return share
@@ -339,7 +342,7 @@ class ClosedForm:
         common, filled = _NOTHING, _NONE
         if context.given is not None:
             common, filled = given_kernels.common_growth(
-                *(self._weights, context.classes, context.log_counts),
+                *(self._weights.G, len(context.classes), context.z),
                 *(*_lists(context.given), context.slopes, rows),
             )
         found: Floats = object_kernels.reasons(*each, rows, common, filled, self._group)

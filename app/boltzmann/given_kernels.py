@@ -105,7 +105,10 @@ def _add_expanded(G, factors, some, out):
 
 @compiled
 def fixed_point(x, w, classes, log_counts, a, i, j, r, g, sweeps):
-    """The mean field given relations: logits of h1 (H1,), and the slopes (E,) at its end."""
+    """The mean field given relations: logits of h1 (H1,), and the slopes (E,) at its end.
+
+    And the factors z (E, K + 1) of the units, which `shares` and `common_growth` need again.
+    """
     E, G = len(a), w.G
     z, base = _units(w, classes, log_counts, a, i, j)
     rows, start, place = _by_relation(z, a, len(G))
@@ -137,7 +140,7 @@ def fixed_point(x, w, classes, log_counts, a, i, j, r, g, sweeps):
             add_rows(slopes, U, y)
         else:
             _add_pull(slopes, G, rows, start, y)
-    return y, slopes[place]
+    return y, slopes[place], z
 
 
 @compiled_in_any_order
@@ -181,16 +184,15 @@ def find_slopes(n, relations, a, i, j, slopes, units_a, units_i, units_j):
 
 
 @compiled
-def shares(w, W, classes, presence, log_counts, a, i, j, slopes):
-    """What each class and its relations add to y, (n, H1)."""
-    n, H1, G = len(classes), W.shape[1], w.G
+def shares(G, W, classes, presence, z, a, i, j, slopes):
+    """What each class and its relations, of factors z (E, K + 1), add to y, (n, H1)."""
+    n, H1 = len(classes), W.shape[1]
     found = np.empty((n, H1), np.float32)
     for c in range(n):
         row, into = W[classes[c]], found[c]
         for h in range(H1):
             into[h] = presence[c] * row[h]
-    z, _ = _units(w, classes, log_counts, a, i, j)
-    factors, some = np.zeros((n, *w.g.shape), np.float32), np.zeros((n, len(G)), np.bool_)
+    factors, some = np.zeros((n, *G.shape[:2]), np.float32), np.zeros((n, len(G)), np.bool_)
     _gather(i, a, z, slopes, factors, some)
     _gather(np.where(i == j, -1, j), a, z, slopes, factors, some)
     for c in range(n):
@@ -199,17 +201,20 @@ def shares(w, W, classes, presence, log_counts, a, i, j, slopes):
 
 
 @compiled
-def common_growth(w, classes, log_counts, a, i, j, slopes, rows):
+def common_growth(G, n, z, a, i, j, slopes, rows):
     """e^ what the relations between two classes add to y, (N, n, H1) for classes in rows (N,).
 
     And (N, n), whether there are any: where there are none, nothing is filled in.
+
+    Args:
+        n: classes of the scene.
+        z: (E, K + 1) the factors of the relations.
     """
-    n, H1, N, G = len(classes), w.G.shape[2], len(rows), w.G
-    z, _ = _units(w, classes, log_counts, a, i, j)
+    H1, N = G.shape[2], len(rows)
     place = np.full(n, -1)
     for c in range(N):
         place[rows[c]] = c
-    factors, some = np.empty((n, *w.g.shape), np.float32), np.empty((n, len(G)), np.bool_)
+    factors, some = np.empty((n, *G.shape[:2]), np.float32), np.empty((n, len(G)), np.bool_)
     target = np.empty(len(a), np.int64)
     found, filled = np.empty((N, n, H1), np.float32), np.zeros((N, n), np.bool_)
     for c in range(N):

@@ -10,27 +10,33 @@ from numpy.typing import NDArray
 from app.boltzmann.closed_form import Given
 from app.compiling import compiled
 from app.reasoning.present import Present
-from app.scene.evidence import class_evidence
+from app.scene.evidence import instance_evidence, pooled
 from app.scene.scene import Scene
 
 
 def given_relations(scene: Scene, present: Present, relations: int) -> Given | None:
-    """What `class_evidence` observes, as lists; None where the scene says nothing of relations.
+    """What is observed, by class, as lists; None where the scene says nothing of relations.
 
     Args:
         relations: how many the machine knows.
     """
     if scene.poses is None and not scene.relations and not scene.relations_complete:
         return None
-    found = class_evidence(scene)
-    return Given(*_lists(found.holds[:relations], found.observed[:relations], present.presence))
+    holds, observed = instance_evidence(scene)
+    return Given(*_lists(present.row, present.presence, holds, observed, relations))
 
 
 @compiled
 def _lists(
-    holds: NDArray[np.bool_], observed: NDArray[np.bool_], presence: NDArray[np.float32]
+    row: NDArray[np.int64],
+    presence: NDArray[np.float32],
+    instances_hold: NDArray[np.bool_],
+    instances_observed: NDArray[np.bool_],
+    relations: int,
 ) -> tuple[Any, ...]:
-    """See `Given`, for (A, n, n) both."""
+    """See `Given`, for (A, N, N) both."""
+    on, seen = pooled(row, len(presence), instances_hold, instances_observed)
+    holds, observed = on[:relations], seen[:relations]
     size = np.count_nonzero(observed)
     a, i, j = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     r, g = np.empty(size, np.float32), np.empty(size, np.float32)

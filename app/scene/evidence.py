@@ -88,6 +88,18 @@ def _pool(classes, confidence, holds, observed):
     for i in range(size):
         counts[row[i]] += 1
         absent[row[i]] *= 1.0 - confidence[i]
+    on, seen = pooled(row, n, holds, observed)
+    return distinct, counts, 1.0 - absent, on, seen
+
+
+@compiled
+def pooled(row, n, holds, observed):
+    """Relations of instances (A, N, N), which hold and which were observed, by class, (A, n, n).
+
+    Args:
+        row: (N,) the class of each instance, of n.
+    """
+    size = len(row)
     on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
     for a in range(A):
         for i in range(size):
@@ -98,7 +110,7 @@ def _pool(classes, confidence, holds, observed):
                     on[a, row[i], row[j]] = seen[a, row[i], row[j]] = True
                 elif observed[a, i, j]:
                     seen[a, row[i], row[j]] = True
-    return distinct, counts, 1.0 - absent, on, seen
+    return on, seen
 
 
 def class_evidence(scene: Scene) -> ClassEvidence:
@@ -112,15 +124,18 @@ def class_evidence(scene: Scene) -> ClassEvidence:
     size = len(kept)
     classes = np.array([scene.objects[i].class_index for i in kept], dtype=np.int64)
     confidence = np.array([scene.objects[i].confidence for i in kept], dtype=np.float64)
-    if scene.poses is not None:
-        holds, observed = scene.poses.holds, scene.poses.observed
-        if size < len(scene.objects):
-            holds, observed = holds[:, kept][:, :, kept], observed[:, kept][:, :, kept]
-    else:
-        place = {i: position for position, i in enumerate(kept)}
-        holds = np.zeros((A, size, size), dtype=np.bool_)
-        for relation, subject, anchor in scene.relations or ():
-            if subject in place and anchor in place:
-                holds[relation, place[subject], place[anchor]] = True
-        observed = np.full((A, size, size), scene.relations_complete)
+    holds, observed = instance_evidence(scene)
+    if size < len(scene.objects):
+        holds, observed = holds[:, kept][:, :, kept], observed[:, kept][:, :, kept]
     return pool_instances(classes, confidence, holds, observed, scene.room_type)
+
+
+def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which relations hold between the N instances of a scene, and which are known, (A, N, N)."""
+    if scene.poses is not None:
+        return scene.poses.holds, scene.poses.observed
+    size = len(scene.objects)
+    holds = np.zeros((A, size, size), dtype=np.bool_)
+    if scene.relations:
+        holds[tuple(np.array(scene.relations).T)] = True
+    return holds, np.full((A, size, size), scene.relations_complete)
