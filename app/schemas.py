@@ -212,46 +212,6 @@ class SceneRequest(Request):
     ] = "error"
 
 
-_BEDROOM: dict[str, Any] = {
-    "objects": [
-        "bed",
-        {"id": "nightstand_1", "label": "nightstand"},
-        {"id": "lamp_1", "label": "lamp", "confidence": 0.92},
-    ],
-    "relations": [{"subject": "lamp_1", "relation": "on-top", "object": "nightstand_1"}],
-    "room_type": "bedroom",
-}
-_POSES: dict[str, Any] = {
-    "objects": [
-        {
-            "id": "desk_1",
-            "label": "desk",
-            "position": {"x": 2.0, "y": 0.0, "z": 0.4},
-            "size": {"x": 0.7, "y": 1.4, "z": 0.8},
-        },
-        {
-            "id": "lamp_1",
-            "label": "lamp",
-            "position": {"x": 2.0, "y": 0.5, "z": 1.0},
-            "size": {"x": 0.2, "y": 0.2, "z": 0.4},
-        },
-        {
-            "id": "chair_1",
-            "label": "chair",
-            "position": {"x": 1.2, "y": 0.0, "z": 0.45},
-            "size": {"x": 0.5, "y": 0.5, "z": 0.9},
-            "orientation": {"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0},
-        },
-    ],
-    "frame_id": "base_link",
-    "stamp": {"sec": 12, "nanosec": 500000000},
-}
-
-
-def _examples(*examples: dict[str, Any]) -> ConfigDict:
-    return ConfigDict(json_schema_extra={"examples": list(examples)})
-
-
 class RelationsOptions(Request):
     """What `/relations` is asked beside the scene."""
 
@@ -271,8 +231,6 @@ class RelationsOptions(Request):
 class RelationsRequest(RelationsOptions, SceneRequest):
     """How do these objects stand to each other?"""
 
-    model_config = _examples(_BEDROOM | {"top_k": 5}, _POSES)
-
     objects: Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
 
 
@@ -291,11 +249,6 @@ class MissingOptions(Request):
 
 class MissingRequest(MissingOptions, SceneRequest):
     """What else should be here, and where?"""
-
-    model_config = _examples(
-        _BEDROOM | {"top_k": 3},
-        {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
-    )
 
     objects: Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
 
@@ -318,15 +271,11 @@ class OutliersOptions(Request):
 class OutliersRequest(OutliersOptions, SceneRequest):
     """What does not belong here, or stands in the wrong place?"""
 
-    model_config = _examples({**_BEDROOM, "objects": [*_BEDROOM["objects"], "toilet"]})
-
     objects: Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
 
 
 class GenerateRequest(SceneRequest):
     """What would a scene like this look like?"""
-
-    model_config = _examples({"objects": ["bed"], "room_type": "bedroom", "count": 2, "seed": 7})
 
     objects: Annotated[
         list[SceneObject], Field(max_length=256, description="evidence; may be empty")
@@ -764,8 +713,6 @@ class RefreshAnswer(Reply):
 
 class AliasRequest(Request):
     """Where an alias shall lead."""
-
-    model_config = _examples({"model": "home@1.1.0", "expected": "home@1.0.0"})
 
     model: Annotated[ModelSpec, Field(description="`name@version`, or `name` for its newest")]
     expected: Annotated[

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from app.reasoning.answers import Because, MissingAnswer, entries
+from app.reasoning.answers import Because, MissingAnswer, Placement, entries
 from app.reasoning.calibration import missing_scores, placed_scores
 from app.reasoning.listing import absent_things, likeliest_classes
 from app.reasoning.placements import placements
@@ -29,6 +29,7 @@ def missing(
     candidates: Sequence[int] | None = None,
     at: tuple[str, int] | None = None,
     axes: Axes | None = _VIEWER,
+    details: bool = True,
 ) -> tuple[MissingAnswer, ...]:
     """Absent classes by the probability that they were taken away, likeliest first.
 
@@ -42,6 +43,7 @@ def missing(
         at: (relation, position of an object): the missing thing stood so to that object.
         axes: the viewer's, in the frame that offsets are answered in (`viewer_axes`); None where
             nobody knows where the viewer looks.
+        details: also say where each would stand, and what speaks for it.
 
     Raises:
         ValueError: top_k below 1, a candidate outside the vocabulary, an unknown relation, or an
@@ -67,14 +69,19 @@ def missing(
     where, probabilities = likeliest_classes(scores, chosen, top_k)
     found = absent[where]
     labels = artifact.vocabulary.labels
+    standing: Sequence[tuple[Placement, ...]] = [()] * len(found)
+    because: Sequence[tuple[Because, ...]] = [()] * len(found)
+    if details:
+        standing = placements(artifact, given, found, axes, place)
+        because = _reasons(given, found)
     return tuple(
         entries(
             MissingAnswer,
             [labels[index] for index in found.tolist()],
             probabilities.tolist(),
             log_odds[where].tolist(),
-            placements(artifact, given, found, axes, place),
-            _reasons(given, found),
+            standing,
+            because,
         )
     )
 

@@ -19,7 +19,7 @@ _REASON_UNITS = 1 << 22
 
 
 def outliers(
-    artifact: Artifact, scene: Scene, *, threshold: float | None = None
+    artifact: Artifact, scene: Scene, *, threshold: float | None = None, details: bool = True
 ) -> tuple[tuple[OutlierAnswer, ...], tuple[MisplacedAnswer, ...]]:
     """Every object, least fitting first, and every stated relation, least likely first.
 
@@ -29,6 +29,7 @@ def outliers(
 
     Args:
         threshold: probability from which an object is called an outlier; by default the model's.
+        details: also say what speaks for and against each object.
 
     Raises:
         ValueError: a threshold outside [0, 1].
@@ -47,7 +48,8 @@ def outliers(
     )
     row = given.present.row[order]
     rows, probability, labels = row.tolist(), p[row], artifact.vocabulary.labels
-    reasons = _reasons(given, list(dict.fromkeys(rows[: _affordable(given)])))
+    explained = list(dict.fromkeys(rows[: _affordable(given)])) if details else []
+    reasons = _reasons(given, explained) if explained else {}
     found = entries(
         OutlierAnswer,
         order.tolist(),

@@ -254,6 +254,13 @@ async def test_every_body_has_worked_examples(document: dict[str, Any]) -> None:
         }
 
 
+def model_of(content: dict[str, Any]) -> Any:
+    """The model that a media type's schema describes."""
+    outer, _, inner = content["schema"]["$ref"].rpartition("/")[2].partition("_")
+    model = getattr(schemas, outer)
+    return model[getattr(schemas, inner.rstrip("_"))] if inner else model
+
+
 QUESTIONS = [
     (operation, name)
     for operation, cases in REQUESTS.items()
@@ -269,11 +276,16 @@ async def test_an_example_is_answered_or_refused_as_it_says(
     case = REQUESTS[operation][name]
     address = "/" + operation.replace("_", "/")
     response = await client.post(address, json=case.value)
+    responses = document["paths"][address]["post"]["responses"]
     if case.problem is None:
         assert response.status_code == 200, response.text
+        # No field too many or in another place, and every number as it was.
+        model = model_of(responses["200"]["content"]["application/json"])
+        validated = model.model_validate_json(response.content, extra="forbid")
+        assert validated.model_dump_json(exclude_none=True) == response.text
         return
     found = problem(response, case.problem.status, case.problem.slug)
-    documented = document["paths"][address]["post"]["responses"][str(case.problem.status)]
+    documented = responses[str(case.problem.status)]
     shown = documented["content"]["application/problem+json"]["examples"][case.problem.slug]
     if name in {"unknown-labels", "contradictory-evidence"}:
         # The problem in the document is the one that this example meets.
@@ -308,10 +320,6 @@ async def test_example_answers_have_the_fields_of_real_ones(document: dict[str, 
         if media_type == "text/plain":
             assert path == "/metrics"  # its example is compared in test_monitoring
             continue
-        outer, _, inner = ok["schema"]["$ref"].rpartition("/")[2].partition("_")
-        model = getattr(schemas, outer)
-        if inner:
-            model = model[getattr(schemas, inner.rstrip("_"))]
-        validated = model.model_validate(ok["example"], extra="forbid")
+        validated = model_of(ok).model_validate(ok["example"], extra="forbid")
         dumped = json.loads(validated.model_dump_json(exclude_none=True))
         assert dumped == ok["example"], path

@@ -13,13 +13,9 @@ import pytest
 from app.scene.relations import CANONICAL, opposite
 from app.schemas import (
     GenerateAnswer,
-    GenerateRequest,
     MissingAnswer,
-    MissingRequest,
     OutliersAnswer,
-    OutliersRequest,
     RelationsAnswer,
-    RelationsRequest,
 )
 from tests.http.conftest import serve
 from tests.http.stores import VOCABULARY, publish
@@ -330,27 +326,6 @@ async def test_models_of_few_classes_answer(tmp_path: Path, variant: str, classe
             await ask(client, question, objects=["bed"])
         refused = await client.post("/missing", json={"objects": ["bed"], "top_k": classes + 1})
         assert refused.status_code == 422
-
-
-# ---------------------------------------------------------------------------------- examples
-
-
-@pytest.mark.parametrize(
-    ("question", "model"),
-    [
-        ("relations", RelationsRequest),
-        ("missing", MissingRequest),
-        ("outliers", OutliersRequest),
-        ("generate", GenerateRequest),
-    ],
-)
-async def test_the_documented_examples_work(
-    client: httpx.AsyncClient, question: str, model: Any
-) -> None:
-    examples = model.model_config["json_schema_extra"]["examples"]
-    assert examples
-    for example in examples:
-        await ask(client, question, **example)
 
 
 async def test_the_place_that_was_asked_about_comes_first(client: httpx.AsyncClient) -> None:

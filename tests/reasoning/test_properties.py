@@ -404,3 +404,17 @@ def test_classes_and_rooms_must_be_the_machine_s(question):
             question(ARTIFACTS["triway-local"], Scene((scene.objects[0], bad)))
     with pytest.raises(ValueError, match="room_type"):
         question(ARTIFACTS["triway-local"], Scene(scene.objects, room_type=2))
+
+
+@few
+@given(names, scenes(minimum=2))
+def test_details_change_nothing_else(name, scene):
+    artifact = ARTIFACTS[name]
+    bare = missing(artifact, scene, details=False)
+    assert bare == tuple(
+        answer._replace(placements=(), because=()) for answer in missing(artifact, scene)
+    )
+    judged, stated = outliers(artifact, scene, details=False)
+    explained, again = outliers(artifact, scene)
+    assert judged == tuple(answer._replace(because=()) for answer in explained)
+    assert stated == again

@@ -165,7 +165,8 @@ def ask_missing(
         return None
     target, kept = taken
     label = artifact.vocabulary.labels[target]
-    return [(a.probability, a.label == label) for a in missing(artifact, _bare(encoded, kept))]
+    found = missing(artifact, _bare(encoded, kept), details=False)
+    return [(answer.probability, answer.label == label) for answer in found]
 
 
 def ask_placed(
@@ -178,7 +179,7 @@ def ask_placed(
     scene, relation, anchor, target = case
     scene = replace(scene, room_type=None)
     label = artifact.vocabulary.labels[target]
-    found = missing(artifact, scene, at=(CANONICAL[relation], anchor))
+    found = missing(artifact, scene, at=(CANONICAL[relation], anchor), details=False)
     return [(answer.probability, answer.label == label) for answer in found]
 
 
@@ -198,7 +199,7 @@ def ask_outliers(
         intruder = len(scene.objects)
         thing = SceneObject(id="intruder", label=artifact.vocabulary.labels[c], class_index=c)
         scene = replace(scene, objects=(*scene.objects, thing))
-    found, _ = outliers(artifact, scene)
+    found, _ = outliers(artifact, scene, details=False)
     usable = [not structure[thing.class_index] for thing in scene.objects]
     return [(a.probability, a.object == intruder) for a in found if usable[a.object]]
 
