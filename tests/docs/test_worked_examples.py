@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import httpx
@@ -71,8 +72,12 @@ def test_the_log_line_of_the_operations_page_has_the_fields_of_a_real_one(
         json={"objects": ["bed"]},
         headers={"X-Request-Id": request_id},
     )
-    lines = (workplace.folder.parent / "log").read_text(encoding="utf-8").splitlines()
-    (line,) = [json.loads(line) for line in lines if request_id in line]
+    # Written when the answer has been sent, which the client may see before.
+    log, found, deadline = workplace.folder.parent / "log", list[str](), monotonic() + 10
+    while not found and monotonic() < deadline:
+        found = [line for line in log.read_text("utf-8").splitlines(True) if request_id in line]
+        found = [line for line in found if line.endswith("\n")]
+    (line,) = map(json.loads, found)
     assert line.keys() == shown.keys()
     assert {name: type(value) for name, value in line.items()} == {
         name: type(value) for name, value in shown.items()

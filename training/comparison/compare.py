@@ -9,7 +9,7 @@ from typing import Any
 
 from app.scene import Vocabulary
 from training.batches import SceneTensors, scene_tensors
-from training.comparison.differences import Difference, differences
+from training.comparison.differences import RELATIONAL, Difference, differences
 from training.comparison.examples import Example, changed_most
 from training.comparison.heldout import HeldOut, held_out
 from training.comparison.sides import Say, Side
@@ -35,6 +35,8 @@ class Comparison:
         notes: what has to be said beside the figures.
         differences: a minus b, by task and metric.
         examples: questions whose answers differ most.
+        unmeasured: tasks about relations at which the second was measured when it was published,
+            where the scenes ask about none.
     """
 
     a: str
@@ -45,6 +47,7 @@ class Comparison:
     notes: tuple[str, ...]
     differences: tuple[Difference, ...]
     examples: tuple[Example, ...]
+    unmeasured: tuple[str, ...] = ()
 
     def worse_by(self, margin: float) -> list[Difference]:
         """The primary metrics in which the first is worse by more than a margin, surely."""
@@ -105,7 +108,16 @@ def compare(
         ),
         differences=tuple(rows),
         examples=tuple(_examples(rivals, scenes, data, a.vocabulary, examples)),
+        unmeasured=unmeasured(rows, b),
     )
+
+
+def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
+    """The tasks about relations at which a model was measured, where no row is of any."""
+    if other.artifact is None or any(row.task in RELATIONAL for row in rows):
+        return ()
+    measured = {metric.task for metric in other.artifact.manifest.metrics}
+    return tuple(task for task in RELATIONAL if task in measured)
 
 
 def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneTensors:

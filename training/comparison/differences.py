@@ -58,6 +58,9 @@ class Difference:
         return "worse" if self.difference.high < 0 else "undecided"
 
 
+RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
+"""The tasks that only scenes with relations ask about."""
+
 _RELATED = ("T2-at missing at a place", "T3b placement")
 
 # What stands for a model in a task.

@@ -1,7 +1,8 @@
 """Whether a new version may take the place of the one that an alias serves.
 
 It may not where a primary metric is worse by more than a margin, surely: where the whole interval
-of the paired difference lies beyond it. A difference that could be chance stops nobody.
+of the paired difference lies beyond it. A difference that could be chance stops nobody. Nor may it
+where nothing shows how it does at relations, and what is served was measured at them.
 """
 
 from __future__ import annotations
@@ -21,14 +22,20 @@ MARGIN = 0.02
 
 
 class WorseError(RuntimeError):
-    """A version that is worse than the one it would replace; holds the comparison."""
+    """A version that is, or may be, worse than the one it would replace; holds the comparison."""
 
     def __init__(self, comparison: Comparison, margin: float) -> None:
-        rows = comparison.worse_by(margin)
-        names = ", ".join(f"{row.task} {row.metric} ({row.difference})" for row in rows)
-        super().__init__(
-            f"{comparison.a} is worse than {comparison.b} by more than {margin}: {names}"
-        )
+        a, b, reasons = comparison.a, comparison.b, []
+        if rows := comparison.worse_by(margin):
+            names = ", ".join(f"{row.task} {row.metric} ({row.difference})" for row in rows)
+            reasons.append(f"{a} is worse than {b} by more than {margin}: {names}")
+        if comparison.unmeasured:
+            names = ", ".join(comparison.unmeasured)
+            reasons.append(
+                f"no held-out scene tells of relations: nothing shows how {a} does at {names}, "
+                f"at which {b} was measured"
+            )
+        super().__init__("; ".join(reasons))
         self.comparison = comparison
 
 
@@ -81,11 +88,11 @@ def judge(
         artifact: as it would be published.
 
     Raises:
-        WorseError: it is worse.
+        WorseError: it is worse, or nothing shows how it does at relations.
         ConfigError: see `compare`.
     """
     new = Side("the new version", run.config, scenes.digests, artifact, root)
     comparison = compare(new, holder, root, limit=limit, examples=3, say=say)
-    if comparison.worse_by(margin):
+    if comparison.worse_by(margin) or comparison.unmeasured:
         raise WorseError(comparison, margin)
     return comparison

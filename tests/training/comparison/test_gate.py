@@ -1,14 +1,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from app.registry import Store
 from tests.http.stores import corrupt, make_store
-from training.comparison.compare import Comparison
-from training.comparison.differences import Difference
+from training.comparison import gate
+from training.comparison.compare import Comparison, unmeasured
+from training.comparison.differences import RELATIONAL, Difference
 from training.comparison.gate import WorseError, seat
+from training.comparison.sides import Side
 from training.evaluation.intervals import Figure
 
 
@@ -45,6 +50,39 @@ def test_a_refusal_names_every_metric_that_is_worse() -> None:
     assert "AP" not in text
     assert found.to_dict()["differences"][0]["verdict"] == "worse"
     assert replace(found, differences=()).worse_by(0) == []
+
+
+@pytest.mark.parametrize(
+    ("measured", "task", "expected"),
+    [
+        (("T2 missing", "T3b placement", "T1a relations"), "T2 missing", 2),
+        (("T2 missing", "T1a relations"), "T1a relations", 0),  # some scenes tell of relations
+        (("T2 missing",), "T2 missing", 0),  # nor does what is served know of any
+    ],
+)
+def test_what_was_measured_at_relations_gives_way_to_nothing_that_was_not(
+    measured, task, expected, monkeypatch
+) -> None:
+    manifest = SimpleNamespace(metrics=[SimpleNamespace(task=name) for name in measured])
+    holder = Side("old", None, {}, SimpleNamespace(manifest=manifest))  # type: ignore[arg-type]
+    row = Difference(task, "MRR", True, 0.5, 0.5, Figure(0, -0.1, 0.1, 9))
+    names = unmeasured([row], holder)
+    assert len(names) == expected
+    assert set(names) < set(RELATIONAL)
+
+    found = replace(comparison(("MRR", True, -0.1, 0.1)), unmeasured=names)
+    monkeypatch.setattr(gate, "compare", lambda *_, **__: found)
+    run, scenes = SimpleNamespace(config=None), SimpleNamespace(digests={})
+    ask = partial(
+        *(gate.judge, run, scenes, None, holder, Path()), margin=0.02, limit=None, say=print
+    )
+    if not names:
+        assert ask() is found
+        return
+    with pytest.raises(WorseError) as refused:
+        ask()
+    assert "nothing shows how new does at T1a relations, T3b placement" in str(refused.value)
+    assert "worse" not in str(refused.value)
 
 
 def test_an_alias_serves_a_model_or_nothing_that_can_be_compared_with(tmp_path) -> None:
