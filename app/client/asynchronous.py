@@ -242,6 +242,14 @@ class AsyncClient:
         """Whether the service's default model answers; asked once."""
         return await self._is("ready", timeout)
 
+    async def check_ready(self, *, timeout: float | None = None) -> None:
+        """Return if the service's default model answers; asked once.
+
+        Raises:
+            UnreachableError, DeadlineError, ProblemError: it does not, and so.
+        """
+        await self._call(calls.health("ready"), timeout, retries=0)
+
     async def _is(self, health: str, timeout: float | None) -> bool:
         try:
             await self._call(calls.health(health), timeout, retries=0)

@@ -24,7 +24,7 @@ from rich.console import Console, RenderableType
 from typer.core import TyperGroup
 
 from app import __version__
-from app.client import calls, tables
+from app.client import tables
 from app.client.errors import (
     ClientError,
     DeadlineError,
@@ -311,8 +311,7 @@ def ready(context: typer.Context) -> None:
     """Whether the service answers; says nothing but by its exit status."""
     asked: Asked = context.obj
     with _failing(), asked.open() as client:
-        # Not `is_ready`, to which nobody there, too late and busy are one and the same no.
-        client._call(calls.health("ready"), None, retries=0)
+        client.check_ready()
 
 
 # ------------------------------------------------------------------------------------ reading

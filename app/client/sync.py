@@ -232,6 +232,14 @@ class Client:
         """Whether the service's default model answers; asked once."""
         return self._is("ready", timeout)
 
+    def check_ready(self, *, timeout: float | None = None) -> None:
+        """Return if the service's default model answers; asked once.
+
+        Raises:
+            UnreachableError, DeadlineError, ProblemError: it does not, and so.
+        """
+        self._call(calls.health("ready"), timeout, retries=0)
+
     def _is(self, health: str, timeout: float | None) -> bool:
         try:
             self._call(calls.health(health), timeout, retries=0)

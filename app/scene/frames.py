@@ -17,12 +17,17 @@ _NORM_TOLERANCE = 0.01
 
 def is_optical(frame_id: str) -> bool:
     """Whether a frame has optical axes: z forward, x right, y down."""
-    return frame_id.endswith(("_optical", "_optical_frame"))
+    return _plain(frame_id).endswith(("_optical", "_optical_frame"))
 
 
 def is_world_fixed(frame_id: str) -> bool:
     """Whether a frame is fixed to the world ("map", "robot_1/odom"): its origin is no viewer."""
-    return frame_id.rpartition("/")[2] in WORLD_FRAMES
+    return _plain(frame_id).rpartition("/")[2] in WORLD_FRAMES
+
+
+def _plain(frame_id: str) -> str:
+    # "MAP" or "map " is nobody's body frame: to take it for one would answer wrongly in silence.
+    return frame_id.strip().casefold()
 
 
 def body_pose(

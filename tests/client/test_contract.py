@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from app.api.example_requests import REQUESTS
 from app.client import (
     Client,
     DeadlineError,
@@ -18,7 +19,7 @@ from app.client import (
     OfflineClient,
     ProblemError,
 )
-from app.schemas import _BEDROOM, _POSES, Answer
+from app.schemas import Answer
 from tests.client.callers import Caller
 from tests.client.conftest import EVERY
 from tests.conftest import REPOSITORY
@@ -27,20 +28,22 @@ from tests.http.stores import make_store
 
 every_client = pytest.mark.parametrize("caller", EVERY, indirect=True)
 
+BEDROOM = REQUESTS["relations"]["relations"].value
+_POSES = REQUESTS["relations"]["poses"].value
 POSED: dict[str, Any] = {**_POSES, "objects": _POSES["objects"][:2]}
 QUESTIONS: list[tuple[str, dict[str, Any]]] = [
     ("relations", {"objects": ["bed", "lamp", "chair", "chair"], "top_k": 5}),
-    ("relations", {**_BEDROOM, "include_opposites": True, "min_probability": 0.1}),
+    ("relations", {**BEDROOM, "include_opposites": True, "min_probability": 0.1}),
     (
         "relations",
         {"objects": ["bed", "lamp"], "pairs": [{"subject": "bed", "object": "lamp"}]},
     ),
-    ("missing", {**_BEDROOM, "top_k": 3}),
+    ("missing", {**BEDROOM, "top_k": 3}),
     ("missing", {"objects": ["desk"], "at": {"relation": "on-top", "object": "desk"}}),
     ("missing", {"objects": ["desk", "bed"], "candidates": ["lamp", "TV"], "model": "plain"}),
     ("missing", {"objects": ["desk", "unheard-of"], "unknown_labels": "ignore"}),
     ("missing", POSED),
-    ("outliers", {**_BEDROOM, "threshold": 0.25}),
+    ("outliers", {**BEDROOM, "threshold": 0.25}),
     ("outliers", {"objects": ["bed"], "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}),
     ("generate", {"objects": ["bed"], "count": 3, "seed": 7, "temperature": 0.5}),
     ("generate", {"objects": [], "room_type": "office", "seed": 1, "steps": 5, "model": "deep"}),
@@ -191,9 +194,10 @@ def test_a_store_without_a_usable_default_is_not_ready(tmp_path: Path) -> None:
     with OfflineClient(tmp_path, timeout=1.0) as scene:
         assert scene.is_live()
         assert not scene.is_ready()
-        with pytest.raises(ProblemError) as raised:
-            scene.missing(["bed"])
-    assert raised.value.type == "/problems/not-ready"
+        for ask in (lambda: scene.missing(["bed"]), scene.check_ready):
+            with pytest.raises(ProblemError) as raised:
+                ask()
+            assert raised.value.type == "/problems/not-ready"
 
 
 def test_what_is_served_is_changed_alike_with_a_service_and_without(tmp_path: Path) -> None:

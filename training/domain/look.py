@@ -14,6 +14,9 @@ _ON_TOP, _ABOVE = CANONICAL.index("on-top"), CANONICAL.index("above")
 # So many of each kind are shown; all of them are counted.
 SHOWN = 5
 
+# Of a label in a request (`Label` of app/schemas.py, which training does without).
+LONGEST = 100
+
 
 @dataclass
 class Finding:
@@ -136,7 +139,7 @@ def _findings(scenes: Sequence[AnnotatedScene], rooms: Counter[str]) -> Iterator
                 crossed.add(_pair(scene, i, j))
         if (circle := _circle(scene, held)) is not None:
             cycles.add(f"{scene.scene_id}: {', '.join(circle)}")
-    yield from (small, both_ways, crossed, cycles)
+    yield from (small, both_ways, crossed, cycles, _unaskable(scenes))
     yield _duplicates(scenes)
     yield _alone(scenes)
     nowhere = Finding(
@@ -158,6 +161,18 @@ def _findings(scenes: Sequence[AnnotatedScene], rooms: Counter[str]) -> Iterator
         if placed and scene.relations is None and not scene.viewer_frame:
             axes.add(scene.scene_id)
     yield axes
+
+
+def _unaskable(scenes: Sequence[AnnotatedScene]) -> Finding:
+    labels = {thing.label for scene in scenes for thing in scene.objects}
+    found = Finding(
+        f"Labels are longer than {LONGEST} characters or hold some that cannot be printed.",
+        "No request can name such a thing. Shorten them.",
+    )
+    for label in sorted(labels):
+        if len(label) > LONGEST or not label.isprintable():
+            found.add(f"{label[:40]!r}…")
+    return found
 
 
 def _pair(scene: AnnotatedScene, i: int, j: int) -> str:

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import pytest
+from pydantic import ValidationError
 
+from app.schemas import MissingRequest
 from tests.training.domain.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.names import Names
 from training.datasets.workplaces import WORKPLACES
-from training.domain.look import Facts, look
+from training.domain.look import LONGEST, Facts, look
 
 NAMES = Names()
 
@@ -78,6 +80,17 @@ def test_copies_in_other_groups_are_found() -> None:
     assert finding("different groups", first, framed) == (0, [])
     # Two small rooms may hold the same things.
     assert finding("different groups", scene("a", "cup", "bed"), scene("b", "cup", "bed"))[0] == 0
+
+
+def test_labels_that_no_request_can_name_are_found() -> None:
+    with pytest.raises(ValidationError):
+        MissingRequest.model_validate({"objects": ["x" * (LONGEST + 1)]})
+    MissingRequest.model_validate({"objects": ["x" * LONGEST]})
+    named = scene("a", "x" * LONGEST, "cup", "cup")
+    assert finding("Labels", named) == (0, [])
+    count, examples = finding("Labels", named, scene("b", "x" * (LONGEST + 1), "tea\tcup"))
+    assert count == 2
+    assert examples == ["'tea\\tcup'…", f"'{'x' * 40}'…"]
 
 
 def test_examples_are_few_and_all_are_counted() -> None:
