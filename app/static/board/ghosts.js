@@ -53,7 +53,7 @@ function suggest(state, answer, sizes) {
     const wanted = asked ?? (state.at ? { ...state.at, probability: null } : placements[0]);
     const anchor = boxes.find((box) => box.id === wanted?.object);
     if (anchor && !state.things.some((thing) => thing.label === label)) {
-      const place = stand(anchor, wanted, size, state.viewer, [...boxes, ...ghosts]);
+      const place = stand(anchor, wanted, size, state.viewer, boxes, ghosts);
       ghosts.push({ id: label, label, probability, placement: wanted, size, yaw: 0, ...place });
     }
   }
@@ -69,11 +69,12 @@ const within = ({ yaw }, x, y) => turned({ yaw: -yaw }, x, y);
 
 /**
  * Where a suggestion stands in the relation that is said of it, as the service reads relations from
- * places: near where it was learnt, if it was, and free of other things where there is room.
+ * places: near where it was learnt, if it was, free of other things where there is room, and not
+ * over another suggestion where there is more.
  */
-function stand(anchor, placement, size, viewer, taken) {
+function stand(anchor, placement, size, viewer, boxes, ghosts) {
   const { relation, offset } = placement;
-  const others = taken.filter((box) => box !== anchor);
+  const others = [...boxes.filter((box) => box !== anchor), ...ghosts];
   const learnt = offset && { x: anchor.x + offset.mean.x, y: anchor.y + offset.mean.y };
   const spread = learnt && { ...learnt, rx: FOUR_OF_FIVE * offset.std.x, ry: FOUR_OF_FIVE * offset.std.y };
   const centre = offset && anchor.z + anchor.size.z / 2 + offset.mean.z;
@@ -82,7 +83,9 @@ function stand(anchor, placement, size, viewer, taken) {
   const find = VERTICAL.includes(relation) ? over : beside;
   const places = [...find(anchor, relation, size, viewer, learnt)].map(([x, y]) => ({ x: round(x), y: round(y), z }));
   const free = (place) => !others.some((other) => meet({ ...place, size, yaw: 0 }, other));
-  return { ...(places.find(free) ?? places[0]), spread };
+  const apart = (place) => !ghosts.some((ghost) => overlap({ ...place, size, yaw: 0 }, ghost));
+  const place = places.find((one) => free(one) && apart(one)) ?? places.find(free) ?? places[0];
+  return { ...place, spread };
 }
 
 /** Whether boxes are in each other: those that only touch, or are as thin as a rug, are not. */
