@@ -46,9 +46,12 @@ audit: $(EVERYTHING)  ## known vulnerabilities, risky code, bills of materials (
 	$(BIN)/python scripts/audit.py $(ARGS)
 
 chaos: $(EVERYTHING)  ## attack a live service: hostile requests, overload, swaps (minutes)
+	$(BIN)/python -m app.compile
 	$(BIN)/python -m pytest tests/chaos $(ARGS)
 
 soak: $(EVERYTHING)  ## ten minutes of mixed use: nothing may grow (MINUTES=10)
+	@# The compiler's memory is no part of the service's.
+	$(BIN)/python -m app.compile
 	CHAOS_SOAK_MINUTES=$(MINUTES) $(BIN)/python -m pytest tests/chaos/test_soak.py $(ARGS)
 
 setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need
