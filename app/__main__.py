@@ -38,6 +38,11 @@ def main() -> int:
     return serve(settings)
 
 
+# Containers made until the collector looks at the youngest. An answer is some two hundred, all freed
+# by their counts of references: to look every 700, as is usual, takes 4 to 8 % of a request's time.
+_YOUNG = 10_000
+
+
 def serve(
     settings: Settings,
     *,
@@ -57,6 +62,7 @@ def serve(
     # What starting makes stays: looking through it for garbage takes a fifth of the time. The
     # runtime turns the collector on again when it serves.
     gc.disable()
+    gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
     from app.server import build
 
     server = build(settings, peers)

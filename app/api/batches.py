@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from starlette.responses import Response
 
 from app.api import catalogue
-from app.api.answers import respond
+from app.api.answers import entry, failed_entry, respond_all
 from app.api.body import JSONRoute
 from app.api.dependencies import SessionDep
 from app.api.openapi import queued
@@ -56,13 +56,13 @@ async def _answer_each(
     def count(outcome: str) -> None:
         session.metrics.entry_answered(question.__name__, outcome)
 
-    results: list[Answer] = []
+    results: list[bytes] = []
     with session.for_batch([_reference(scene) for scene in batch.scenes]) as held:
         for place, scene in enumerate(batch.scenes):
             try:
                 held.ticket.check()
                 result = await question(held, _validated(scene, place, kind))
-                results.append({"status": 200, "result": result})
+                results.append(entry(result))
                 count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
                 failure = from_exception(error, at=("scenes", place))
@@ -70,10 +70,10 @@ async def _answer_each(
                 if problem.status == 500:
                     report_defect(error, session.request_id)
                 count(failure.kind.slug)
-                results.append({"status": problem.status, "problem": problem})
+                results.append(failed_entry(problem))
             # Others are served between two scenes, health checks first of all.
             await asyncio.sleep(0)
-    return respond({"request_id": session.request_id, "results": results})
+    return respond_all(session.request_id, results)
 
 
 def _reference(scene: Any) -> str:

@@ -76,8 +76,8 @@ class Done(Generic[T]):
 
     Attributes:
         waited, computed: seconds before it was begun, and that it took.
-        processor: seconds that it kept a processor busy. In the worker thread it also waits for the
-            interpreter, and anywhere for other processes.
+        processor: seconds that it kept a processor busy: `computed` without waiting for other
+            processes and, in a worker thread, for the interpreter.
     """
 
     result: T

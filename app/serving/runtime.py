@@ -10,7 +10,7 @@ import sys
 from collections.abc import Awaitable, Callable
 from functools import partial, wraps
 from pathlib import Path
-from typing import Concatenate, Final, Literal, ParamSpec, TypeVar
+from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 import torch
 
@@ -329,13 +329,8 @@ def _names(models: ServedModels, *, but_not: ServedModels) -> list[str]:
     ]
 
 
-# An answer is some two hundred containers, all freed by their counts of references. To look through
-# them every 700, as is usual, takes 4 to 8 % of a request's time.
-_YOUNG: Final = 10_000
-
-
 def _settle_memory() -> None:
-    """Take what is long-lived out of the collector's sight, and let it look less often.
+    """Take what is long-lived out of the collector's sight.
 
     With torch imported a full collection stops the world for some 90 ms. What a replaced snapshot
     left frozen must be thawed first, or its cycles would never be freed. At the start, which the
@@ -348,5 +343,4 @@ def _settle_memory() -> None:
     if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
         trim(0)
     gc.freeze()
-    gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
     gc.enable()

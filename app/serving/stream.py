@@ -35,6 +35,7 @@ from app.schemas import (
     SceneRequest,
 )
 from app.serving import questions
+from app.serving.answers import written
 from app.serving.errors import Fault, Location, Reason, RequestError
 from app.serving.metrics import Metrics
 from app.serving.reading import Faults, Names
@@ -269,13 +270,15 @@ async def _answer(state: SceneState, view: Session) -> _Found:
         except RequestError as error:
             found.failures[name] = error
         else:
-            found.lists.update({own: answer[own] for own in _own(_ANSWERS[name])})
+            lists = {own: answer[own] for own in _own(_ANSWERS[name])}
+            written(lists)  # no number that is not finite leaves, as in an answer to a request
+            found.lists.update(lists)
     return found
 
 
-def _own(kind: type[Answer]) -> set[str]:
+def _own(kind: type[Answer]) -> list[str]:
     """The lists that one question's answer has and the others' have not."""
-    return set(kind.model_fields) - set(Answer.model_fields)
+    return [name for name in kind.model_fields if name not in Answer.model_fields]
 
 
 def _alarms(before: Mapping[str, list[Entry]], after: Mapping[str, list[Entry]]) -> Alarms:

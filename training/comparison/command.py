@@ -87,7 +87,11 @@ def show(comparison: Comparison, console: Console) -> None:
             f"[{colour}]{row.verdict}[/{colour}]",
         )
     console.print(table)
-    for note in comparison.notes:
+    notes = list(comparison.notes)
+    if comparison.unmeasured:
+        names = ", ".join(comparison.unmeasured)
+        notes.append(f"nothing here shows how {comparison.a} does at {names}")
+    for note in notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     if not comparison.examples:
         return

@@ -32,8 +32,8 @@ class WorseError(RuntimeError):
         if comparison.unmeasured:
             names = ", ".join(comparison.unmeasured)
             reasons.append(
-                f"no held-out scene tells of relations: nothing shows how {a} does at {names}, "
-                f"at which {b} was measured"
+                f"none of the scenes compared on tells of relations: nothing shows how {a} does at "
+                f"{names}, at which {b} was measured"
             )
         super().__init__("; ".join(reasons))
         self.comparison = comparison

@@ -92,7 +92,7 @@ def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
         relations=dict(
             Counter(r for scene in scenes for _, r, _ in scene.relations or ()).most_common()
         ),
-        findings=tuple(finding for finding in _findings(scenes, rooms) if finding.count),
+        findings=tuple(finding for finding in _findings(scenes, rooms, names) if finding.count),
     )
 
 
@@ -111,7 +111,9 @@ def _shares(scenes: Sequence[AnnotatedScene], names: Names) -> dict[str, float]:
     }
 
 
-def _findings(scenes: Sequence[AnnotatedScene], rooms: Counter[str]) -> Iterator[Finding]:
+def _findings(
+    scenes: Sequence[AnnotatedScene], rooms: Counter[str], names: Names
+) -> Iterator[Finding]:
     small = Finding(
         "Scenes of fewer than two different things teach nothing of what belongs together.",
         "They are read and skipped where they cannot be asked about.",
@@ -139,7 +141,7 @@ def _findings(scenes: Sequence[AnnotatedScene], rooms: Counter[str]) -> Iterator
                 crossed.add(_pair(scene, i, j))
         if (circle := _circle(scene, held)) is not None:
             cycles.add(f"{scene.scene_id}: {', '.join(circle)}")
-    yield from (small, both_ways, crossed, cycles, _unaskable(scenes))
+    yield from (small, both_ways, crossed, cycles, _unaskable(scenes, names))
     yield _duplicates(scenes)
     yield _alone(scenes)
     nowhere = Finding(
@@ -163,15 +165,15 @@ def _findings(scenes: Sequence[AnnotatedScene], rooms: Counter[str]) -> Iterator
     yield axes
 
 
-def _unaskable(scenes: Sequence[AnnotatedScene]) -> Finding:
-    labels = {thing.label for scene in scenes for thing in scene.objects}
+def _unaskable(scenes: Sequence[AnnotatedScene], names: Names) -> Finding:
     found = Finding(
-        f"Labels are longer than {LONGEST} characters or hold some that cannot be printed.",
-        "No request can name such a thing. Shorten them.",
+        f"Labels are blank, longer than {LONGEST} characters or cannot be printed.",
+        "No request can name such a thing. Give them other names.",
     )
-    for label in sorted(labels):
-        if len(label) > LONGEST or not label.isprintable():
-            found.add(f"{label[:40]!r}…")
+    for label in sorted({thing.label for scene in scenes for thing in scene.objects}):
+        name = names.canonical(label)
+        if not name.strip() or len(name) > LONGEST or not name.isprintable():
+            found.add(repr(label) if len(label) <= LONGEST else f"{label[:40]!r} …")
     return found
 
 

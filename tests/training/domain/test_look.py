@@ -88,9 +88,11 @@ def test_labels_that_no_request_can_name_are_found() -> None:
     MissingRequest.model_validate({"objects": ["x" * LONGEST]})
     named = scene("a", "x" * LONGEST, "cup", "cup")
     assert finding("Labels", named) == (0, [])
-    count, examples = finding("Labels", named, scene("b", "x" * (LONGEST + 1), "tea\tcup"))
-    assert count == 2
-    assert examples == ["'tea\\tcup'…", f"'{'x' * 40}'…"]
+    # The blank in between is any.
+    assert finding("Labels", scene("b", "tea\tcup", "cup")) == (0, [])
+    count, examples = finding("Labels", scene("b", "x" * (LONGEST + 1), " ", "a\0b", "cup"))
+    assert count == 3
+    assert examples == ["' '", "'a\\x00b'", f"'{'x' * 40}' …"]
 
 
 def test_examples_are_few_and_all_are_counted() -> None:
