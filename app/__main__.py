@@ -38,8 +38,9 @@ def main() -> int:
     return serve(settings)
 
 
-# Containers made until the collector looks at the youngest. An answer is some two hundred, all freed
-# by their counts of references: to look every 700, as is usual, takes 4 to 8 % of a request's time.
+# Containers made until the collector looks at the youngest. An answer is some two hundred, all of
+# them freed by their counts of references: to look every 700, as is usual, takes 4 to 8 % of a
+# request's time.
 _YOUNG = 10_000
 
 

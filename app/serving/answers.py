@@ -122,7 +122,10 @@ def written(answer: Any) -> bytes:
     """
     body = to_json(answer, inf_nan_mode="constants", exclude_none=True)
     if b"NaN" in body or b"Infinity" in body:  # as a number, or as part of a name
-        from_json(body, allow_inf_nan=False)
+        try:
+            from_json(body, allow_inf_nan=False)
+        except ValueError:
+            raise ValueError("a number of an answer is not finite") from None
     return body
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import httpx
@@ -74,8 +75,9 @@ async def test_there_is_no_batch_of_drawings(client: httpx.AsyncClient) -> None:
     assert (await client.post("/generate/batch", json={"scenes": []})).status_code == 404
 
 
+@pytest.mark.parametrize("fault", ["raised", math.nan, math.inf])
 async def test_a_defect_spoils_one_entry_only(
-    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch, fault: Any
 ) -> None:
     from app.serving import questions
 
@@ -83,7 +85,10 @@ async def test_a_defect_spoils_one_entry_only(
 
     def fail_on_sofas(artifact: Any, scene: Any, **parameters: Any) -> Any:
         if any(thing.label == "sofa" for thing in scene.objects):
-            raise ZeroDivisionError("secret detail")
+            if fault == "raised":
+                raise ZeroDivisionError("secret detail")
+            ((first, *others), misplaced) = real(artifact, scene, **parameters)
+            return (first._replace(log_odds=fault), *others), misplaced
         return real(artifact, scene, **parameters)
 
     monkeypatch.setattr(questions.reasoning, "outliers", fail_on_sofas)
@@ -92,3 +97,10 @@ async def test_a_defect_spoils_one_entry_only(
     assert [entry["status"] for entry in response.json()["results"]] == [200, 500, 200]
     assert response.json()["results"][1]["problem"]["type"] == "/problems/internal-error"
     assert "secret" not in response.text
+    assert (await client.post("/outliers", json=scenes[1])).status_code == 500
+
+
+async def test_a_name_may_be_that_of_what_is_no_number(client: httpx.AsyncClient) -> None:
+    objects = [{"id": "NaN", "label": "bed"}, {"id": "-Infinity", "label": "lamp"}]
+    answer = (await client.post("/outliers", json={"objects": objects})).json()
+    assert {entry["object"] for entry in answer["outliers"]} == {"NaN", "-Infinity"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic
@@ -267,6 +268,27 @@ def test_a_question_that_fails_leaves_the_others_their_answers(service: Service)
     assert message.dropped == ["missing"]
     lists = applied(lists, message.changes, message.dropped)
     assert [entry["object"] for entry in lists["outliers"]] == ["bed"]
+
+
+def test_no_number_that_is_not_finite_is_told(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = questions.reasoning.outliers
+
+    def broken(artifact: Any, scene: Any, **parameters: Any) -> Any:
+        ((first, *others), misplaced) = real(artifact, scene, **parameters)
+        return (first._replace(probability=math.nan), *others), misplaced
+
+    session = StreamSession()
+    service.take(session, type="open", ask=ASK)
+    service.take(session, type="update", seq=1, objects=["desk", "bed"])
+    with monkeypatch.context() as patch:
+        patch.setattr(questions.reasoning, "outliers", broken)
+        with pytest.raises(ValueError, match="not finite"):
+            service.answer(session)
+    # In the order of the schemas, whatever the hashes of their names are.
+    lists = applied({}, service.answer(session).changes, ())
+    assert list(lists) == ["missing", "outliers", "misplaced", "relations", "disagreements"]
 
 
 def test_another_model_starts_from_nothing(service: Service) -> None:
