@@ -18,7 +18,6 @@ from app.client.exchange import (
     MAX_ANSWER,
     RETRIES,
     Late,
-    Lost,
     Outcome,
     Pause,
     Received,
@@ -301,9 +300,9 @@ class AsyncClient:
             except httpx.TimeoutException:
                 return Late()
             except (httpx.ConnectError, httpx.UnsupportedProtocol) as error:
-                return Lost(str(error), sent=False)
+                return options.lost(error, sent=False)
             except httpx.TransportError as error:
-                return Lost(str(error), sent=True)
+                return options.lost(error, sent=True)
         return Late()
 
     # ------------------------------------------------------------------------------- lifetime

@@ -10,7 +10,7 @@ import httpx
 
 from app.client.calls import Call, T
 from app.client.errors import InvalidRequestError
-from app.client.exchange import MAX_TIMEOUT, RETRIES
+from app.client.exchange import MAX_TIMEOUT, RETRIES, Lost
 from app.schemas import FieldError
 
 
@@ -71,6 +71,17 @@ class Options:
     def address(self, call: Call[T]) -> str:
         """The URL of a call."""
         return self.url.rstrip("/") + call.path
+
+    def lost(self, error: Exception, *, sent: bool) -> Lost:
+        """The outcome of a call that got no answer for such a reason.
+
+        Args:
+            sent: the service may have got it.
+        """
+        parts = urlsplit(self.url)
+        # A name and a password may stand before the host.
+        host = parts.netloc.rpartition("@")[2]
+        return Lost(f"{parts.scheme}://{host}: {str(error) or type(error).__name__}", sent=sent)
 
     def headers(self, call: Call[T]) -> dict[str, str]:
         """The headers of a call."""

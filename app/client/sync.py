@@ -17,7 +17,6 @@ from app.client.exchange import (
     MAX_ANSWER,
     RETRIES,
     Late,
-    Lost,
     Outcome,
     Pause,
     Received,
@@ -288,9 +287,9 @@ class Client:
         except httpx.TimeoutException:
             return Late()
         except (httpx.ConnectError, httpx.UnsupportedProtocol) as error:
-            return Lost(str(error), sent=False)
+            return options.lost(error, sent=False)
         except httpx.TransportError as error:
-            return Lost(str(error), sent=True)
+            return options.lost(error, sent=True)
         return Received(response.status_code, response.headers, bytes(body))
 
     # ------------------------------------------------------------------------------- lifetime

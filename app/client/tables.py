@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Final
 
 from rich import box
 from rich.console import Group, RenderableType
@@ -21,6 +21,9 @@ from app.schemas import (
     VocabularyAnswer,
     WeightedLabel,
 )
+
+MOST_MISPLACED: Final = 10
+"""Rows at most: a dozen positions tell of a hundred relations."""
 
 
 def relations(answer: RelationsAnswer) -> RenderableType:
@@ -63,7 +66,7 @@ def missing(answer: MissingAnswer) -> RenderableType:
 
 
 def outliers(answer: OutliersAnswer) -> RenderableType:
-    """Every object, least fitting first, with why, and the relations that were given."""
+    """Every object, least fitting first, with why, and what was given likely wrongly."""
     rows = [
         (
             entry.object,
@@ -80,10 +83,13 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
         return found
     wrong = [
         (entry.subject, entry.relation, entry.object, _share(entry.probability))
-        for entry in answer.misplaced
+        for entry in answer.misplaced[:MOST_MISPLACED]
     ]
     columns = ("subject", "relation", "object", "probability of being wrong")
-    return Group(found, _table(*columns, rows=wrong, title="relations as given"))
+    title = "relations as given"
+    if len(wrong) < len(answer.misplaced):
+        title += f": the {len(wrong)} likeliest to be wrong of {len(answer.misplaced)}"
+    return Group(found, _table(*columns, rows=wrong, title=title))
 
 
 def generate(answer: GenerateAnswer) -> RenderableType:

@@ -18,6 +18,7 @@ import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, thread_time
@@ -128,10 +129,13 @@ class Threads:
     Attributes:
         costly: for questions that would hold up the event loop.
         drawing: for drawings.
+        turn: of those that give way, one is given to `costly` at a time: whoever does not waits for
+            one of them at most.
     """
 
     costly: Executor = field(default_factory=partial(_one_thread, "costly work"))
     drawing: Executor = field(default_factory=partial(_one_thread, "drawing"))
+    turn: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def stop(self) -> None:
         """Let go of them; what they have not begun is dropped."""
@@ -208,7 +212,8 @@ class WorkQueue:
         self.backlog += counted
         try:
             if self._costs.expected(kind, size) > CHEAP:
-                return await _in_thread(lambda _: learnt(), ticket, self.threads.costly)
+                async with self.threads.turn if gives_way else nullcontext():
+                    return await _in_thread(lambda _: learnt(), ticket, self.threads.costly)
             line = self._giving_way if gives_way else self._waiting
             return await self._in_tick(learnt, ticket, line)
         finally:

@@ -277,7 +277,7 @@ class Client {
       }
       if (attempt >= retries || pause >= ends - Clock::now()) {
         if (problem) throw *problem;
-        throw UnreachableError("no service: " + outcome.reason);
+        throw UnreachableError(address_.server + ": " + outcome.reason);
       }
       std::this_thread::sleep_for(pause);
     }

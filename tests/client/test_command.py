@@ -304,3 +304,16 @@ def test_words_of_a_service_cannot_dress_themselves_up() -> None:
     found = SimpleNamespace(outliers=[hostile], misplaced=[])
     text = shown(tables.outliers(found))  # type: ignore[arg-type]
     assert "[red]x[/red]" in text
+
+
+def test_of_many_given_relations_the_likeliest_to_be_wrong_are_shown() -> None:
+    given = [
+        SimpleNamespace(subject=f"a_{i}", relation="left", object="b", probability=1 - i / 40)
+        for i in range(12)
+    ]
+    text = shown(tables.outliers(SimpleNamespace(outliers=[], misplaced=given)))  # type: ignore[arg-type]
+    assert "the 10 likeliest to be wrong of 12" in text
+    assert "a_9" in text
+    assert "a_10" not in text
+    few = SimpleNamespace(outliers=[], misplaced=given[:10])
+    assert "likeliest" not in shown(tables.outliers(few))  # type: ignore[arg-type]

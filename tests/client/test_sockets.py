@@ -146,7 +146,7 @@ def test_nobody_listening_is_unreachable_and_not_ready(open_caller: Any) -> None
         port = taken.getsockname()[1]
     with open_caller(f"http://127.0.0.1:{port}", retries=1) as call:
         assert call("is_ready") is False
-        with pytest.raises(UnreachableError):
+        with pytest.raises(UnreachableError, match=f"http://127.0.0.1:{port}: "):
             call("models")
 
 

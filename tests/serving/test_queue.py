@@ -6,6 +6,7 @@ import asyncio
 import math
 import threading
 from collections.abc import Callable, Coroutine, Iterator
+from functools import partial
 from time import monotonic, sleep, thread_time
 from typing import Any
 
@@ -133,6 +134,29 @@ async def test_questions_of_streams_give_way_and_hold_up_no_request(queue: WorkQ
     # All of one tick: the request is first, and alone is counted.
     assert order == ["request, 1 counted", "stream 1, 1 counted", "stream 2, 1 counted"]
     assert queue.backlog == 0
+
+
+async def test_costly_questions_of_streams_let_requests_go_first(queue: WorkQueue) -> None:
+    order: list[str] = []
+    began, release = threading.Event(), threading.Event()
+
+    def note(name: str) -> None:
+        began.set()
+        assert release.wait(30)
+        order.append(name)
+
+    def ask(name: str, *, gives_way: bool) -> asyncio.Future[Any]:
+        call = partial(note, name)
+        run = queue.run(call, ENDLESS, kind="costly", size=1, gives_way=gives_way)
+        return asyncio.ensure_future(run)
+
+    waiting = [ask(f"stream {number}", gives_way=True) for number in (1, 2, 3)]
+    await asyncio.to_thread(began.wait, 30)
+    waiting.append(ask("request", gives_way=False))
+    await asyncio.sleep(0)
+    release.set()
+    await asyncio.gather(*waiting)
+    assert order == ["stream 1", "request", "stream 2", "stream 3"]
 
 
 async def test_nobody_who_asks_waits_for_a_drawing(queue: WorkQueue) -> None:
