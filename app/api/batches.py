@@ -65,15 +65,24 @@ async def _answer_each(
                 results.append(entry(result))
                 count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
-                failure = from_exception(error, at=("scenes", place))
-                problem = failure.describe(session.request_id)
-                if problem.status == 500:
-                    report_defect(error, session.request_id)
-                count(failure.kind.slug)
-                results.append(failed_entry(problem))
+                outcome, failed = _failed(error, place, session.request_id)
+                count(outcome)
+                results.append(failed)
             # Others are served between two scenes, health checks first of all.
             await asyncio.sleep(0)
     return respond_all(session.request_id, results)
+
+
+def _failed(error: Exception, place: int, request_id: str) -> tuple[str, bytes]:
+    """The outcome and the entry of a scene that could not be answered.
+
+    The error stays in this frame: it knows that of the batch, and would keep it from being freed.
+    """
+    failure = from_exception(error, at=("scenes", place))
+    problem = failure.describe(request_id)
+    if problem.status == 500:
+        report_defect(error, request_id)
+    return failure.kind.slug, failed_entry(problem)
 
 
 def _reference(scene: Any) -> str:

@@ -245,7 +245,10 @@ class WorkQueue:
         if not self._draining:
             self._draining = True
             loop.call_soon(self._drain)
-        found: Done[T] = await job.future
+        try:
+            found: Done[T] = await job.future
+        finally:
+            del job  # see `_settle`
         # Others may have had their turns meanwhile.
         ticket.check()
         return found
@@ -253,9 +256,7 @@ class WorkQueue:
     def _drain(self) -> None:
         end = monotonic() + _TICK
         while line := self._waiting or self._giving_way:
-            job = line.popleft()
-            if not job.future.done():
-                _settle(job)
+            _settle(line.popleft())
             if (self._waiting or self._giving_way) and monotonic() > end:
                 asyncio.get_running_loop().call_soon(self._drain)
                 return
@@ -288,6 +289,7 @@ async def _in_thread(
     finally:
         given_up = True
         future.cancel()
+        del future  # see `_settle`
 
 
 def _do(call: Callable[[], T], came: float) -> Done[T]:
@@ -299,7 +301,12 @@ def _do(call: Callable[[], T], came: float) -> Done[T]:
 
 def _settle(job: _Job) -> None:
     try:
-        job.ticket.check()
-        job.future.set_result(job.call())
+        if not job.future.done():
+            job.ticket.check()
+            job.future.set_result(job.call())
     except Exception as error:  # noqa: BLE001 - it belongs to the request, which raises it
         job.future.set_exception(error)
+    finally:
+        # The error knows this frame, and the future the error: with the job in the frame they would
+        # keep the whole request until the collector comes.
+        del job

@@ -268,7 +268,8 @@ async def _answer(state: SceneState, view: Session) -> _Found:
             else:
                 answer = await questions.relations(asked, RelationsRequest(**fields))
         except RequestError as error:
-            found.failures[name] = error
+            # Without the frames, of which one has this dictionary.
+            found.failures[name] = error.with_traceback(None)
         else:
             lists = {own: answer[own] for own in _own(_ANSWERS[name])}
             written(lists)  # no number that is not finite leaves, as in an answer to a request

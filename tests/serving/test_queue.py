@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import math
 import threading
+import weakref
 from collections.abc import Callable, Coroutine, Iterator
 from functools import partial
 from time import monotonic, sleep, thread_time
@@ -99,6 +101,36 @@ async def test_one_failure_is_one_request_s(queue: WorkQueue, ask: Any) -> None:
     assert isinstance(results[0], ZeroDivisionError)
     assert results[1].result == "fine"
     assert queue.backlog == 0
+
+
+@pytest.mark.parametrize("ask", WAYS)
+async def test_a_failure_keeps_nothing_of_its_request(queue: WorkQueue, ask: Any) -> None:
+    """No cycle does: bodies of megabytes would wait for the collector."""
+
+    class Body:
+        pass
+
+    async def fail() -> weakref.ref[Body]:
+        body = Body()
+
+        def broken() -> None:
+            raise ZeroDivisionError(id(body))
+
+        with pytest.raises(ZeroDivisionError):
+            await ask(queue, broken)
+        return weakref.ref(body)
+
+    gc.disable()
+    try:
+        found = await fail()
+        # A worker thread lets go of its last call a moment later.
+        for _ in range(100):
+            await asyncio.sleep(0.01)
+            if found() is None:
+                break
+        assert found() is None
+    finally:
+        gc.enable()
 
 
 async def test_questions_are_counted_until_they_are_answered_and_drawings_are_not(
