@@ -184,6 +184,9 @@ class SceneRequest(Request):
         list[Relation] | None,
         Field(
             max_length=MAX_RELATIONS,
+            # Of so many, each wrong in many ways: a list of all faults would take a hundred times
+            # the memory of the request.
+            fail_fast=True,
             description="relations that hold; whatever is not listed is unobserved, unless "
             "`relations_complete`. Left out, they are derived from positions; an empty list says "
             "that none is known and derives none",
@@ -221,7 +224,9 @@ class RelationsOptions(Request):
     ] = 0.0
     pairs: Annotated[
         list[Pair] | None,
-        Field(min_length=1, max_length=4096, description="only these ordered pairs"),
+        Field(
+            min_length=1, max_length=4096, fail_fast=True, description="only these ordered pairs"
+        ),
     ] = None
     include_opposites: Annotated[
         bool, Field(description="also report right, behind, under and below")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Coroutine
 from email.message import Message
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 from fastapi.routing import APIRoute
 from pydantic_core import from_json
@@ -14,6 +14,11 @@ from starlette.responses import Response
 
 from app.api import catalogue
 from app.api.problems import ProblemError
+from app.schemas import FieldError
+
+MAX_MEMBERS: Final = 32
+"""No object of any request has as many fields, and every field that is unknown is a fault to tell:
+a hundred times the memory of the request."""
 
 
 def parse(body: bytes) -> Any:
@@ -23,12 +28,17 @@ def parse(body: bytes) -> Any:
     deeper than 200, integers of more than 4,300 digits, and a member name used twice in one object.
 
     Raises:
-        ProblemError: of kind `catalogue.NOT_JSON`.
+        ProblemError: of kind `catalogue.NOT_JSON`; or `catalogue.INVALID_REQUEST`, where an object
+            has more than `MAX_MEMBERS`.
     """
     try:
         # The strict parser judges; the lenient one, which alone can see repeated names, reads.
         from_json(body, allow_inf_nan=False)
         return json.loads(body, object_pairs_hook=_members)
+    except _TooManyMembersError:
+        detail = f"An object has more than {MAX_MEMBERS} members."
+        errors = [FieldError(pointer="#", message=detail)]
+        raise ProblemError(catalogue.INVALID_REQUEST, detail, errors=errors) from None
     except ValueError as error:
         raise _not_json(_reason(error)) from None
 
@@ -37,7 +47,13 @@ class _RepeatedNameError(ValueError):
     pass
 
 
+class _TooManyMembersError(ValueError):
+    pass
+
+
 def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(pairs) > MAX_MEMBERS:
+        raise _TooManyMembersError
     members = dict(pairs)
     if len(members) != len(pairs):
         raise _RepeatedNameError

@@ -277,7 +277,7 @@ class Client {
       }
       if (attempt >= retries || pause >= ends - Clock::now()) {
         if (problem) throw *problem;
-        throw UnreachableError(address_.server + ": " + outcome.reason);
+        throw UnreachableError("no service: " + address_.server + ": " + outcome.reason);
       }
       std::this_thread::sleep_for(pause);
     }

@@ -339,6 +339,17 @@ def nonsense() -> Iterator[Hostile]:
             },
             {422},
         ),
+        "relations full of what nobody knows": (
+            {
+                "objects": names,
+                "relations": [
+                    {"subject": "bed", "relation": "left", "object": "lamp"}
+                    | {f"{k:x}": 0 for k in range(29)}
+                ]
+                * 4096,
+            },
+            {422},
+        ),
         "complete and none": ({"objects": names, "relations_complete": True}, {422}),
         "all relations": (
             {

@@ -283,6 +283,24 @@ async def test_what_does_not_fit_is_pointed_at(
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
+async def test_no_body_has_more_faults_than_it_is_long(
+    client: httpx.AsyncClient, question: str
+) -> None:
+    unknown = {f"u{k}": 0 for k in range(29)}
+    triple = {"subject": "bed", "relation": "left", "object": "lamp"}
+    body = {"objects": ["bed", "lamp"], "relations": [triple, triple | unknown] * 2048}
+    document = problem(await post(client, json.dumps(body), f"/{question}"), 422, "invalid-request")
+    # Those of the first that does not fit, and of no other.
+    assert [error["pointer"] for error in document["errors"]] == [
+        f"#/relations/1/{name}" for name in unknown
+    ]
+    body = {"objects": [{"label": "bed"} | unknown | {f"v{k}": 0 for k in range(3)}]}
+    document = problem(await post(client, json.dumps(body), f"/{question}"), 422, "invalid-request")
+    assert [error["pointer"] for error in document["errors"]] == ["#"]
+    assert "32 members" in document["detail"]
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
 async def test_contradictions_are_refused(client: httpx.AsyncClient, question: str) -> None:
     for second in (("bed", "right", "lamp"), ("lamp", "left", "bed"), ("bed", "front", "bed")):
         triples = [("bed", "left", "lamp"), second]
