@@ -9,11 +9,15 @@ every process compiles for itself.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any, Final, TypeAlias
 
+from llvmlite.binding import parse_bitcode
 from numba import njit
 
 Function: TypeAlias = Callable[..., Any]
+
+_LOOPS: Final[list[Any]] = []
 
 # Sums may be taken in any order, so that the compiler can take eight terms at a time. It chooses
 # one order, once.
@@ -46,4 +50,22 @@ def _compile(function: Function, options: dict[str, Any]) -> Function:
         found: Function = njit(cache=True, **options)(function)
     except RuntimeError:  # no directory for the cache
         found = njit(**options)(function)
+    _LOOPS.append(found)
     return found
+
+
+def pack() -> None:
+    """Keep the intermediate code of loops that were loaded from disk as it was there: packed.
+
+    numba unpacks it with every loop, and uses it only where another that calls the loop is compiled
+    later; for those of the service it takes 25 MB. There is no public way to say so: where a later
+    numba has other names for it nothing happens.
+    """
+    for loop in _LOOPS:
+        for version in loop.overloads.values():
+            library = version.library
+            unpacked = getattr(library, "_shared_module", None)
+            # That of a loop which this process has compiled is its only code.
+            if unpacked is not None and unpacked is not library._final_module:
+                library._get_module_for_linking = partial(parse_bitcode, unpacked.as_bitcode())
+                library._shared_module = None

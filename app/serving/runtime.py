@@ -14,6 +14,7 @@ from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 import torch
 
+from app.compiling import pack
 from app.registry import AliasTarget, Store, StoreError, load_model_set
 from app.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 from app.serving.errors import (
@@ -337,6 +338,7 @@ def _settle_memory() -> None:
     collector sits out, there is none. Pages that loading has left empty go back to the system,
     where the C library can do that: some 30 MB.
     """
+    pack()
     gc.unfreeze()
     if gc.isenabled():
         gc.collect()
