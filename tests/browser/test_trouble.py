@@ -157,3 +157,19 @@ def test_a_service_with_a_key_is_asked_with_it(
         guarded.client.close()
         guarded.process.kill()
         guarded.process.wait()
+
+
+def test_what_is_answered_behind_another_tab_is_no_longer_awaited(open_board: OpenBoard) -> None:
+    page = open_board().page
+    held: list[Route] = []
+    page.route("**/relations", lambda route: held.append(route))
+    box = page.get_by_role("combobox", name="Add an object")
+    box.fill("lamp")
+    box.press("Enter")
+    awaited = page.locator("article[aria-busy=true]")
+    expect(awaited).to_have_count(1)
+    page.get_by_role("tab", name="Wrong").click()
+    expect(page.get_by_role("tab", name="Wrong")).to_have_attribute("aria-selected", "true")
+    expect(awaited).to_have_count(1)
+    held[0].continue_()
+    expect(awaited).to_have_count(0)

@@ -153,7 +153,6 @@ export function createColumns(store, parents, askKey) {
     own.title.textContent = answer ? `${answer.model.name} ${answer.model.version}` : model;
     own.show.hidden = !state.models[1];
     own.show.setAttribute('aria-pressed', String(state.shown === column));
-    own.node.setAttribute('aria-busy', String(status === 'asking'));
     own.problem.hidden = !problem;
     if (problem && own.told !== problem) {
       own.problem.replaceChildren(...problemWords(problem, entry.body), ...(problem.status === 401 ? [askKey()] : []));
@@ -170,8 +169,12 @@ export function createColumns(store, parents, askKey) {
   return (state, previous) => {
     if (!changed(state, previous, ...SEEN)) return;
     for (const question of QUESTIONS) {
-      if (question !== state.tab && state.tab === previous.tab) continue;
-      for (const column of [0, 1]) draw(state, question, column);
+      for (const column of [0, 1]) {
+        const busy = state.answers[column][question]?.status === 'asking';
+        made.get(`${column}/${question}`).node.setAttribute('aria-busy', String(busy));
+        // What is not looked at is drawn when it will be.
+        if (question === state.tab || state.tab !== previous.tab) draw(state, question, column);
+      }
     }
   };
 }
