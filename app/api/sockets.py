@@ -67,6 +67,7 @@ class GuardedSocket(WebSocketsSansIOProtocol):
         self.conn = Handshakes(max_size=self.config.ws_max_size)
         self._unread: asyncio.TimerHandle | None = None
         self._lingering: asyncio.TimerHandle | None = None
+        self._parted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Let little be on its way to a client that does not read."""
@@ -111,6 +112,8 @@ class GuardedSocket(WebSocketsSansIOProtocol):
 
     def handle_ping(self) -> None:
         """Answer, unless the client reads no answers."""
+        if self._parted:
+            return
         if self._unread is None:
             super().handle_ping()
         else:
@@ -132,12 +135,36 @@ class GuardedSocket(WebSocketsSansIOProtocol):
         else:
             super().send_receive_event_to_app()
 
+    def handle_parser_exception(self) -> None:
+        """What came is too long, or no WebSocket's."""
+        self._part()
+
     def _fail(self, code: int, reason: str) -> None:
         self.frames = []
         self.conn.fail(code, reason)
+        self._part()
+
+    def _part(self) -> None:
+        """Say why, and let the client read it: its messages are discarded until it has.
+
+        A socket that is closed while there is something to be read takes back what it sent.
+        """
+        close = self.conn.close_sent
+        if self._parted or close is None:
+            return
+        self._parted = True
         self.transport.write(b"".join(self.conn.data_to_send()))
-        self.close_sent = True
-        self.transport.close()
+        if not self.close_sent:
+            self.queue.put_nowait(
+                {"type": "websocket.disconnect", "code": close.code, "reason": close.reason}
+            )
+        self.close_sent = self.disconnected = True
+        if not self.transport.can_write_eof():
+            self.transport.close()
+            return
+        self.transport.write_eof()
+        if self.close_timer is None:
+            self.close_timer = self.loop.call_later(self.patience, self.transport.abort)
 
 
 def _is_text(data: bytes) -> bool:

@@ -491,6 +491,32 @@ def test_a_message_may_not_come_in_endless_pieces(guarded: LiveService) -> None:
         assert closed(stream)[0] == 1008
 
 
+def test_who_goes_on_after_the_farewell_is_cut_off(guarded: LiveService) -> None:
+    """He has time to read it, and no more: what he sends meanwhile is discarded."""
+    handshake = (
+        f"GET /stream HTTP/1.1\r\nHost: x\r\nX-API-Key: {API_KEY}\r\nConnection: Upgrade\r\n"
+        "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", guarded.port), timeout=30) as connection:
+        connection.sendall(handshake.encode())
+        assert connection.recv(4096).startswith(b"HTTP/1.1 101 ")
+        # A text that goes on, and pieces of nothing; each with a mask, as a client's have.
+        connection.sendall(b"\x01\x80\0\0\0\0" + b"\x00\x80\0\0\0\0" * 2000)
+        told = b""
+        while part := connection.recv(4096):
+            told += part
+        assert told[:4] == b"\x88\x14" + (1008).to_bytes(2, "big")
+        began = time.monotonic()
+        with suppress(ConnectionError):
+            while time.monotonic() - began < 30:
+                connection.sendall(b"\x89\x80\0\0\0\0" * 100)
+                time.sleep(0.01)
+            pytest.fail("he is still there")
+        assert time.monotonic() - began > 1
+    assert "Traceback" not in guarded.log.read_text()
+
+
 def test_a_text_frame_that_is_no_text_ends_the_stream(guarded: LiveService) -> None:
     with opened(guarded, additional_headers=KEY) as stream:
         talk(stream, "open")
