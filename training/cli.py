@@ -242,9 +242,9 @@ def _train(
         with Display(trainer, console, tensorboard) as display:
             result = trainer.run(display.progress, display.ended)
     except KeyboardInterrupt:
-        console.print(
-            f"stopped after epoch {len(trainer.epochs)}; the same command goes on from there"
-        )
+        # As the next run will find it: the last epoch may have ended and not been kept.
+        kept = len(trainer.epochs) if trainer.resume() else 0
+        console.print(f"stopped after epoch {kept}; the same command goes on from there")
         raise typer.Exit(130) from None
     save_run(folder, config, result, data=root, scenes=scenes.digest)
     summarise(result, trainer, folder, console)

@@ -11,11 +11,15 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from typer.testing import CliRunner
 
+from training.checkpoints import save_checkpoint
+from training.cli import app
 from training.config import Config
 from training.curves import Epoch
 from training.live import Display, sparkline, summarise
@@ -88,6 +92,26 @@ def test_nobody_who_asks_for_no_logs_waits_for_tensorboard() -> None:
 
 def epochs_of(curve: Path) -> int:
     return len(curve.read_text().splitlines()) - 1 if curve.exists() else 0
+
+
+@pytest.mark.parametrize("kept", [0, 2])
+def test_ctrl_c_while_an_epoch_is_kept_counts_those_that_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int
+) -> None:
+    config = tmp_path / "live.toml"
+    config.write_text(CONFIG.format(epochs=4))
+    saved: list[Path] = []
+
+    def save(path: Path, state: dict[str, Any]) -> None:
+        if len(saved) == kept:
+            raise KeyboardInterrupt
+        saved.append(path)
+        save_checkpoint(path, state)
+
+    monkeypatch.setattr("training.trainer.save_checkpoint", save)
+    result = CliRunner().invoke(app, ["train", str(config), "--runs", str(tmp_path)])
+    assert result.exit_code == 130
+    assert f"stopped after epoch {kept};" in " ".join(result.output.split())
 
 
 @pytest.mark.slow
