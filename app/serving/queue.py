@@ -15,10 +15,11 @@ A job whose deadline has passed, or whose client has gone, is dropped when its t
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import asynccontextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, thread_time
@@ -212,7 +213,7 @@ class WorkQueue:
         self.backlog += counted
         try:
             if self._costs.expected(kind, size) > CHEAP:
-                async with self.threads.turn if gives_way else nullcontext():
+                async with _turn(self.threads.turn, ticket) if gives_way else nullcontext():
                     return await _in_thread(lambda _: learnt(), ticket, self.threads.costly)
             line = self._giving_way if gives_way else self._waiting
             return await self._in_tick(learnt, ticket, line)
@@ -261,6 +262,20 @@ class WorkQueue:
                 asyncio.get_running_loop().call_soon(self._drain)
                 return
         self._draining = False
+
+
+@asynccontextmanager
+async def _turn(lock: asyncio.Lock, ticket: Ticket) -> AsyncIterator[None]:
+    """The turn of one that gives way, if it comes before the deadline."""
+    left = ticket.deadline - monotonic()
+    try:
+        await asyncio.wait_for(lock.acquire(), left if left < math.inf else None)
+    except TimeoutError:
+        raise DeadlinePassedError("The deadline passed before the answer was begun.") from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 async def _in_thread(

@@ -191,6 +191,24 @@ async def test_costly_questions_of_streams_let_requests_go_first(queue: WorkQueu
     assert order == ["stream 1", "request", "stream 2", "stream 3"]
 
 
+async def test_nobody_waits_past_the_deadline_for_a_turn(queue: WorkQueue) -> None:
+    release = threading.Event()
+
+    def ask(call: Call, ticket: Ticket) -> asyncio.Future[Any]:
+        run = queue.run(call, ticket, kind="costly", size=1, gives_way=True)
+        return asyncio.ensure_future(run)
+
+    first = ask(lambda: release.wait(30), ENDLESS)
+    await asyncio.sleep(0)
+    with pytest.raises(DeadlinePassedError):
+        await ask(lambda: pytest.fail("begun"), Ticket(monotonic() + 0.05))
+    assert not first.done()
+    release.set()
+    await first
+    # Nobody has kept the turn.
+    assert (await ask(lambda: "fine", ENDLESS)).result == "fine"
+
+
 async def test_nobody_who_asks_waits_for_a_drawing(queue: WorkQueue) -> None:
     release = threading.Event()
     drawing = asyncio.ensure_future(drawn(queue, lambda: release.wait(30)))
