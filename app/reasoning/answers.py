@@ -19,12 +19,18 @@ def entries(kind: type[TupleT], *columns: Iterable[Any]) -> list[TupleT]:
 
 
 class RelationAnswer(NamedTuple):
-    """`subject` stands in `relation` to `object`; probability that an annotator would list it."""
+    """`subject` stands in `relation` to `object`.
+
+    Attributes:
+        probability: that the relation holds, given that both are in the scene.
+        observed: the scene states it, or its poses show it.
+    """
 
     subject: int
     relation: str
     object: int
     probability: float
+    observed: bool = False
 
 
 class Offset(NamedTuple):
@@ -102,7 +108,9 @@ class OutlierAnswer(NamedTuple):
         probability: that it is an intruder, where half of the scenes are clean.
         log_odds: of its class being present given the rest of the scene.
         is_outlier: the probability reaches the threshold.
-        because: the objects that change its log-odds most, strongest first.
+        because: the objects that make it unlikely, strongest first; of one that fits, those that
+            make it likely.
+        usually_with: absent classes that would make it likely, at most three; of outliers only.
     """
 
     object: int
@@ -111,6 +119,7 @@ class OutlierAnswer(NamedTuple):
     log_odds: float
     is_outlier: bool
     because: tuple[Because, ...]
+    usually_with: tuple[str, ...] = ()
 
 
 class MisplacedAnswer(NamedTuple):
@@ -120,6 +129,7 @@ class MisplacedAnswer(NamedTuple):
     relation: str
     object: int
     probability: float
+    is_misplaced: bool = False
 
 
 @dataclass(frozen=True, slots=True)

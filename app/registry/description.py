@@ -73,12 +73,42 @@ class Slope(Frozen):
     slope: float = 1.0
 
 
+class Thresholds(Frozen):
+    """Probabilities from which an alarm is raised, by sensitivity."""
+
+    low: Annotated[float, Field(ge=0, le=1)] = 0.5
+    medium: Annotated[float, Field(ge=0, le=1)] = 0.5
+    high: Annotated[float, Field(ge=0, le=1)] = 0.5
+
+
+class EvidenceWeights(Frozen):
+    """How strongly given relations pull the context, by kind of evidence and of question.
+
+    Attributes:
+        relations_on_objects, relations_on_relations: relations that a request states.
+        poses_on_objects, poses_on_relations: relations derived from positions.
+    """
+
+    relations_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
+    relations_on_relations: Annotated[float, Field(ge=0, le=1)] = 1.0
+    poses_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
+    poses_on_relations: Annotated[float, Field(ge=0, le=1)] = 1.0
+
+
 class Calibration(Frozen):
     """How a machine's log-odds become the probabilities that the service promises.
 
     The defaults change nothing.
 
     Attributes:
+        coverage: probability that a class which is present is listed, unless a request says.
+        missing: posterior log-odds of an unlisted class to the calibrated ones; n counts the listed
+            classes.
+        evidence: see `EvidenceWeights`.
+        popularity: (V,) log-odds of finding each class in a training scene; empty: all alike.
+        popularity_weight: alpha of the prior of an intruder, proportional to popularity^alpha.
+        outlier_thresholds: probabilities from which an object is an outlier.
+        misplaced_thresholds: probabilities from which a relation is misplaced.
         missing_temperature: divides the log-odds before the softmax over absent classes.
         placed_temperature: the same where the question names a place.
         placed_relation_weight: weight of the relation's log-odds in that question.
@@ -90,6 +120,13 @@ class Calibration(Frozen):
         misplaced: relation log-odds to the log-odds of being false.
     """
 
+    coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
+    missing: CountSlope = CountSlope()
+    evidence: EvidenceWeights = EvidenceWeights()
+    popularity: tuple[float, ...] = ()
+    popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
+    outlier_thresholds: Thresholds = Thresholds()
+    misplaced_thresholds: Thresholds = Thresholds()
     missing_temperature: Annotated[float, Field(gt=0)] = 1.0
     placed_temperature: Annotated[float, Field(gt=0)] = 1.0
     placed_relation_weight: float = 1.0
