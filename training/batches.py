@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +27,11 @@ class Batch:
         classes, counts: (B, n) int64, classes -1 where padded, counts 0 where nobody counted.
         holds, observed: (B, A, n, n) relations between those classes.
         room: (B,) int64, -1 where nobody said.
+        source: (B,) int64 index into the source names of the scene tensors.
+        weight: (B,) what a scene counts for in object learning.
+        complete: (B,) bool, its object list is nearly the whole scene.
+
+    The last three default to source 0, weight 1 and complete.
     """
 
     v: Tensor
@@ -34,6 +40,14 @@ class Batch:
     holds: Tensor
     observed: Tensor
     room: Tensor
+    source: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    weight: Tensor = field(default_factory=lambda: torch.ones(0))
+    complete: Tensor = field(default_factory=lambda: torch.ones(0, dtype=torch.bool))
+
+    def __post_init__(self) -> None:
+        for name, value in (("source", 0), ("weight", 1), ("complete", 1)):
+            if not len(tensor := getattr(self, name)):
+                object.__setattr__(self, name, tensor.new_full((len(self.v),), value))
 
     def __len__(self) -> int:
         return len(self.v)
@@ -49,8 +63,11 @@ class SceneTensors:
 
     Attributes:
         scenes: the encoded scenes.
-        v: (N, V); room: (N,); source: (N,) int64 index into annotated_classes.
+        v: (N, V); room: (N,); source: (N,) int64 index into annotated_classes and source_names.
         annotated_classes: (sources, V) bool.
+        source_names: sorted names of the sources.
+        weight: (N,) what a scene counts for in object learning.
+        complete: (N,) bool, the object list of a scene is nearly the whole scene.
     """
 
     scenes: Sequence[EncodedScene]
@@ -58,6 +75,15 @@ class SceneTensors:
     room: Tensor
     source: Tensor
     annotated_classes: Tensor
+    source_names: tuple[str, ...] = ()
+
+    @cached_property
+    def weight(self) -> Tensor:
+        return torch.tensor([scene.weight for scene in self.scenes], dtype=torch.float32)
+
+    @cached_property
+    def complete(self) -> Tensor:
+        return torch.tensor([scene.complete for scene in self.scenes], dtype=torch.bool)
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -82,6 +108,9 @@ class SceneTensors:
             holds=torch.from_numpy(holds),
             observed=torch.from_numpy(observed),
             room=self.room[index],
+            source=self.source[index],
+            weight=self.weight[index],
+            complete=self.complete[index],
         )
 
 
@@ -109,6 +138,7 @@ def scene_tensors(
         room=torch.tensor([scene.room_type for scene in scenes], dtype=torch.int64),
         source=torch.tensor([names.index(scene.source) for scene in scenes], dtype=torch.int64),
         annotated_classes=torch.from_numpy(np.stack([annotated[name] for name in names])),
+        source_names=tuple(names),
     )
 
 

@@ -98,7 +98,9 @@ class SplitScenes:
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
-    """The scenes of every source under its name: of a file, or of `<source>.jsonl.gz` in `root`.
+    """The scenes of every source under its name.
+
+    A source is a file, or `<source>.jsonl.gz` in `root` or in its folder `extra`.
 
     Raises:
         ConfigError: there is no such file.
@@ -111,6 +113,9 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
             found = generate_rooms(data.rooms, seed=data.split_seed)
         else:
             path = root / (source if is_file(source) else f"{source}.jsonl.gz")
+            extra = root / "extra" / path.name
+            if not is_file(source) and not path.is_file() and extra.is_file():
+                path = extra
             if not path.is_file():
                 raise ConfigError(
                     f"there is no {path.name} in {path.parent}: name its folder with --data"

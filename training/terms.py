@@ -38,6 +38,37 @@ TERMS: dict[str, Terms] = {
         "research use",
         research_only=True,
     ),
+    "nr3d": Terms(
+        "Nr3D (Achlioptas et al., ECCV 2020): triples from descriptions of ScanNet rooms; "
+        "research use",
+        research_only=True,
+    ),
+    "coco_captions": Terms(
+        "COCO captions (Lin et al., ECCV 2014): triples from captions of indoor pictures; "
+        "CC BY 4.0",
+        research_only=False,
+    ),
+    "reverie_text": Terms(
+        "REVERIE (Qi et al., CVPR 2020): triples from instructions for Matterport houses; "
+        "non-commercial use",
+        research_only=True,
+    ),
+    "alfred": Terms(
+        "ALFRED (Shridhar et al., CVPR 2020): AI2-THOR rooms and triples from instructions; MIT",
+        research_only=False,
+    ),
+    "bddl_goal": Terms(
+        "BEHAVIOR-1K (Li et al., CoRL 2022): end states of household activities; MIT",
+        research_only=False,
+    ),
+    "behavior1k_rooms": Terms(
+        "BEHAVIOR-1K (Li et al., CoRL 2022): object lists of rooms; MIT", research_only=False
+    ),
+    "vsr": Terms(
+        "Visual Spatial Reasoning (Liu, Emerson, Collier, TACL 2023): voted relations in "
+        "photographs; Apache-2.0",
+        research_only=False,
+    ),
     "rooms": Terms(
         "Rooms made by this project's own generator; no restriction", research_only=False
     ),

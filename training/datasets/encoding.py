@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,12 +23,14 @@ from app.scene import (
     to_viewer_frame,
 )
 from training.datasets.image_plane import derive_from_boxes
+from training.datasets.meanings import Meaning, meaning_of
 from training.datasets.names import Names, curated_names
 from training.datasets.records import AnnotatedObject, AnnotatedScene
 from training.datasets.viewpoints import room_viewpoint
 
 A = len(CANONICAL)
 _ON_TOP: Final = CANONICAL.index("on-top")
+_VERTICAL: Final = [_ON_TOP, CANONICAL.index("above")]
 
 # Labels that a source annotates so incompletely that they say nothing there.
 LEFT_OUT: Final[dict[str, tuple[str, ...]]] = {"sunrgbd": ("wall", "floor")}
@@ -51,6 +54,8 @@ class EncodedScene:
         unknown: distinct labels outside the vocabulary, which are left out.
         instance_positions: (N, 3) centres in metres in the viewer axes that the relations were
             derived in, NaN where unknown; None where relations do not come from positions.
+        weight: what the scene counts for in object learning.
+        complete: its object list is nearly the whole scene, see `Meaning`.
     """
 
     scene_id: str
@@ -63,25 +68,31 @@ class EncodedScene:
     instance_observed: NDArray[np.bool_]
     unknown: int
     instance_positions: NDArray[np.float64] | None = None
+    weight: float = 1.0
+    complete: bool = True
 
 
 def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[EncodedScene]:
     """Encode scenes.
 
-    What is observed depends on how a scene was annotated:
+    Observed relations are known to hold or known not to hold. They come from the best annotation of
+    a scene:
 
-    - relations by people: every pair of instances; what is not listed is off, in the sense that the
-      annotator would not list it; what is listed both ways round is unobserved;
-    - positions: what `app.scene.geometry` derives, from `room_viewpoint` where the axes are not a
-      viewer's; support links count as on-top, and then nothing else holds of the pair;
-    - boxes in an image: what `training.datasets.image_plane` derives;
+    - listed relations; a relation listed in both directions is unobserved;
+    - positions: the rules of `app.scene.geometry`, from `room_viewpoint` where the axes are not a
+      viewer's; a support link is on-top, and the other relations of its pair are off;
+    - boxes in an image: the rule of `training.datasets.image_plane`;
     - otherwise support links alone, or nothing.
+
+    `training.datasets.meanings` says which unlisted relations of a source are off.
 
     Relations of structure classes are dropped: neither on nor off. Labels in `LEFT_OUT` are treated
     as if they had not been annotated.
     """
     encoder = _Encoder(vocabulary, curated_names())
-    return [encoder(scene) for scene in scenes]
+    every = list(scenes)
+    groups = Counter((scene.source, scene.group) for scene in every)
+    return [encoder(scene, groups[scene.source, scene.group]) for scene in every]
 
 
 def annotated_classes(
@@ -116,11 +127,12 @@ class _Encoder:
             for source, labels in LEFT_OUT.items()
         }
 
-    def __call__(self, scene: AnnotatedScene) -> EncodedScene:
+    def __call__(self, scene: AnnotatedScene, group_size: int) -> EncodedScene:
+        meaning = meaning_of(scene.source, listed=scene.relations is not None)
         left_out = self.left_out.get(scene.source, frozenset())
         classes = [self._index(thing.label) for thing in scene.objects]
         kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
-        relations, positions = _relations(scene)
+        relations, positions = _relations(scene, meaning)
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
         instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
@@ -131,14 +143,17 @@ class _Encoder:
             array[:, :, structure] = False
         room = self.names.canonical_room(scene.room_type)
         room_type = None if room is None else self.vocabulary.room_index(room)
+        evidence = pool_instances(instance_classes, np.ones(len(kept)), holds, observed, room_type)
+        if any(thing.count > 1 for thing in scene.objects):
+            alike = [scene.objects[i].count for i in kept]
+            evidence = replace(evidence, counts=_counts(evidence, instance_classes, alike))
+        share = (meaning.scenes_per_group or group_size) / group_size
         return EncodedScene(
             scene_id=scene.scene_id,
             source=scene.source,
             group=scene.group,
             room_type=-1 if room_type is None else room_type,
-            evidence=pool_instances(
-                instance_classes, np.ones(len(kept)), holds, observed, room_type
-            ),
+            evidence=evidence,
             instance_classes=instance_classes,
             instance_holds=holds,
             instance_observed=observed,
@@ -150,6 +165,8 @@ class _Encoder:
                 }
             ),
             instance_positions=None if positions is None else positions[kept],
+            weight=min(1.0, share),
+            complete=meaning.complete_objects,
         )
 
     def _index(self, label: str) -> int | None:
@@ -158,31 +175,79 @@ class _Encoder:
         return self.indices[label]
 
 
-def _relations(scene: AnnotatedScene) -> tuple[PoseRelations, NDArray[np.float64] | None]:
+def _counts(
+    evidence: ClassEvidence, classes: NDArray[np.int64], alike: Sequence[int]
+) -> NDArray[np.int64]:
+    """Instances of each class, where one entry may stand for several."""
+    counts = np.zeros_like(evidence.counts)
+    np.add.at(counts, np.searchsorted(evidence.classes, classes), alike)
+    return counts
+
+
+def _relations(
+    scene: AnnotatedScene, meaning: Meaning
+) -> tuple[PoseRelations, NDArray[np.float64] | None]:
     """Relations between all instances of a scene, by the best annotation there is.
 
     Returns:
         Them, and the positions (n, 3) that they were derived from, if they were.
     """
-    n = len(scene.objects)
     positions = None
     if scene.relations is not None:
-        holds = np.zeros((A, n, n), dtype=np.bool_)
-        for subject, relation, anchor in scene.relations:
-            holds[canonicalise(subject, relation, anchor)] = True
-        # Who says that each is in front of the other has said nothing.
-        both = holds & holds.swapaxes(1, 2)
-        return PoseRelations(holds & ~both, ~both & ~np.eye(n, dtype=np.bool_)), None
+        return _from_lists(scene, scene.relations, meaning), None
     if any(thing.position is not None for thing in scene.objects):
         found, positions = _from_poses(scene)
+        _close_poses(found, scene.objects, meaning)
     elif any(thing.box2d is not None for thing in scene.objects):
         boxes = [thing.box2d or (math.nan,) * 4 for thing in scene.objects]
         found = derive_from_boxes(boxes)
     else:
-        nothing = np.zeros((A, n, n), dtype=np.bool_)
+        nothing = np.zeros((A, len(scene.objects), len(scene.objects)), dtype=np.bool_)
         found = PoseRelations(nothing, nothing.copy())
     _add_supports(found, scene.objects)
+    for subject, relation, anchor in scene.false_relations:
+        denied = canonicalise(subject, relation, anchor)
+        found.holds[denied], found.observed[denied] = False, True
     return found, positions
+
+
+def _from_lists(
+    scene: AnnotatedScene, listed: Sequence[tuple[int, str, int]], meaning: Meaning
+) -> PoseRelations:
+    """Listed and denied relations, and the unlisted ones that are off by the source's meaning."""
+    n = len(scene.objects)
+    holds, denied = np.zeros((2, A, n, n), dtype=np.bool_)
+    for relations, array in ((listed, holds), (scene.false_relations, denied)):
+        for subject, relation, anchor in relations:
+            array[canonicalise(subject, relation, anchor)] = True
+    # Two opposite statements cancel: both directions, or listed and denied.
+    contradicted = (holds & holds.swapaxes(1, 2)) | (holds & denied)
+    related = holds.any(0)
+    masks = {
+        "off": np.ones((n, n), dtype=np.bool_),
+        "off for neighbours": related | related.T,
+        "unobserved": np.zeros((n, n), dtype=np.bool_),
+    }
+    holds &= ~contradicted
+    observed = np.stack([masks[kind] for kind in meaning.unlisted]) | holds | denied
+    stacked = holds[_VERTICAL].any(0)
+    observed[_VERTICAL] |= stacked | stacked.T
+    return PoseRelations(holds, observed & ~contradicted & ~np.eye(n, dtype=np.bool_))
+
+
+def _close_poses(
+    found: PoseRelations, objects: Sequence[AnnotatedObject], meaning: Meaning
+) -> None:
+    """Extend or restrict the observed relations of neighbours to the source's meaning."""
+    located = np.array([thing.position is not None for thing in objects])
+    sized = located & np.array([thing.size is not None for thing in objects])
+    for relation, unlisted in enumerate(meaning.unlisted):
+        if unlisted == "off":
+            known = sized if relation in _VERTICAL else located
+            pairs = known[:, None] & known & ~np.eye(len(objects), dtype=np.bool_)
+            found.observed[relation] |= pairs
+        elif unlisted == "unobserved":
+            found.observed[relation] &= found.holds[relation]
 
 
 def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, NDArray[np.float64]]:

@@ -2,8 +2,12 @@
 
 One scene a line: ``scene_id``, ``source``, ``group``, ``room_type`` (or null), ``objects``
 [{``id``, ``label``, ``position``?, ``size``?, ``yaw``?, ``supported_by``?, ``box2d``?}],
-``relations`` [[subject id, predicate, object id]] or null where nobody annotated any, and
-``viewer_frame``? (true where positions are in viewer axes: x away, y left, z up).
+``relations`` [[subject id, predicate, object id]] or null where nobody annotated any,
+``false_relations``? (the same form: relations that do not hold), ``counts``? {label: instances}
+where one object stands for all instances of its label, and ``viewer_frame``? (true where positions
+are in viewer axes: x away, y left, z up).
+
+Lines are read up to `MAX_LINE` bytes, so that a small compressed file cannot fill the memory.
 """
 
 from __future__ import annotations
@@ -11,15 +15,21 @@ from __future__ import annotations
 import gzip
 import json
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from training.datasets.predicates import relation_of
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 
-_SCENE_FIELDS = {"scene_id", "source", "group", "room_type", "objects", "relations", "viewer_frame"}
+MAX_LINE: Final = 8 * 2**20
+
+_SCENE_FIELDS = {
+    *("scene_id", "source", "group", "room_type", "objects", "relations", "false_relations"),
+    *("counts", "viewer_frame"),
+}
 _OBJECT_FIELDS = {"id", "label", "position", "size", "yaw", "supported_by", "box2d"}
 
 # Sources recorded in viewer axes before the format could say so.
@@ -57,6 +67,8 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
             yield DatasetError(path, where, f"not JSON: {error}")
         except (ValueError, RecursionError) as error:
             yield DatasetError(path, where, str(error))
+        except OverflowError as error:
+            yield DatasetError(path, where, f"a number is out of range: {error}")
         else:
             first = seen.setdefault((scene.source, scene.scene_id), number)
             if first == number:
@@ -77,18 +89,26 @@ def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
 def _values(scene: AnnotatedScene) -> dict[str, Any]:
     ids = [thing.id for thing in scene.objects]
     relations = scene.relations
-    values = {
+    values: dict[str, Any] = {
         "scene_id": scene.scene_id,
         "source": scene.source,
         "group": scene.group,
         "room_type": scene.room_type,
         "objects": [
             # What nobody knows is left out.
-            {name: value for name, value in asdict(thing).items() if value is not None}
+            {
+                name: value
+                for name, value in asdict(thing).items()
+                if value is not None and name != "count"
+            }
             for thing in scene.objects
         ],
         "relations": None if relations is None else [[ids[s], r, ids[o]] for s, r, o in relations],
     }
+    if scene.false_relations:
+        values["false_relations"] = [[ids[s], r, ids[o]] for s, r, o in scene.false_relations]
+    if counts := {thing.label: thing.count for thing in scene.objects if thing.count > 1}:
+        values["counts"] = counts
     return values | ({"viewer_frame": True} if scene.viewer_frame else {})
 
 
@@ -97,7 +117,13 @@ def _lines(path: Path) -> Iterator[bytes]:
     opener = gzip.open if path.suffix == ".gz" else open
     try:
         with opener(path, "rb") as file:
-            yield from file
+            number = 0
+            while line := file.readline(MAX_LINE + 1):
+                number += 1
+                if len(line) > MAX_LINE:
+                    problem = f"is longer than {MAX_LINE // 2**20} MiB"
+                    raise DatasetError(path, f"line {number}", problem)
+                yield line
     except (OSError, EOFError, zlib.error) as error:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
 
@@ -108,7 +134,7 @@ def _scene(values: Any) -> AnnotatedScene:
     source = _text("source", values.get("source", "jsonl"))
     if not isinstance(values["objects"], list):
         raise ValueError("objects must be a list")
-    objects = tuple(_object(entry) for entry in values["objects"])
+    objects = _counted(tuple(_object(entry) for entry in values["objects"]), values.get("counts"))
     viewer_frame = values.get("viewer_frame", source in _VIEWER_SOURCES)
     if not isinstance(viewer_frame, bool):
         raise ValueError(f"viewer_frame must be true or false, not {viewer_frame!r}")
@@ -119,9 +145,27 @@ def _scene(values: Any) -> AnnotatedScene:
         group=_text("group", values.get("group", scene_id)),
         room_type=None if room_type is None else _text("room_type", room_type),
         objects=objects,
-        relations=_relations(values.get("relations"), source, objects),
+        relations=_relations("relations", values.get("relations"), source, objects),
         viewer_frame=viewer_frame,
+        false_relations=_relations(
+            "false_relations", values.get("false_relations"), source, objects
+        )
+        or (),
     )
+
+
+def _counted(objects: tuple[AnnotatedObject, ...], counts: Any) -> tuple[AnnotatedObject, ...]:
+    if counts is None:
+        return objects
+    if not isinstance(counts, Mapping):
+        raise ValueError("counts must be a mapping of labels to numbers, or null")
+    listed = Counter(thing.label for thing in objects)
+    for label, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int):
+            raise ValueError(f"the count of {label!r} must be an integer, not {count!r}")
+        if listed[label] != 1:
+            raise ValueError(f"counts has {label!r}, which {listed[label]} objects are called")
+    return tuple(replace(thing, count=counts.get(thing.label, 1)) for thing in objects)
 
 
 def _object(values: Any) -> AnnotatedObject:
@@ -142,12 +186,12 @@ def _object(values: Any) -> AnnotatedObject:
 
 
 def _relations(
-    values: Any, source: str, objects: tuple[AnnotatedObject, ...]
+    name: str, values: Any, source: str, objects: tuple[AnnotatedObject, ...]
 ) -> tuple[tuple[int, str, int], ...] | None:
     if values is None:
         return None
     if not isinstance(values, list):
-        raise ValueError("relations must be a list or null")
+        raise ValueError(f"{name} must be a list or null")
     place = {thing.id: index for index, thing in enumerate(objects)}
     found: dict[tuple[int, str, int], None] = {}
     for entry in values:

@@ -6,11 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from app.scene import RELATIONS
 
 Point = tuple[float, float, float]
 Box2d = tuple[float, float, float, float]
+
+MAX_COUNT: Final = 1_000_000
 
 
 class DatasetError(ValueError):
@@ -41,9 +44,10 @@ class AnnotatedObject:
         yaw: turn about z in radians.
         supported_by: id of the thing that carries it, or None.
         box2d: (xmin, ymin, xmax, ymax) in the image, y downwards, or None.
+        count: instances that this entry stands for.
 
     Raises:
-        ValueError: numbers that are not finite, or extents that are not positive.
+        ValueError: numbers that are not finite, or extents or a count that are not positive.
     """
 
     id: str
@@ -53,6 +57,7 @@ class AnnotatedObject:
     yaw: float = 0.0
     supported_by: str | None = None
     box2d: Box2d | None = None
+    count: int = 1
 
     def __post_init__(self) -> None:
         if not self.label:
@@ -70,6 +75,8 @@ class AnnotatedObject:
             )
         if not math.isfinite(self.yaw):
             raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
+        if not 1 <= self.count <= MAX_COUNT:
+            raise ValueError(f"count of {self.id!r} must be 1 to {MAX_COUNT}, not {self.count}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +93,7 @@ class AnnotatedScene:
             relations; None = nobody annotated any.
         viewer_frame: positions are in viewer axes; otherwise left and front mean nothing in them
             until a viewpoint is chosen.
+        false_relations: in the form of ``relations``, those that an annotator denied.
 
     Raises:
         ValueError: ids that are not distinct, or links and relations that point nowhere.
@@ -98,6 +106,7 @@ class AnnotatedScene:
     objects: tuple[AnnotatedObject, ...]
     relations: tuple[tuple[int, str, int], ...] | None = None
     viewer_frame: bool = False
+    false_relations: tuple[tuple[int, str, int], ...] = ()
 
     def __post_init__(self) -> None:
         ids = {thing.id for thing in self.objects}
@@ -106,7 +115,7 @@ class AnnotatedScene:
         for thing in self.objects:
             if thing.supported_by is not None and thing.supported_by not in ids:
                 raise ValueError(f"{thing.id!r} is supported by {thing.supported_by!r}: no such id")
-        for subject, relation, anchor in self.relations or ():
+        for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:
                 raise ValueError(f"unknown relation {relation!r}")
             for end in (subject, anchor):

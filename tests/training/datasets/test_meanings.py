@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from app.scene import ObjectClass, Vocabulary
+from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+from training.batches import scene_tensors
+from training.datasets import (
+    AnnotatedObject,
+    AnnotatedScene,
+    DatasetError,
+    EncodedScene,
+    annotated_classes,
+    encode,
+    jsonl,
+    read_scenes,
+)
+from training.datasets.meanings import BOXES, LISTS, MEANINGS, meaning_of
+from training.terms import TERMS
+
+VOCABULARY = Vocabulary([ObjectClass("desk"), ObjectClass("monitor"), ObjectClass("pencil")])
+LATERAL, VERTICAL = [LEFT, FRONT], [ON_TOP, ABOVE]
+CUBE = (0.2, 0.2, 0.2)
+
+
+def encoded(source: str, *objects: AnnotatedObject, **fields: Any) -> EncodedScene:
+    things = objects or tuple(AnnotatedObject(x, x) for x in ("desk", "monitor", "pencil"))
+    scene = AnnotatedScene("s", source, "g", None, things, viewer_frame=True, **fields)
+    (found,) = encode([scene], VOCABULARY)
+    return found
+
+
+def off(found: EncodedScene) -> set[tuple[int, int, int]]:
+    known = found.instance_observed & ~found.instance_holds
+    return {(int(a), int(i), int(j)) for a, i, j in np.argwhere(known)}
+
+
+@pytest.mark.parametrize("source", ["vrd", "nr3d", "coco_captions", "alfred", "bddl_goal"])
+def test_people_mention_few_of_the_relations_that_hold(source: str) -> None:
+    found = encoded(source, relations=((1, "on-top", 0), (2, "left", 1)))
+    assert np.argwhere(found.instance_holds).tolist() == [[LEFT, 2, 1], [ON_TOP, 1, 0]]
+    assert off(found) == {(ON_TOP, 0, 1), (ABOVE, 0, 1), (ABOVE, 1, 0)}
+
+
+def test_two_listed_vertical_relations_of_one_pair_both_hold() -> None:
+    found = encoded("nr3d", relations=((1, "on-top", 0), (1, "above", 0)))
+    assert found.instance_holds[VERTICAL, 1, 0].all()
+    assert off(found) == {(ON_TOP, 0, 1), (ABOVE, 0, 1)}
+
+
+def test_denied_relations_are_off() -> None:
+    found = encoded("vsr", relations=(), false_relations=((1, "under", 0), (2, "right", 0)))
+    assert off(found) == {(ON_TOP, 0, 1), (LEFT, 0, 2)}
+    assert not found.instance_holds.any()
+    # Nobody listed relations, somebody denied one.
+    assert off(encoded("robot", false_relations=((1, "on-top", 0),))) == {(ON_TOP, 1, 0)}
+
+
+def test_listed_and_denied_is_unobserved() -> None:
+    one = ((1, "on-top", 0),)
+    found = encoded("vsr", relations=one, false_relations=one)
+    assert not found.instance_observed.any()
+
+
+def test_3dssg_annotates_supports_throughout_and_sides_of_related_pairs() -> None:
+    found = encoded("3dssg", relations=((1, "on-top", 0), (2, "left", 0)))
+    pairs = ~np.eye(3, dtype=bool)
+    assert (found.instance_observed[ON_TOP] == pairs).all()
+    related = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=bool)
+    assert (found.instance_observed[LATERAL] == related).all()
+    assert np.argwhere(found.instance_observed[ABOVE]).tolist() == [[0, 1], [1, 0]]
+
+
+def test_lists_of_the_users_own_are_complete() -> None:
+    found = encoded("robot", relations=((1, "on-top", 0),))
+    assert (found.instance_observed == ~np.eye(3, dtype=bool)).all()
+    assert meaning_of("robot") is LISTS
+    assert meaning_of("robot", listed=False) is BOXES
+
+
+@pytest.mark.parametrize("source", ["procthor", "rooms", "robot"])
+def test_boxes_far_apart_are_not_stacked(source: str) -> None:
+    objects = (
+        AnnotatedObject("a", "desk", position=(0.0, 0.0, 0.5), size=CUBE),
+        AnnotatedObject("b", "monitor", position=(0.5, 0.0, 0.5), size=CUBE),
+        AnnotatedObject("c", "pencil", position=(9.0, 0.0, 0.5), size=CUBE),
+        AnnotatedObject("d", "pencil"),
+    )
+    observed = encoded(source, *objects).instance_observed
+    located = np.array([1, 1, 1, 0], dtype=bool)
+    assert (observed[VERTICAL] == (located[:, None] & located & ~np.eye(4, dtype=bool))).all()
+    assert np.argwhere(observed[LEFT]).tolist() == [[0, 1], [1, 0]]
+
+
+@pytest.mark.parametrize("source", ["sunrgbd_bedrooms_3d", "sunrgbd-bedroom-3d"])
+def test_centres_tell_left_and_front_alone(source: str) -> None:
+    objects = (
+        AnnotatedObject("a", "desk", position=(0.0, 0.0, 0.5)),
+        AnnotatedObject("b", "monitor", position=(0.5, 0.0, 0.5)),
+        AnnotatedObject("c", "pencil", position=(9.0, 0.0, 0.5)),
+    )
+    found = encoded(source, *objects)
+    assert (found.instance_observed[LATERAL] == ~np.eye(3, dtype=bool)).all()
+    assert not found.instance_observed[VERTICAL].any()
+    assert np.argwhere(found.instance_holds).tolist() == [[FRONT, 0, 1]]
+
+
+def test_a_floor_plan_counts_as_a_few_scenes() -> None:
+    things = (AnnotatedObject("0", "desk", count=4), AnnotatedObject("1", "pencil"))
+    scenes = [AnnotatedScene(f"s{k}", "alfred", f"g{k // 6}", None, things) for k in range(8)]
+    scenes += [AnnotatedScene(f"v{k}", "vsr", "g", None, things, ()) for k in range(5)]
+    found = encode(scenes, VOCABULARY)
+    assert [scene.weight for scene in found] == [0.5] * 6 + [1.0] * 2 + [1.0] * 5
+    assert found[0].evidence.counts.tolist() == [4, 1]
+    assert found[0].instance_classes.tolist() == [0, 2]
+    tensors = scene_tensors(found, annotated_classes(found, VOCABULARY), len(VOCABULARY))
+    assert tensors.source_names == ("alfred", "vsr")
+    batch = tensors.batch(torch.tensor([12, 0]))
+    assert batch.source.tolist() == [1, 0]
+    assert batch.weight.tolist() == [1.0, 0.5]
+    assert batch.complete.tolist() == [False, True]
+    assert batch.counts.tolist() == [[4, 1], [4, 1]]
+    rows = batch.rows(torch.tensor([False, True]))
+    assert (rows.source.tolist(), rows.weight.tolist(), rows.complete.tolist()) == (
+        [0], [0.5], [True]
+    )  # fmt: skip
+
+
+def test_every_source_has_a_meaning_and_terms() -> None:
+    assert set(MEANINGS) - {"sunrgbd-bedroom-3d"} == set(TERMS) - {"rooms"}
+    incomplete = {source for source, meaning in MEANINGS.items() if not meaning.complete_objects}
+    assert incomplete == {"vrd", "nr3d", "coco_captions", "reverie_text", "vsr", "bddl_goal"}
+
+
+# ------------------------------------------------------------------------------ reading
+
+
+@pytest.fixture
+def lines(tmp_path: Path) -> Callable[..., Path]:
+    def write(**fields: Any) -> Path:
+        scene = {
+            "scene_id": "a",
+            "source": "alfred",
+            "objects": [{"id": 0, "label": "cup"}, {"id": 1, "label": "table"}],
+        }
+        path = tmp_path / "alfred.jsonl"
+        path.write_text(json.dumps(scene | fields) + "\n")
+        return path
+
+    return write
+
+
+def test_predicates_of_sentences(lines: Callable[..., Path]) -> None:
+    relations = [[0, "on-top", 1], [0, "inside", 1], [0, "next to", 1], [1, "covered", 0]]
+    (scene,) = read_scenes(lines(relations=relations, false_relations=[[1, "inside", 0]]))
+    assert scene.relations == ((0, "on-top", 1),)
+    assert scene.false_relations == ()
+
+
+def test_counts_belong_to_the_one_object_of_their_label(lines: Callable[..., Path]) -> None:
+    (scene,) = read_scenes(lines(counts={"cup": 3}))
+    assert [thing.count for thing in scene.objects] == [3, 1]
+    for counts, problem in (
+        ({"fork": 1}, "which 0 objects are called"),
+        ({"cup": 0}, "must be 1 to 1000000"),
+        ({"cup": 10**400}, "must be 1 to 1000000"),
+        ({"cup": 1.5}, "must be an integer"),
+        ({"cup": True}, "must be an integer"),
+        ([3], "must be a mapping"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            read_scenes(lines(counts=counts))
+
+
+def test_scenes_are_read_as_they_were_written(lines: Callable[..., Path], tmp_path: Path) -> None:
+    scenes = read_scenes(lines(counts={"cup": 3}, relations=[], false_relations=[[1, "behind", 0]]))
+    jsonl.write_jsonl(scenes, tmp_path / "again.jsonl.gz")
+    assert read_scenes(tmp_path / "again.jsonl.gz") == scenes
+    assert scenes[0].false_relations == ((1, "behind", 0),)
+
+
+def test_a_number_of_400_digits_is_an_error_of_its_line(lines: Callable[..., Path]) -> None:
+    for field in ("position", "size", "yaw"):
+        huge = [10**400, 0, 0] if field != "yaw" else 10**400
+        path = lines(objects=[{"id": 0, "label": "cup", field: huge}])
+        with pytest.raises(DatasetError, match=r"alfred\.jsonl, line 1: a number is out of range"):
+            read_scenes(path)
+
+
+def test_a_small_file_cannot_unpack_into_a_huge_line(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.jsonl.gz"
+    with gzip.open(path, "wb", compresslevel=1) as file:
+        for _ in range(9):
+            file.write(b" " * 2**20)
+    with pytest.raises(DatasetError, match="line 1: is longer than 8 MiB"):
+        read_scenes(path)
