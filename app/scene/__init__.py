@@ -3,7 +3,7 @@
 from app.scene.evidence import ClassEvidence, class_evidence, pool_instances
 from app.scene.frames import body_pose, is_optical, is_world_fixed, viewer_axes
 from app.scene.geometry import PoseRelations, Viewpoint, derive_relations, to_viewer_frame
-from app.scene.labels import label_key
+from app.scene.labels import head_of, label_key
 from app.scene.observe import observe
 from app.scene.relations import (
     CANONICAL,
@@ -32,6 +32,7 @@ __all__ = [
     "class_evidence",
     "contradiction",
     "derive_relations",
+    "head_of",
     "is_optical",
     "is_world_fixed",
     "label_key",

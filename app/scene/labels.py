@@ -3,6 +3,9 @@
 Detectors, annotators and programmers write one thing in many ways ("Trash_Cans", "trash can",
 "trashcan"). `label_key` folds case, separators and a final plural, so that equal keys mean the same
 label. Synonyms ("tv", "television") are the business of alias tables, not of spelling.
+
+`head_of` names the thing of a phrase with "of": a bottle of milk is a bottle, a pair of shoes is
+shoes.
 """
 
 from __future__ import annotations
@@ -56,6 +59,32 @@ _IRREGULAR: Final = (
     ("canoes", "canoe"),
 )
 _IRREGULAR_ENDINGS: Final = tuple(plural for plural, _ in _IRREGULAR)
+
+
+_OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
+# What is named by its contents is the container; what is named by its parts is the parts.
+_CONTAINERS: Final = frozenset(
+    (
+        *("bag", "basket", "bottle", "bowl", "box", "bucket", "can", "canister", "carton"),
+        *("crate", "cup", "glass", "jar", "jug", "mug", "pack", "package", "packet"),
+        *("pitcher", "plate", "pot", "tin", "tray", "tube", "vase"),
+    )
+)
+_COLLECTIONS: Final = frozenset({"bunch", "pair", "piece", "pile", "row", "slice", "stack"})
+
+
+def head_of(label: str) -> str | None:
+    """The thing that a phrase names: "bottle of milk" is "bottle", "pile of books" is "books".
+
+    None where the label is no such phrase.
+    """
+    parts = _OF.split(label, maxsplit=1)
+    if len(parts) != 2:
+        return None
+    first = label_key(parts[0])
+    if first in _CONTAINERS:
+        return first
+    return parts[1] if first in _COLLECTIONS else None
 
 
 def singular(word: str) -> str:

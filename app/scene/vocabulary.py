@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rapidfuzz import fuzz, process
 
-from app.scene.labels import label_key
+from app.scene.labels import head_of, label_key
 
 Extents = tuple[float, float, float]
 
@@ -132,9 +132,16 @@ class Vocabulary:
         return sizes
 
     def index(self, label: str) -> int | None:
-        """The class a label names under any accepted spelling; None if there is none."""
+        """The class a label names under any accepted spelling; None if there is none.
+
+        A phrase that is no name itself means its head: "bottle of milk" is a bottle (`head_of`).
+        """
         found = self._by_spelling.get(label)
-        return found if found is not None else self._by_key.get(label_key(label))
+        if found is None:
+            found = self._by_key.get(label_key(label))
+        if found is None and (head := head_of(label)) is not None:
+            found = self._by_key.get(label_key(head))
+        return found
 
     def room_index(self, room: str) -> int | None:
         """The room type under any spelling ("bed_room" is "bedroom"); None if there is none."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 
-from app.scene import label_key
+from app.scene import head_of, label_key
 
 NAMES_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "names.toml"
 
@@ -18,6 +18,7 @@ class Names:
 
     Attributes:
         base: classes of every indoor vocabulary.
+        household: the same, however seldom scenes mention them.
         structure: classes that are accepted and never proposed.
         not_objects: labels that become no class.
         surroundings: structure outdoors; no class of an indoor vocabulary.
@@ -28,6 +29,7 @@ class Names:
     """
 
     base: tuple[str, ...] = ()
+    household: tuple[str, ...] = ()
     structure: tuple[str, ...] = ()
     not_objects: tuple[str, ...] = ()
     surroundings: tuple[str, ...] = ()
@@ -45,7 +47,7 @@ class Names:
                     if other and owner.setdefault(label_key(other), name) != name:
                         first = owner[label_key(other)]
                         raise ValueError(f"{title}: {other!r} names both {first!r} and {name!r}")
-        for name in self.base:
+        for name in (*self.base, *self.household):
             if (other := self.canonical(name)) != name:
                 raise ValueError(f"the base class {name!r} is an alias of {other!r}")
         for name, kinds in self.kinds.items():
@@ -56,7 +58,11 @@ class Names:
     def canonical(self, label: str) -> str:
         """The curated name of a label, or the label itself, in lower case with single spaces."""
         found = self._by_key.get(label_key(label))
-        return found if found is not None else " ".join(label.casefold().replace("_", " ").split())
+        if found is not None:
+            return found
+        if (head := head_of(label)) is not None:
+            return self.canonical(head)
+        return " ".join(label.casefold().replace("_", " ").split())
 
     def canonical_room(self, room: str | None) -> str | None:
         """The one spelling of a room type; None where it names none."""
@@ -74,7 +80,7 @@ class Names:
             for name, others in self.aliases.items()
             for other in (name, *others)
         }
-        for name in (*self.base, *self.structure, *self.surroundings):
+        for name in (*self.base, *self.household, *self.structure, *self.surroundings):
             keys.setdefault(label_key(name), name)
         return keys
 
@@ -98,6 +104,7 @@ def curated_names(path: Path = NAMES_FILE) -> Names:
     values = tomllib.loads(path.read_text(encoding="utf-8"))
     return Names(
         base=tuple(values["base"]),
+        household=tuple(values["household"]),
         structure=tuple(values["structure"]),
         not_objects=tuple(values["not_objects"]),
         surroundings=tuple(values["surroundings"]),

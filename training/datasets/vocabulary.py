@@ -16,8 +16,9 @@ from training.datasets.records import AnnotatedScene
 
 INDOOR_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "indoor.json"
 
-# Fewer mentions than this do not train a class.
+# Fewer mentions than this do not train a class. Indoors a class is also known by its word vector.
 MINIMUM_MENTIONS = 8
+INDOOR_MINIMUM_MENTIONS = 5
 # Fewer boxes than this give no typical size.
 MINIMUM_BOXES = 5
 
@@ -27,14 +28,15 @@ def build_vocabulary(
     names: Names,
     *,
     minimum: int = MINIMUM_MENTIONS,
+    minimum_rooms: int | None = None,
     outdoor: bool = False,
 ) -> Vocabulary:
     """The classes that scenes mention often enough, most frequent first, and their aliases.
 
-    Labels are pooled under their curated names before they are counted. The base classes of
-    ``names`` are in the vocabulary however seldom they are mentioned; labels of ``not_objects``
-    never are, those of ``outdoor`` and ``surroundings`` only on request. Room types are kept
-    under the same minimum, counted in scenes.
+    Labels are pooled under their curated names before they are counted. The base and household
+    classes of ``names`` are in the vocabulary however seldom they are mentioned; labels of
+    ``not_objects`` never are, those of ``outdoor`` and ``surroundings`` only on request. Room types
+    are kept from ``minimum_rooms`` scenes, by default ``minimum``.
 
     Raises:
         ValueError: no scene mentions any class often enough.
@@ -57,7 +59,9 @@ def build_vocabulary(
     refused = {label_key(name) for name in names.not_objects}
     if not outdoor:
         refused |= {label_key(name) for name in (*names.outdoor, *names.surroundings)}
-    kept = set(names.base) | {label for label, count in mentions.items() if count >= minimum}
+    rooms_from = minimum if minimum_rooms is None else minimum_rooms
+    kept = {*names.base, *names.household}
+    kept |= {label for label, count in mentions.items() if count >= minimum}
     structure = {label_key(name) for name in (*names.structure, *names.surroundings)}
     return Vocabulary(
         [
@@ -69,15 +73,25 @@ def build_vocabulary(
             for label in sorted(kept, key=lambda label: (-mentions[label], label))
             if label_key(label) not in refused
         ],
-        sorted(room for room, count in rooms.items() if count >= minimum),
+        sorted(room for room, count in rooms.items() if count >= rooms_from),
     )
 
 
 def write_indoor_vocabulary(
     scenes: Iterable[AnnotatedScene], path: Path = INDOOR_FILE
 ) -> Vocabulary:
-    """Build the indoor vocabulary from the scenes of all sources and write it, one class a line."""
-    vocabulary = build_vocabulary(scenes, curated_names())
+    """Build the indoor vocabulary from the scenes of all sources and write it, one class a line.
+
+    Things seen outdoors are ends of relations in photographs, so they are ordinary classes here.
+    """
+    names = replace(curated_names(), surroundings=())
+    vocabulary = build_vocabulary(
+        scenes,
+        names,
+        minimum=INDOOR_MINIMUM_MENTIONS,
+        minimum_rooms=MINIMUM_MENTIONS,
+        outdoor=True,
+    )
     path.write_text(vocabulary_json(vocabulary), encoding="utf-8")
     return vocabulary
 
@@ -140,7 +154,7 @@ def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> Obj
 
 def _reachable(names: Names) -> dict[str, tuple[str, ...]]:
     """Aliases, with an entry for every curated class so that its spelling stays canonical."""
-    return dict.fromkeys((*names.base, *names.structure), ()) | names.aliases
+    return dict.fromkeys((*names.base, *names.household, *names.structure), ()) | names.aliases
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
