@@ -7,20 +7,20 @@ One scene a line: ``scene_id``, ``source``, ``group``, ``room_type`` (or null), 
 where one object stands for all instances of its label, and ``viewer_frame``? (true where positions
 are in viewer axes: x away, y left, z up).
 
-Lines are read up to `MAX_LINE` bytes, so that a small compressed file cannot fill the memory.
+A line has at most `MAX_LINE` bytes.
 """
 
 from __future__ import annotations
 
 import gzip
 import json
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
+from training.datasets.lines import read_lines
 from training.datasets.predicates import relation_of
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 
@@ -57,7 +57,7 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
         DatasetError: the file cannot be read.
     """
     seen: dict[tuple[str, str], int] = {}
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         if not line.strip():
             continue
         where = f"line {number}"
@@ -110,22 +110,6 @@ def _values(scene: AnnotatedScene) -> dict[str, Any]:
     if counts := {thing.label: thing.count for thing in scene.objects if thing.count > 1}:
         values["counts"] = counts
     return values | ({"viewer_frame": True} if scene.viewer_frame else {})
-
-
-def _lines(path: Path) -> Iterator[bytes]:
-    """Undecoded, so that one that is no UTF-8 is one bad line."""
-    opener = gzip.open if path.suffix == ".gz" else open
-    try:
-        with opener(path, "rb") as file:
-            number = 0
-            while line := file.readline(MAX_LINE + 1):
-                number += 1
-                if len(line) > MAX_LINE:
-                    problem = f"is longer than {MAX_LINE // 2**20} MiB"
-                    raise DatasetError(path, f"line {number}", problem)
-                yield line
-    except (OSError, EOFError, zlib.error) as error:
-        raise DatasetError(path, "", f"cannot be read: {error}") from error
 
 
 def _scene(values: Any) -> AnnotatedScene:

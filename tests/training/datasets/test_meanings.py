@@ -200,5 +200,5 @@ def test_a_small_file_cannot_unpack_into_a_huge_line(tmp_path: Path) -> None:
     with gzip.open(path, "wb", compresslevel=1) as file:
         for _ in range(9):
             file.write(b" " * 2**20)
-    with pytest.raises(DatasetError, match="line 1: is longer than 8 MiB"):
+    with pytest.raises(DatasetError, match="line 1: is longer than 8388608 bytes"):
         read_scenes(path)

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.scene import ObjectClass, Vocabulary
+from training.datasets import DatasetError, indoor_vocabulary, words
+from training.datasets.words import class_vectors, read_word_vectors
+
+WORDS = np.array(["coffee", "table", "zero", "the", "sofa"])
+VECTORS = np.array([[4, 0], [0, 2], [0, 0], [3, 3], [3, -4]], dtype=np.int8)
+SCALE = np.float32(0.5)
+
+
+def save(folder: Path, **changes: Any) -> Path:
+    path = folder / "vectors.npz"
+    arrays = {"words": WORDS, "vectors": VECTORS, "scale": SCALE} | changes
+    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    return path
+
+
+def test_vectors_of_words(tmp_path: Path) -> None:
+    found = read_word_vectors(save(tmp_path))
+    assert found.dimensions == 2
+    half = np.sqrt(0.5)
+    for text, vector in (
+        ("coffee", (1, 0)),
+        ("Coffee_Tables", (half, half)),
+        ("the table", (0, 1)),
+        ("table x", (0, 1)),
+        ("the", (half, half)),
+    ):
+        assert found.of(text) == pytest.approx(np.array(vector)), text
+    for text in ("zero", "lamp", "table x y", "", "-"):
+        assert found.of(text) is None, text
+
+
+def test_classes_have_the_vector_of_their_label_or_alias(tmp_path: Path) -> None:
+    vocabulary = Vocabulary(
+        [
+            ObjectClass("coffee table"),
+            ObjectClass("settee", ("davenport", "sofa", "table")),
+            ObjectClass("lamp"),
+        ]
+    )
+    vectors, found = class_vectors(read_word_vectors(save(tmp_path)), vocabulary)
+    assert found.tolist() == [True, True, False]
+    assert vectors.dtype == np.float32
+    assert vectors[1] == pytest.approx([0.6, -0.8])
+    assert np.linalg.norm(vectors, axis=1) == pytest.approx([1, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"words": None}, "words: is missing"),
+        ({"words": np.array([1, 2, 3, 4, 5])}, "words: must be 1 to"),
+        ({"words": np.array(["a", "A", "b", "c", "d"])}, "words: has a word twice"),
+        ({"words": np.array(["a", {}, 1, 2, 3], dtype=object)}, "words: must be plain"),
+        ({"words": WORDS[:0], "vectors": VECTORS[:0]}, "words: must be 1 to"),
+        ({"vectors": VECTORS[1:]}, "vectors: must be 5 rows of int8"),
+        ({"vectors": VECTORS.astype(np.float32)}, "vectors: must be 5 rows of int8"),
+        ({"vectors": VECTORS[:, :0]}, "vectors: must have at least one column"),
+        ({"scale": np.float32(np.nan)}, "scale: must be one positive number"),
+        ({"scale": np.float32([1, 2])}, "scale: must be one positive number"),
+    ],
+)
+def test_malformed_arrays(tmp_path: Path, changes: dict[str, Any], problem: str) -> None:
+    with pytest.raises(DatasetError, match=rf"vectors\.npz, {problem}"):
+        read_word_vectors(save(tmp_path, **changes))
+
+
+def test_malformed_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DatasetError, match=r"none\.npz: cannot be read"):
+        read_word_vectors(tmp_path / "none.npz")
+    path = save(tmp_path)
+    whole = path.read_bytes()
+    for broken in (b"", whole[:200], whole[:-30], whole.replace(b"NUMPY", b"NUMPI")):
+        path.write_bytes(broken)
+        with pytest.raises(DatasetError, match=r"vectors\.npz"):
+            read_word_vectors(path)
+    monkeypatch.setattr(words, "MAX_BYTES", 64)
+    with pytest.raises(DatasetError, match=r"vectors\.npz, words: must be plain and at most"):
+        read_word_vectors(save(tmp_path))
+
+
+def test_the_real_vectors(repository: Path) -> None:
+    path = repository.parent / "shared" / "data" / "extra" / "word_vectors.npz"
+    if not path.is_file():
+        pytest.skip("the vectors of ../shared/data are not here")
+    vocabulary = indoor_vocabulary()
+    vectors, found = class_vectors(read_word_vectors(path), vocabulary)
+    assert vectors.shape == (len(vocabulary), 100)
+    assert found.mean() > 0.99
+    fork, spoon, sofa = (vectors[vocabulary.labels.index(x)] for x in ("fork", "spoon", "sofa"))
+    assert fork @ spoon > fork @ sofa

@@ -1,0 +1,149 @@
+"""Word vectors for the classes of a vocabulary.
+
+A ``.npz`` file with ``words`` (n,) strings, ``vectors`` (n, d) int8 and ``scale`` (): the vector of
+a word is its row times the scale.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+import zlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from app.scene import ObjectClass, Vocabulary
+from training.datasets.records import DatasetError
+
+MAX_WORDS: Final = 1_000_000
+MAX_BYTES: Final = 512 * 2**20
+
+_MEMBERS: Final = ("words", "vectors", "scale")
+# RuntimeError: an encrypted archive, or an unknown compression.
+_UNREADABLE: Final = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_SEPARATORS: Final = re.compile(r"[\s_\-./]+")
+# They tell nothing of the thing.
+_FILLERS: Final = frozenset({"a", "an", "and", "for", "in", "no", "of", "on", "or", "the", "with"})
+
+Vectors = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class WordVectors:
+    """Vectors of words.
+
+    Attributes:
+        words: (n,) distinct, in lower case.
+        vectors: (n, d) int8, to be multiplied with ``scale``.
+        scale: positive.
+    """
+
+    words: tuple[str, ...]
+    vectors: NDArray[np.int8]
+    scale: float
+
+    @property
+    def dimensions(self) -> int:
+        return int(self.vectors.shape[1])
+
+    def of(self, text: str) -> Vectors | None:
+        """(d,) mean of the words of a text, of unit length; None where no word is known.
+
+        A word that is unknown in the plural counts in the singular; fillers ("of") do not count. A
+        text of which less than half the words are known is unknown.
+        """
+        words = [word for word in _SEPARATORS.split(text.casefold()) if word]
+        words = [word for word in words if word not in _FILLERS] or words
+        rows = [row for word in words if (row := self._row(word)) is not None]
+        if not rows or 2 * len(rows) < len(words):
+            return None
+        mean = np.mean([_unit(self.vectors[row] * np.float32(self.scale)) for row in rows], axis=0)
+        return _unit(mean) if np.linalg.norm(mean) > 0 else None
+
+    def _row(self, word: str) -> int | None:
+        forms = (word, word.removesuffix("s"), word.removesuffix("es"))
+        return next((row for form in forms if (row := self._rows.get(form)) is not None), None)
+
+    @cached_property
+    def _rows(self) -> dict[str, int]:
+        return {word: row for row, word in enumerate(self.words) if self.vectors[row].any()}
+
+
+def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, NDArray[np.bool_]]:
+    """Vectors of the classes of a vocabulary.
+
+    The label decides; where it has no vector, the first alias that has one.
+
+    Returns:
+        (V, d) float32 of unit length, zero where there is none; (V,) bool, where there is one.
+    """
+    vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
+    found = np.zeros(len(vocabulary), dtype=np.bool_)
+    for index, entry in enumerate(vocabulary.objects):
+        if (vector := _class_vector(words, entry)) is not None:
+            vectors[index], found[index] = vector, True
+    return vectors, found
+
+
+def read_word_vectors(path: Path) -> WordVectors:
+    """Read a file of word vectors.
+
+    Raises:
+        DatasetError: the file is missing, is no such file, or is too large.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            arrays = {name: _member(path, archive, name) for name in _MEMBERS}
+    except DatasetError:
+        raise
+    except _UNREADABLE as error:
+        raise DatasetError(path, "", f"cannot be read: {error}") from error
+    words, vectors, scale = (arrays[name] for name in _MEMBERS)
+    if words.ndim != 1 or words.dtype.kind != "U" or not 0 < len(words) <= MAX_WORDS:
+        raise DatasetError(path, "words", f"must be 1 to {MAX_WORDS} strings")
+    if vectors.dtype != np.int8 or vectors.ndim != 2 or len(vectors) != len(words):
+        raise DatasetError(path, "vectors", f"must be {len(words)} rows of int8")
+    if not vectors.shape[1]:
+        raise DatasetError(path, "vectors", "must have at least one column")
+    if scale.shape != () or scale.dtype.kind != "f" or not 0 < float(scale) < np.inf:
+        raise DatasetError(path, "scale", "must be one positive number")
+    names = tuple(word.casefold() for word in words.tolist())
+    if len(set(names)) < len(names):
+        raise DatasetError(path, "words", "has a word twice")
+    return WordVectors(names, vectors, float(scale))
+
+
+def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    """An array, the declared size of which is checked before it is read; nothing is unpickled."""
+    if f"{name}.npy" not in archive.namelist():
+        raise DatasetError(path, name, "is missing")
+    with archive.open(f"{name}.npy") as file:
+        version = npy.read_magic(file)
+        if version not in ((1, 0), (2, 0)):
+            raise DatasetError(path, name, f"has the unknown version {version} of its format")
+        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, dtype = read(file)
+        size = dtype.itemsize
+        for length in shape:
+            size *= length
+        if dtype.hasobject or size > MAX_BYTES:
+            raise DatasetError(path, name, f"must be plain and at most {MAX_BYTES // 2**20} MiB")
+    with archive.open(f"{name}.npy") as file:
+        return npy.read_array(file, allow_pickle=False)
+
+
+def _class_vector(words: WordVectors, entry: ObjectClass) -> Vectors | None:
+    for name in (entry.label, *entry.aliases):
+        if (vector := words.of(name)) is not None:
+            return vector
+    return None
+
+
+def _unit(vector: NDArray[Any]) -> Vectors:
+    return np.asarray(vector / np.linalg.norm(vector), dtype=np.float32)
