@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from training.datasets.records import DatasetError
+
+MAX_DIGITS: Final = 30
 
 
 def load_json(path: Path) -> Any:
@@ -16,11 +18,24 @@ def load_json(path: Path) -> Any:
         DatasetError: it cannot be read, or is not JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"), parse_int=bounded_int)
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
     except json.JSONDecodeError as error:
         raise DatasetError(path, f"line {error.lineno}", f"not JSON: {error.msg}") from error
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(path, "", f"not JSON: {error}") from error
+
+
+def bounded_int(digits: str) -> int:
+    """An integer of a JSON file, for ``parse_int``.
+
+    Raises:
+        ValueError: it has more than `MAX_DIGITS` digits; longer ones overflow where floats are due.
+    """
+    if len(digits.lstrip("-")) > MAX_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits starts with {digits[:10]}")
+    return int(digits)
 
 
 def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type, ...]) -> Any:

@@ -20,6 +20,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
+from training.datasets.json_file import bounded_int
 from training.datasets.lines import read_lines
 from training.datasets.predicates import relation_of
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
@@ -62,13 +63,11 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
             continue
         where = f"line {number}"
         try:
-            scene = _scene(json.loads(line))
+            scene = _scene(json.loads(line, parse_int=bounded_int))
         except json.JSONDecodeError as error:
             yield DatasetError(path, where, f"not JSON: {error}")
         except (ValueError, RecursionError) as error:
             yield DatasetError(path, where, str(error))
-        except OverflowError as error:
-            yield DatasetError(path, where, f"a number is out of range: {error}")
         else:
             first = seen.setdefault((scene.source, scene.scene_id), number)
             if first == number:

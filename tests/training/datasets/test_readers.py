@@ -553,3 +553,13 @@ def test_missing_files(name: str, tmp_path: Path) -> None:
 def test_unknown_file_names(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="the name fits no known format"):
         read_scenes(tmp_path / "scenes.csv")
+
+
+def test_a_number_of_400_digits_in_a_json_file_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "instances.json"
+    path.write_text('{"categories": [], "images": [], "annotations": [{"bbox": [' + "9" * 400)
+    with pytest.raises(DatasetError, match=r"instances\.json: not JSON: a number of 400 digits"):
+        read_scenes(path)
+    path.write_text("[" * 100_000)
+    with pytest.raises(DatasetError, match=r"instances\.json: not JSON"):
+        read_scenes(path)
