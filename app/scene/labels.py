@@ -62,7 +62,7 @@ _IRREGULAR_ENDINGS: Final = tuple(plural for plural, _ in _IRREGULAR)
 
 
 _OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
-# What is named by its contents is the container; what is named by its parts is the parts.
+# A container with its contents is the container; a collection is its members.
 _CONTAINERS: Final = frozenset(
     (
         *("bag", "basket", "bottle", "bowl", "box", "bucket", "can", "canister", "carton"),
@@ -76,7 +76,7 @@ _COLLECTIONS: Final = frozenset({"bunch", "pair", "piece", "pile", "row", "slice
 def head_of(label: str) -> str | None:
     """The thing that a phrase names: "bottle of milk" is "bottle", "pile of books" is "books".
 
-    None where the label is no such phrase.
+    None where the label is another phrase.
     """
     parts = _OF.split(label, maxsplit=1)
     if len(parts) != 2:

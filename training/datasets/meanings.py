@@ -1,4 +1,4 @@
-"""What an unlisted relation means in each source, and what its object lists mean.
+"""The meaning of unlisted relations and of object lists, source by source.
 
 A listed relation holds. An unlisted one is off, or off only for neighbours, or unobserved:
 
@@ -13,8 +13,8 @@ A listed relation holds. An unlisted one is off, or off only for neighbours, or 
 Two rules hold in every source. A listed on-top or above excludes the other on-top and above
 relations of its pair, in both directions. A relation that an annotator denied is off.
 
-Neighbours are near by the rule of `app.scene.geometry`, or, where there are no poses, related: the
-annotators listed a relation of the pair. 3DSSG compares heights only within a class and lists
+Neighbours are near by the rule of `app.scene.geometry`. Without poses, neighbours are the pairs for
+which the annotators listed any relation. 3DSSG compares heights only within a class and lists
 left and front only between things with one support, so above and far pairs stay unobserved there.
 """
 
@@ -30,7 +30,7 @@ Unlisted = Literal["off", "off for neighbours", "unobserved"]
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """What a source leaves unsaid.
+    """The meaning of the unlisted in a source.
 
     Attributes:
         on_top, above, lateral: an unlisted relation of the kind; left and front are lateral.

@@ -1,9 +1,11 @@
 """Annotated predicates to the eight relations, source by source.
 
-The sources of sentences (`SENTENCES`) use the names of the eight, and some more. These are left
-out: ``inside`` and ``contains`` (a cup in a cupboard stands on none of its tops), ``attached`` (a
-towel on a hook, a picture on a wall), ``next to``, ``touching`` and ``nearby`` (no direction), and
-``covered`` (dust on a table is no object).
+The sources of sentences (`SENTENCES`) use the names of the eight and these, which are left out:
+
+- ``inside``, ``contains``: a cup in a cupboard is not on top of it;
+- ``attached``: a towel on a hook, a picture on a wall;
+- ``next to``, ``touching``: they have no direction;
+- ``covered``: the dust on a table is a state of the table.
 """
 
 from __future__ import annotations

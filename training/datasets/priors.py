@@ -1,4 +1,4 @@
-"""Pairs of things and where one is put: a table that is no scene.
+"""Placing priors: a table of pairs of things and their relation, without scenes.
 
 A gzipped or plain table of tab-separated columns, with these names in the first line: ``source``,
 ``subject``, ``relation``, ``object``, ``count``, ``room`` (empty where any). Relations other than
@@ -35,7 +35,7 @@ class PriorSource:
     Attributes:
         words: provenance and licence.
         licence: its identifier.
-        share_alike: what is derived from it must be shared under the same licence.
+        share_alike: derived works must be shared under the same licence.
     """
 
     words: str

@@ -95,7 +95,7 @@ def read_word_vectors(path: Path) -> WordVectors:
     """Read a file of word vectors.
 
     Raises:
-        DatasetError: the file is missing, is no such file, or is too large.
+        DatasetError: the file is missing, malformed or too large.
     """
     try:
         with zipfile.ZipFile(path) as archive:
