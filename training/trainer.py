@@ -388,4 +388,5 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
         room=scenes.room[index],
         source=scenes.source[index],
         annotated_classes=scenes.annotated_classes,
+        source_names=scenes.source_names,
     )
