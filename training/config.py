@@ -48,10 +48,13 @@ class DataConfig(_Section):
     vocabulary: str = Field(
         default="indoor", description="indoor, source, rooms, or a file that ends in .json"
     )
-    split: Literal["group", "stable", "random"] = "group"
+    split: Literal["group", "stable", "random", "final"] = "group"
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
     limit: int | None = Field(default=None, ge=10, description="at most so many scenes a source")
+    words: str = Field(
+        default="", description="file of word vectors in the data folder; none where empty"
+    )
     # Not written where they say nothing, as below.
     terms: str = Field(
         default="", exclude_if=lambda words: not words, description="of use, for files of one's own"
@@ -93,7 +96,7 @@ class MachineConfig(_Section):
 class ObjectiveConfig(_Section):
     """What is minimised, and the knobs of that objective."""
 
-    name: Literal["contrastive_divergence", "persistent_cd", "composite"]
+    name: Literal["contrastive_divergence", "persistent_cd", "composite", "relations"]
     k: int = Field(default=1, ge=1, description="Gibbs steps an update (CD, PCD)")
     chains: int = Field(default=128, ge=1, description="persistent chains (PCD)")
     presence_weight: float = Field(default=0.1, ge=0, description="presence against absence")
@@ -108,6 +111,28 @@ class ObjectiveConfig(_Section):
     count_dropout: float = Field(
         default=0.0, ge=0, le=1, description="share of scenes whose relations see no counts"
     )
+    offset_prior: float = Field(
+        default=8.0, ge=0, description="precision of the offsets of the sources (relations)"
+    )
+    weight_prior: float = Field(
+        default=16.0, ge=0, description="precision of the relation weights (relations)"
+    )
+    word_weight: float = Field(
+        default=0.0, ge=0, description="scale of what word vectors say of classes (relations)"
+    )
+    source_weights: dict[str, float] = Field(
+        default={}, description="what a relation of a source counts for, 1 unless named (relations)"
+    )
+
+
+class ObjectsConfig(_Section):
+    """The first phase: the object part by persistent chains (local form)."""
+
+    epochs: int = Field(default=0, ge=0, description="passes over the scenes; 0 leaves it out")
+    learning_rate: float = Field(default=0.2, gt=0, description="at the start; falls to 0")
+    chains: int = Field(default=64, ge=1)
+    batch_size: int = Field(default=32, ge=1)
+    room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of withheld room types")
 
 
 class PolishConfig(_Section):
@@ -146,6 +171,7 @@ class Config(_Section):
     machine: MachineConfig
     objective: ObjectiveConfig
     training: TrainingConfig = TrainingConfig()
+    objects: ObjectsConfig = ObjectsConfig()
     polish: PolishConfig = PolishConfig()
 
     @model_validator(mode="after")
@@ -169,6 +195,10 @@ class Config(_Section):
             raise ValueError("data.rooms must say how many rooms to generate")
         if self.objective.generative_weight and not local:
             raise ValueError("objective.generative_weight is defined for the local form only")
+        if self.objects.epochs and not local:
+            raise ValueError("objects.epochs is defined for the local form only")
+        if self.objective.name == "relations" and not self.objects.epochs:
+            raise ValueError("the objective relations needs objects.epochs: it trains no objects")
         if (self.polish.updates or self.machine.N) and self.machine.form != "local":
             raise ValueError("polish.updates and machine.N are defined for the local form only")
         return self

@@ -28,6 +28,7 @@ from training.datasets import (
     split,
     with_typical_sizes,
 )
+from training.datasets.words import class_vectors, read_word_vectors
 from training.trainer import TrainingData
 
 
@@ -41,6 +42,7 @@ class SplitScenes:
         parts: per part, its scenes over all sources.
         counts, digests: per source, scenes read and sha256 of what was read.
         shuffle: seed of the permutation, None where the scenes are as they were read.
+        words: (V, D) unit word vectors of the classes; None without any.
     """
 
     data: DataConfig
@@ -49,6 +51,7 @@ class SplitScenes:
     counts: dict[str, int]
     digests: dict[str, str]
     shuffle: int | None = None
+    words: torch.Tensor | None = None
 
     @property
     def digest(self) -> str:
@@ -82,6 +85,7 @@ class SplitScenes:
             relations=len(CANONICAL),
             room_types=len(self.vocabulary.room_types),
             digest=self.digest,
+            words=self.words,
         )
 
     def shuffled(self, seed: int) -> SplitScenes:
@@ -179,7 +183,20 @@ def split_and_encode(
         parts={part: encode(some, vocabulary) for part, some in parts.items()},
         counts={source: len(some) for source, some in scenes.items()},
         digests={source: digest_of(some) for source, some in scenes.items()},
+        words=_word_vectors(data, vocabulary, root),
     )
+
+
+def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch.Tensor | None:
+    """The vectors of the classes, (V, D).
+
+    Raises:
+        DatasetError: there is no such file, or it holds no vectors.
+    """
+    if not data.words:
+        return None
+    vectors, _ = class_vectors(read_word_vectors(root / data.words), vocabulary)
+    return torch.from_numpy(vectors)
 
 
 def digest_of(scenes: Sequence[AnnotatedScene]) -> str:

@@ -26,11 +26,15 @@ from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.reconstruction import reconstruction_error
 from training.evaluation.relations import machine_score as relation_score
 from training.evaluation.relations import rank_relations
-from training.objectives import OBJECTIVES, CompositeLikelihood
+from training.objectives import OBJECTIVES, CompositeLikelihood, Objective, RelationLikelihood
+from training.objectives.relations import bake_word_prior
+from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples
 from training.polish import polish
 
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
+# Called while the objects are trained, with the share that is done.
+ObjectProgress = Callable[[float], None]
 # At the full learning rate: the rest are relation weights, which overfit within an epoch at it.
 _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
@@ -46,6 +50,7 @@ class TrainingData:
 
     Attributes:
         digest: of the scenes, their vocabulary and split; a run is not gone on with on others.
+        words: (V, D) unit word vectors of the classes, 0 where unknown; None without any.
     """
 
     train: SceneTensors
@@ -55,6 +60,7 @@ class TrainingData:
     relations: int
     room_types: int
     digest: str = ""
+    words: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -159,11 +165,14 @@ class Trainer:
         torch.set_num_threads(config.training.threads)
         self.generator = torch.Generator().manual_seed(config.training.seed)
         self.machine = new_machine(config, data, self.generator)
-        self.objective = OBJECTIVES[config.objective.name](config.objective, self.machine)
-        if isinstance(self.objective, CompositeLikelihood):
-            self.objective.structure = data.structure
+        self.objective = self._objective()
+        self.train = data.train
+        if config.objects.epochs:
+            self.train = _with_relations(data.train)
+            for name in OBJECT_WEIGHTS:
+                self.machine.get_parameter(name).requires_grad_(False)
         self.optimiser = self._optimiser()
-        self.steps_per_epoch = max(1, math.ceil(len(data.train) / config.training.batch_size))
+        self.steps_per_epoch = max(1, math.ceil(len(self.train) / config.training.batch_size))
         self.scheduler = self._scheduler()
         self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
         self.updates = 0
@@ -171,7 +180,17 @@ class Trainer:
         self.best: dict[str, Tensor] = {}
         self.best_epoch, self.best_score = -1, -math.inf
         self.seconds = 0.0
+        self.objects_trained = not config.objects.epochs
         self._drawn = -math.inf
+
+    def _objective(self) -> Objective:
+        config = self.config.objective
+        if config.name == "relations":
+            return RelationLikelihood(config, self.machine, self.data.train, self.data.words)
+        objective = OBJECTIVES[config.name](config, self.machine)
+        if isinstance(objective, CompositeLikelihood):
+            objective.structure = self.data.structure
+        return objective
 
     def _optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training
@@ -184,6 +203,7 @@ class Trainer:
             group = matrices if parameter.dim() > 1 else biases
             (group if name in _FULL_RATE else relations).append(parameter)
         rate = t.learning_rate * t.relation_rate
+        biases += self.objective.parameters()
         groups = [
             {"params": matrices, "weight_decay": t.weight_decay, "lr": t.learning_rate},
             {"params": biases, "weight_decay": 0.0, "lr": t.learning_rate},
@@ -220,6 +240,7 @@ class Trainer:
             return False
         state = load_checkpoint(self.folder / "checkpoint.pt", self._digest)
         self.machine.load_state_dict(state["machine"])
+        self.objects_trained = state["objects_trained"]
         self.optimiser.load_state_dict(state["optimiser"])
         self.scheduler.load_state_dict(state["scheduler"])
         self.objective.load_state(state["objective"])
@@ -230,11 +251,26 @@ class Trainer:
         self.epochs = [Epoch(**row) for row in state["epochs"]]
         return True
 
-    def run(self, progress: Progress | None = None, ended: Ended | None = None) -> TrainingResult:
-        """Train to the last epoch or until patience runs out.
+    def run(
+        self,
+        progress: Progress | None = None,
+        ended: Ended | None = None,
+        objects: ObjectProgress = lambda _: None,
+    ) -> TrainingResult:
+        """Train the objects if they have a phase of their own, then to the last epoch or until
+        patience runs out.
 
         KeyboardInterrupt passes through; the last finished epoch is on disk by then.
         """
+        if not self.objects_trained:
+            began = time.perf_counter()
+            seed = self.config.training.seed
+            fit_objects(self.machine, self.data.train, self.config.objects, seed, objects)
+            store_samples(self.machine, self.data.train, self.config.objects.room_dropout, seed)
+            self.objects_trained = True
+            self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
+            self.seconds += time.perf_counter() - began
+            self._save()
         while len(self.epochs) < self.config.training.epochs and not self._out_of_patience():
             self._epoch(progress)
             self._save()
@@ -245,13 +281,15 @@ class Trainer:
         with torch.no_grad():
             for name, value in self.best.items():
                 parameters[name].copy_(value)
-        polish(
-            self.machine,
-            self.data.train,
-            self.config.polish,
-            self.config.objective.room_dropout,
-            self.config.training.seed,
-        )
+        bake_word_prior(self.machine)
+        if not self.config.objects.epochs:
+            polish(
+                self.machine,
+                self.data.train,
+                self.config.polish,
+                self.config.objective.room_dropout,
+                self.config.training.seed,
+            )
         return TrainingResult(self.machine, self.epochs, self.best_epoch, self.seconds, True)
 
     @property
@@ -265,11 +303,11 @@ class Trainer:
     def _epoch(self, progress: Progress | None) -> None:
         began = time.perf_counter()
         number = len(self.epochs)
-        order = torch.randperm(len(self.data.train), generator=self.generator)
+        order = torch.randperm(len(self.train), generator=self.generator)
         total = 0.0
         size = self.config.training.batch_size
         for step in range(self.steps_per_epoch):
-            batch = self.data.train.batch(order[step * size : (step + 1) * size])
+            batch = self.train.batch(order[step * size : (step + 1) * size])
             total += self._update(batch)
             if progress is not None:
                 progress(number, (step + 1) / self.steps_per_epoch, total / (step + 1))
@@ -309,7 +347,8 @@ class Trainer:
         object_train, relation_train = reconstruction_error(self.machine, self.data.train)
         object_val, relation_val = reconstruction_error(self.machine, self.data.validation)
         score = mrr + (0.0 if math.isnan(precision) else precision)
-        if score > self.best_score:
+        # Conditional likelihood under a prior has no early optimum: its last average is the best.
+        if score > self.best_score or isinstance(self.objective, RelationLikelihood):
             self.best_score, self.best_epoch = score, number
             self.best = {name: p.detach().clone() for name, p in parameters.items()}
         for name, p in parameters.items():
@@ -356,6 +395,7 @@ class Trainer:
             {
                 "digest": self._digest,
                 "machine": self.machine.state_dict(),
+                "objects_trained": self.objects_trained,
                 "optimiser": self.optimiser.state_dict(),
                 "scheduler": self.scheduler.state_dict(),
                 "objective": self.objective.state(),
@@ -369,6 +409,8 @@ class Trainer:
                 "epochs": [asdict(epoch) for epoch in self.epochs],
             },
         )
+        if not self.epochs:
+            return
         write_csv(self.folder / "curve.csv", self.epochs)
         # Drawing takes longer than an epoch on few scenes does.
         if time.perf_counter() - self._drawn > _DRAWN_EVERY:
@@ -378,6 +420,12 @@ class Trainer:
         if self.folder is not None:
             write_plot(self.folder / "curve.png", self.epochs, self.config.name)
             self._drawn = time.perf_counter()
+
+
+def _with_relations(scenes: SceneTensors) -> SceneTensors:
+    """The scenes of which any relation is known; all of them where there is none."""
+    kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
+    return subset(scenes, torch.tensor(kept, dtype=torch.int64)) if kept else scenes
 
 
 def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:

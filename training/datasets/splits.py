@@ -4,7 +4,8 @@
 that occurs in several sources (a frame and the 3D boxes of the same frame) goes to the same part in
 all of them. ``stable`` has the same shares and is not stratified: a group's part follows from the
 seed and its name alone. A data set can grow without any group moving, so that no later version of a
-model learns from what an earlier one was tested on. ``random``, 60 / 30 / 10, is the protocol of
+model learns from what an earlier one was tested on. ``final``, 90 / 0 / 10, splits as ``group`` does
+and keeps a tenth for calibration: weights that ship learn from all the rest. ``random``, 60 / 30 / 10, is the protocol of
 the seed paper: every scene on its own.
 
 The parts of the others depend on the seed and on what is split, not on its order. Sources that
@@ -23,11 +24,12 @@ from training.datasets.names import curated_names
 from training.datasets.records import AnnotatedScene
 
 Part = Literal["train", "test", "validation"]
-Protocol = Literal["group", "stable", "random"]
+Protocol = Literal["group", "stable", "random", "final"]
 
 FRACTIONS: Final[dict[Protocol, dict[Part, float]]] = {
     "group": {"train": 0.75, "test": 0.15, "validation": 0.1},
     "stable": {"train": 0.75, "test": 0.15, "validation": 0.1},
+    "final": {"train": 0.9, "test": 0.0, "validation": 0.1},
     "random": {"train": 0.6, "test": 0.3, "validation": 0.1},
 }
 
@@ -40,7 +42,7 @@ def split(
     Args:
         scenes: all scenes that are to be split, of all sources.
         seed: draws another split.
-        protocol: ``group``, ``stable`` or ``random``.
+        protocol: ``group``, ``stable``, ``random`` or ``final``.
 
     Raises:
         ValueError: an unknown protocol, or two scenes of one source with one id.

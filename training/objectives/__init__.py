@@ -14,6 +14,7 @@ from training.config import ObjectiveConfig
 from training.objectives.base import Objective
 from training.objectives.composite import CompositeLikelihood
 from training.objectives.contrastive import ContrastiveDivergence, PersistentCD
+from training.objectives.relations import RelationLikelihood
 
 OBJECTIVES: dict[str, Callable[[ObjectiveConfig, BoltzmannMachine], Objective]] = {
     "contrastive_divergence": ContrastiveDivergence,
@@ -27,4 +28,5 @@ __all__ = [
     "ContrastiveDivergence",
     "Objective",
     "PersistentCD",
+    "RelationLikelihood",
 ]

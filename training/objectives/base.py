@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from app.boltzmann import BoltzmannMachine
 from training.batches import Batch
@@ -24,6 +24,10 @@ class Objective(ABC):
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:  # noqa: B027
         """Change the gradients before the update (centring); nothing by default."""
+
+    def parameters(self) -> list[nn.Parameter]:
+        """What it learns beside the machine's weights, and leaves out of the machine."""
+        return []
 
     def state(self) -> dict[str, Tensor]:
         """What a checkpoint must keep."""

@@ -1,0 +1,202 @@
+"""The object part of a machine by maximum likelihood: persistent chains while the rate falls to 0.
+
+In the local form relations sum to one, so that log p(v) has a gradient of its own,
+
+    d log p(v) / dW = v' E[h1 | v] - E_model[v' h1]
+
+and the same for b, c1, c2, J and Q. The first expectation is a mean field (exact with one layer),
+the second runs over Gibbs chains that go on between the updates. The rate falls linearly to 0, so
+that the chains follow a machine that stands still in the end, and the weights are averaged over the
+last part of the run. Each chain keeps a room type (or none) of a training scene: data and chains
+have the same mixture of conditions.
+
+Scenes count by their weight, and only those whose object list is nearly complete take part.
+
+Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008);
+Salakhutdinov and Hinton, "Deep Boltzmann machines" (2009), for two layers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from app.boltzmann import BoltzmannMachine
+from app.boltzmann.bernoulli import bernoulli
+from app.boltzmann.fantasies import pack_scenes
+from app.boltzmann.mean_field import Evidence, mean_field
+from training.batches import SceneTensors
+from training.config import ObjectsConfig
+
+OBJECT_WEIGHTS = ("b", "c1", "c2", "W", "J", "Q")
+# The last part of the run is averaged, by a running mean that then forgets as slowly as this.
+_AVERAGED = 0.3
+_FORGETTING = 0.002
+# Sweeps between the last update and the stored samples.
+_SWEEPS = 200
+# Updates between two calls of `progress`.
+_REPORTED = 100
+
+
+@dataclass
+class _Chains:
+    """Persistent chains: presence (B, V), context (B, H1) and (B, H2), room types (B,)."""
+
+    v: Tensor
+    h1: Tensor
+    h2: Tensor
+    room: Tensor
+
+
+def fit_objects(
+    machine: BoltzmannMachine,
+    train: SceneTensors,
+    config: ObjectsConfig,
+    seed: int,
+    progress: Callable[[float], None] = lambda _: None,
+) -> None:
+    """Train b, c1, c2, W, J and Q in place.
+
+    Args:
+        train: scenes; those with incomplete object lists are left out.
+        config: passes over the data, rate, chains and batch size; no pass does nothing.
+        progress: called with the share of the updates that are done.
+
+    Raises:
+        ValueError: the seed form, in which relations act on the objects.
+        FloatingPointError: the weights diverged.
+    """
+    if not config.epochs:
+        return
+    if machine.spec.form != "local":
+        raise ValueError("objects are trained by themselves in the local form only")
+    generator = torch.Generator().manual_seed(seed)
+    scenes = _Scenes(train, config.room_dropout, generator)
+    weights = {name: machine.get_parameter(name) for name in OBJECT_WEIGHTS}
+    updates = config.epochs * max(1, round(scenes.size / config.batch_size))
+    with torch.no_grad():
+        chains = _begin(machine, *scenes.draw(config.chains))
+        average = {name: weight.clone() for name, weight in weights.items()}
+        for update in range(updates):
+            v, room = scenes.draw(config.batch_size)
+            rate = config.learning_rate * (1 - update / updates)
+            _update(machine, weights, v, room, chains, rate, generator)
+            late = update - (1 - _AVERAGED) * updates
+            share = 1.0 if late <= 0 else max(_FORGETTING, 1 / (late + 1))
+            for name, weight in weights.items():
+                average[name].lerp_(weight, share)
+            if (update + 1) % _REPORTED == 0 or update + 1 == updates:
+                if not all(bool(weight.isfinite().all()) for weight in weights.values()):
+                    raise FloatingPointError("the objects diverged: lower objects.learning_rate")
+                progress((update + 1) / updates)
+        for name, weight in weights.items():
+            weight.copy_(average[name])
+
+
+@torch.no_grad()
+def store_samples(
+    machine: BoltzmannMachine, train: SceneTensors, room_dropout: float, seed: int
+) -> None:
+    """Fill the machine's stored samples with the ends of N long chains that began at scenes.
+
+    Each sample keeps the room type of its scene; a share of the chains runs without it.
+    """
+    if not machine.spec.N:
+        return
+    generator = torch.Generator().manual_seed(seed + 1)
+    scenes = _Scenes(train, 0.0, generator)
+    v, room = scenes.draw(machine.spec.N)
+    hidden = torch.rand(len(v), generator=generator) < room_dropout
+    chains = _begin(machine, v, torch.where(hidden, -1, room))
+    for _ in range(_SWEEPS):
+        _sweep(machine, chains, generator)
+    machine.fantasies.copy_(pack_scenes(chains.v))
+    machine.fantasy_rooms.copy_(room)
+
+
+class _Scenes:
+    """Complete scenes, drawn by weight; `size` is their total weight."""
+
+    def __init__(self, train: SceneTensors, room_dropout: float, generator: torch.Generator):
+        kept = train.complete.nonzero().squeeze(1)
+        if not len(kept):
+            raise ValueError("no scene of the training part has a complete list of objects")
+        self.v, self.room, self.weight = train.v[kept], train.room[kept], train.weight[kept]
+        self.size = float(self.weight.sum())
+        self._dropout, self._generator = room_dropout, generator
+        self._order, self._place = torch.zeros(0, dtype=torch.int64), 0
+
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        """Presence and room types of some scenes, (B, V) and (B,), a share of types withheld."""
+        parts = []
+        while count:
+            if self._place == len(self._order):
+                self._shuffle()
+            part = self._order[self._place : self._place + count]
+            self._place, count = self._place + len(part), count - len(part)
+            parts.append(part)
+        index = torch.cat(parts)
+        hidden = torch.rand(len(index), generator=self._generator) < self._dropout
+        return self.v[index], torch.where(hidden, -1, self.room[index])
+
+    def _shuffle(self) -> None:
+        """A pass over the scenes: each as often as its weight says, in random order."""
+        times = self.weight.floor()
+        extra = torch.rand(len(times), generator=self._generator) < self.weight - times
+        index = torch.arange(len(times)).repeat_interleave(times.long() + extra)
+        if not len(index):
+            index = self.weight.argmax().view(1)
+        self._order = index[torch.randperm(len(index), generator=self._generator)]
+        self._place = 0
+
+
+def _begin(machine: BoltzmannMachine, v: Tensor, room: Tensor) -> _Chains:
+    field = mean_field(machine, Evidence(v, room=room))
+    return _Chains(v.clone(), field.y.sigmoid().round(), field.h2.round(), room)
+
+
+def _update(
+    machine: BoltzmannMachine,
+    weights: dict[str, Tensor],
+    v: Tensor,
+    room: Tensor,
+    chains: _Chains,
+    rate: float,
+    generator: torch.Generator,
+) -> None:
+    field = mean_field(machine, Evidence(v, room=room))
+    _add(weights, v, field.y.sigmoid(), field.h2, room, rate / len(v))
+    mean = _sweep(machine, chains, generator)
+    _add(weights, chains.v, mean, chains.h2, chains.room, -rate / len(chains.v))
+
+
+def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generator) -> Tensor:
+    """Move the chains by one sweep; returns the mean of h1 that was drawn last, (B, H1)."""
+    chains.v = bernoulli(machine.object_logits(chains.h1).sigmoid(), generator)
+    if machine.spec.H2:
+        h2 = machine.second_layer_logits(chains.h1).sigmoid()
+        chains.h2 = bernoulli(h2, generator)
+    x = machine.context_bias(chains.room) + chains.v @ machine.W
+    if machine.spec.H2:
+        x = x + chains.h2 @ machine.J.T
+    mean = x.sigmoid()
+    chains.h1 = bernoulli(mean, generator)
+    return mean
+
+
+def _add(
+    weights: dict[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, room: Tensor, rate: float
+) -> None:
+    """Add the gradient of -E, summed over rows, times the rate."""
+    weights["b"].add_(v.sum(0), alpha=rate)
+    weights["c1"].add_(h1.sum(0), alpha=rate)
+    weights["W"].addmm_(v.T, h1, alpha=rate)
+    if h2.shape[1]:
+        weights["c2"].add_(h2.sum(0), alpha=rate)
+        weights["J"].addmm_(h1.T, h2, alpha=rate)
+    known = (room >= 0).nonzero().squeeze(1)
+    if len(known) and len(weights["Q"]):
+        weights["Q"].index_add_(0, room[known], h1[known], alpha=rate)
