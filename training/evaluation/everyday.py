@@ -26,10 +26,25 @@ from training.evaluation.intervals import Metric
 from training.evaluation.metrics import Ratio
 from training.evaluation.setting import Outcome, Setting
 
-FOLDER = DATA.parent / "everyday"
+EVERYDAY = DATA.parent / "everyday"
 """Where the facts are looked for."""
 
 SOURCE = "facts"
+
+LINES = (
+    "relations: the fact is the likeliest of eight",
+    "relations: the fact is the likeliest vertical one",
+    "relations: the fact has p of at least .5",
+    "missing: an expected object is among five",
+    "missing_at: an expected object is among five",
+    "outliers: the intruder comes first",
+    "outliers: the intruder is flagged at the default",
+    "outliers: plain scenes with an alarm at the default",
+    "generate: the scene has what makes the room",
+    "generate: the scene has what never belongs",
+    "generate: scenes of fewer than three classes",
+)
+"""What is counted; of the alarm and the last two, less is better."""
 
 _VERTICAL = ("on-top", "under", "above", "below")
 _RELATIONS = 50
@@ -41,7 +56,7 @@ _FEW = 3
 Lines = dict[str, list[tuple[int, int]]]
 
 
-def facts_file(folder: Path = FOLDER) -> Path | None:
+def facts_file(folder: Path = EVERYDAY) -> Path | None:
     """The facts in a folder, if there are any."""
     path = folder / "facts.json"
     return path if path.is_file() else None
@@ -53,7 +68,7 @@ def facts_digest(folder: Path) -> str:
     return "" if path is None else sha256(path.read_bytes()).hexdigest()
 
 
-def ask_everyday(artifact: Artifact, folder: Path = FOLDER) -> dict[str, tuple[int, int]]:
+def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> dict[str, tuple[int, int]]:
     """The eleven lines: hits, of how many.
 
     Raises:
@@ -110,14 +125,7 @@ def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
 
 
 def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
-    lines: Lines = {
-        f"relations: the fact {ending}": []
-        for ending in (
-            "is the likeliest of eight",
-            "is the likeliest vertical one",
-            "has p of at least .5",
-        )
-    }
+    lines: Lines = {line: [] for line in LINES[:3]}
     likeliest, vertical, sure = lines.values()
     for fact in facts:
         relation = fact["relation"]
@@ -158,13 +166,20 @@ def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[reasoning.MissingAn
     scene = _scene(artifact, fact["objects"])
     at = None
     if "at" in fact:
-        places = [k for k, thing in enumerate(scene.objects) if thing.id == fact["at"]["object"]]
-        if not places:
+        if (anchor := _place(artifact, scene, fact["at"]["object"])) is None:
             return ()
-        at = fact["at"]["relation"], places[0]
+        at = fact["at"]["relation"], anchor
     if not scene.objects:
         return ()
     return reasoning.missing(artifact, scene, top_k=_LISTED, at=at)
+
+
+def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
+    """The object of that id, or the only one of the class that it names."""
+    index = artifact.vocabulary.index(name)
+    named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
+    places = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]
+    return places[0] if len(places) == 1 else None
 
 
 def _outliers(
@@ -179,11 +194,7 @@ def _outliers(
     for fact in plain:
         loud = any(answer.is_outlier for answer in _judged(artifact, fact["objects"]))
         alarms.append((int(loud), 1))
-    return {
-        "outliers: the intruder comes first": first,
-        "outliers: the intruder is flagged at the default": caught,
-        "outliers: plain scenes with an alarm at the default": alarms,
-    }
+    return dict(zip(LINES[5:8], (first, caught, alarms), strict=True))
 
 
 def _judged(artifact: Artifact, labels: Sequence[str]) -> tuple[reasoning.OutlierAnswer, ...]:
@@ -197,11 +208,7 @@ def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -
         typical.append((sum(bool(one & set(room["one_of"])) for one in drawn), len(drawn)))
         foreign.append((sum(bool(one & set(room["never"])) for one in drawn), len(drawn)))
         empty.append((sum(len(one) < _FEW for one in drawn), len(drawn)))
-    return {
-        "generate: the scene has what makes the room": typical,
-        "generate: the scene has what never belongs": foreign,
-        "generate: scenes of fewer than three classes": empty,
-    }
+    return dict(zip(LINES[8:], (typical, foreign, empty), strict=True))
 
 
 def _drawn(
