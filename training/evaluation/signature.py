@@ -181,20 +181,15 @@ def alarms(
 
 def signature_task(contender: Contender, setting: Setting) -> Outcome | None:
     """T3 signature; a baseline ranks by log-odds alone."""
-    if setting.train is None:
+    if setting.train is None or (contender.artifact is None and contender.objects is None):
         return None
-    return _law_task(contender, setting, by_signature(setting.scenes, setting.train))
-
-
-def _law_task(contender: Contender, setting: Setting, weights: Tensor) -> Outcome | None:
-    """hit@1 of the scenes that have an intruder under weights (N, V) of all scenes."""
-    if contender.artifact is None and contender.objects is None:
-        return None
-    drawn = draw_intruders(setting.scenes, setting.structure, weights, setting.seed)
+    every = by_signature(setting.scenes, setting.train)
+    drawn = draw_intruders(setting.scenes, setting.structure, every, setting.seed)
     index = (drawn >= 0).nonzero().squeeze(1)
     if not len(index):
         return None
-    scenes, own = _some(setting, index, weights)
+    scenes = replace(setting, scenes=subset(setting.scenes, index)).some()
+    own = by_signature(scenes, setting.train)
     if contender.artifact is None:
         assert contender.objects is not None  # one of the two is there  # noqa: S101
         scores = intruder_scores(
@@ -210,13 +205,6 @@ def _law_task(contender: Contender, setting: Setting, weights: Tensor) -> Outcom
     }
     metrics |= {f"caught, {name}": judged.caught(name) for name in SENSITIVITIES}
     return Outcome(metrics, len(scenes), 0)
-
-
-def _some(setting: Setting, index: Tensor, weights: Tensor) -> tuple[SceneTensors, Tensor]:
-    """At most `limit` of the scenes at some positions, with their rows of the weights."""
-    scenes = replace(setting, scenes=subset(setting.scenes, index)).some()
-    row = {scene.scene_id: k for k, scene in enumerate(setting.scenes.scenes)}
-    return scenes, weights[[row[scene.scene_id] for scene in scenes.scenes]]
 
 
 def sensitivity_task(contender: Contender, setting: Setting) -> Outcome | None:

@@ -139,7 +139,10 @@ def test_the_seed_protocol_has_a_section_of_its_own(finished, results):
 
 
 def test_the_shuffled_control_has_a_section_of_its_own(finished, results):
-    """With the rows that were wanted, and those that the others must fall to."""
+    """With the rows that were wanted, and those that the others must fall to.
+
+    So few scenes say nothing of what is typical of a room: T3 signature has no question.
+    """
     control = results["shuffled"]
     rows = {task: {cell["row"] for cell in part["cells"]} for task, part in control.items()}
     assert rows == {
@@ -147,7 +150,6 @@ def test_the_shuffled_control_has_a_section_of_its_own(finished, results):
         "T1 pairs": {"relation popularity", "frequency table"} | MACHINES,
         "T2 missing": {"popularity", "EASE"} | MACHINES,
         "T2 partial": {"popularity", "EASE"} | MACHINES,
-        "T3 signature": {"popularity", "EASE"} | MACHINES,
     }
     for task, part in control.items():
         assert {cell["task"] for cell in part["cells"]} == {task}

@@ -8,6 +8,7 @@ import torch
 
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
+from training.datasets import shuffle_objects
 from training.evaluation import signature
 from training.evaluation.asking import SENSITIVITIES, ask_every, judge, labels_alone
 from training.evaluation.contenders import Contender
@@ -130,6 +131,19 @@ def test_no_room_type_no_question():
     assert signature_task(contender, setting) is None
     assert signature_task(contender, Setting(DATA, STRUCTURE)) is None
     assert signature_task(Contender(), Setting(DATA, STRUCTURE, TRAIN)) is None
+
+
+def test_shuffled_scenes_have_no_signature():
+    """So the control takes its questions from the real ones, and popularity answers alike."""
+    shuffled = tensors(shuffle_objects(TRAIN.scenes, STRUCTURE.numpy(), seed=0), len(VOCABULARY))
+    assert torch.equal(shuffled.v.sum(0), TRAIN.v.sum(0))
+    assert signatures(shuffled).typical.sum() < signatures(TRAIN).typical.sum() / 4
+    found = []
+    for train in (TRAIN, shuffled):
+        popular = train.v.mean(0).clamp(1e-3, 1 - 1e-3).logit()
+        contender = Contender(objects=lambda v, p=popular: p.expand_as(v))
+        found.append(signature_task(contender, Setting(DATA, STRUCTURE, TRAIN)).metrics["hit@1"])
+    assert found[0].value == pytest.approx(found[1].value)
 
 
 def test_a_planted_cheater_is_caught(monkeypatch):
