@@ -40,6 +40,7 @@ from training.datasets import DatasetError
 from training.domain.command import init
 from training.domain.example import example
 from training.evaluation.cases import some_scenes
+from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, by_source, evaluate
 from training.evaluation.service import ServiceError, directly, over_http
 from training.evaluation.service import metrics as service_metrics
@@ -187,7 +188,12 @@ def evaluate_command(
                     tables |= _asked(url, reference, artifact, test, tensors.structure, limit)
                     continue
                 tables[reference] = evaluate(
-                    artifact, test, tensors.structure, tensors.train, progress=status.update
+                    artifact,
+                    test,
+                    tensors.structure,
+                    tensors.train,
+                    everyday=EVERYDAY,
+                    progress=status.update,
                 )
     except (ConfigError, DatasetError, RegistryError, ServiceError) as error:
         _fail(error)

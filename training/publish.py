@@ -21,6 +21,7 @@ from app.scene import Vocabulary
 from training.batches import SceneTensors
 from training.calibrate import calibrate
 from training.draft import as_stored, draft_artifact
+from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.offsets import fit_offsets
 from training.pipeline import SplitScenes
@@ -61,7 +62,14 @@ def publish_run(
     calibration = calibrated.calibration
     if judge is not None:
         judge(calibrated)
-    rows = evaluate(calibrated, data.test, data.structure, data.train, progress=progress)
+    rows = evaluate(
+        calibrated,
+        data.test,
+        data.structure,
+        data.train,
+        everyday=EVERYDAY,
+        progress=progress,
+    )
     progress("publishing")
     description = Description(
         name=run.config.name,

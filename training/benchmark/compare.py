@@ -9,6 +9,7 @@ from pathlib import Path
 from training.batches import seen_triples
 from training.benchmark.domains import Domain
 from training.benchmark.entries import (
+    RELATION_TASKS,
     Entry,
     Material,
     bare_machine_entry,
@@ -35,6 +36,7 @@ from training.benchmark.sections import (
 from training.benchmark.summary import Results, summarise
 from training.benchmark.workers import fill
 from training.config import Config, ConfigError, DataConfig
+from training.evaluation.everyday import EVERYDAY, facts_file
 from training.evaluation.report import SourceReport, settings_by_source
 from training.evaluation.seed_protocol import SEED_TASKS
 from training.evaluation.tasks import Setting
@@ -44,7 +46,6 @@ from training.pipeline import SplitScenes, prepare
 _QUICK_SCENES = 150
 _QUICK_EPOCHS = 2
 _QUICK_LIMIT = 30
-_RELATIONS = "T1a relations"
 QUICK_BASELINES = (
     "popularity",
     "EASE",
@@ -93,7 +94,7 @@ class Options:
         """
         found = tuple(task for task in YARDSTICKS if task in self.tasks)
         if not found:
-            raise ValueError(f"on shuffled scenes only {' and '.join(YARDSTICKS)} are asked")
+            raise ValueError(f"on shuffled scenes only {', '.join(YARDSTICKS)} are asked")
         return found
 
     def configs(self, domain: Domain, seed: int) -> list[Config]:
@@ -174,27 +175,35 @@ def compare_on_shuffled(
         ValueError: see `Options.shuffled_tasks`; it is relations alone, and there are none.
     """
     require_groups(domain)
-    scenes = _scenes(domain, data, options).shuffled(seed=0)
+    real = _scenes(domain, data, options)
+    scenes = real.shuffled(seed=0)
     tasks, names = options.shuffled_tasks(), options.chosen_baselines
-    plan = _plan(folder, scenes, options, tasks)
+    plan = _plan(folder, scenes, options, tasks, asked_by=real)
     if not plan.material.related:
-        tasks = tuple(task for task in tasks if task != _RELATIONS)
+        asked, tasks = tasks, tuple(task for task in tasks if task not in RELATION_TASKS)
         if not tasks:
-            raise ValueError(f"{domain.name} has no relations to shuffle: {_RELATIONS} is empty")
+            raise ValueError(
+                f"{domain.name} has no relations to shuffle: {', '.join(asked)} would be empty"
+            )
         plan = replace(plan, tasks=tasks)
     entries = [bare_machine_entry(config) for config in options.configs(domain, 0)]
+    # A baseline is fitted once, whichever tasks it is asked.
+    baselines: dict[str, Entry] = {}
     for task in tasks:
         yardstick, _ = YARDSTICKS[task]
-        entries += [
-            entry
+        baselines |= {
+            entry.name: entry
             for entry in plain_baseline_entries(0, task)
             if names is None or entry.name in (yardstick, *names)
-        ]
+        }
+    entries += baselines.values()
     title = f"{domain.name}, shuffled"
     reports = _measured(plan, entries, options, begin(title, plan_size(plan, entries)))
     weights = parameters(folder, entries)
     results = {
-        task: summarise(_of_task(reports, task), YARDSTICKS[task][0], weights) for task in tasks
+        task: summarise(found, yardstick, weights)
+        for task in tasks
+        if _answers(found := _of_task(reports, task), yardstick := YARDSTICKS[task][0])
     }
     write_shuffled(folder, results, scenes.digests)
     return results
@@ -225,6 +234,17 @@ def _of_task(reports: Measured, task: str) -> dict[tuple[str, int], dict[str, So
     }
 
 
+def _answers(reports: Measured, row: str) -> bool:
+    """The row was asked anything: not every set of scenes has every question."""
+    return any(
+        outcome is not None
+        for (name, _), by_source in reports.items()
+        if name == row
+        for report in by_source.values()
+        for outcome in report.outcomes.values()
+    )
+
+
 def plan_size(plan: Plan, entries: Sequence[Entry]) -> int:
     """(row, source) pairs."""
     return len(entries) * len(plan.settings)
@@ -235,13 +255,26 @@ def _scenes(domain: Domain, data: Path, options: Options) -> SplitScenes:
     return prepare(config, data)
 
 
-def _plan(folder: Path, scenes: SplitScenes, options: Options, tasks: tuple[str, ...]) -> Plan:
+def _plan(
+    folder: Path,
+    scenes: SplitScenes,
+    options: Options,
+    tasks: tuple[str, ...],
+    asked_by: SplitScenes | None = None,
+) -> Plan:
+    """What the rows that learn from some scenes are asked.
+
+    Args:
+        asked_by: whose training scenes say which questions are put; the same by default.
+    """
     material = Material.of(scenes)
     data = material.data
+    train = data.train if asked_by is None else asked_by.training_data().train
     seen = seen_triples(data.train.scenes, data.train.v.shape[1])
     limit = _QUICK_LIMIT if options.quick else options.limit
-    settings = dict(settings_by_source(data.test, data.structure, data.train, seen, limit=limit))
-    settings[POOLED] = Setting(data.test, data.structure, data.train, seen, limit)
+    settings = dict(settings_by_source(data.test, data.structure, train, seen, limit=limit))
+    facts = EVERYDAY if facts_file() else None
+    settings[POOLED] = Setting(data.test, data.structure, train, seen, limit, everyday=facts)
     return Plan(folder, material, settings, tasks)
 
 

@@ -78,6 +78,12 @@ class Material:
         return has_relations(self.data.train) and has_relations(self.data.validation)
 
 
+RELATION_TASKS = ("T1a relations", "T1 pairs")
+"""What a baseline of `RELATIONS` answers with nothing else fitted."""
+
+OBJECT_TASKS = ("T2 missing", "T2 partial", "T3 signature")
+"""The same for one of `OBJECTS`."""
+
 CALIBRATION = "calibration.json"
 """A machine's calibration, beside its run."""
 
@@ -143,21 +149,21 @@ def baseline_entries(
 
 
 def plain_baseline_entries(seed: int, task: str) -> Iterator[Entry]:
-    """Every baseline of one task, T1a or T2, fitted for that task alone.
+    """Every baseline of a task that asks for objects or relations alone, fitted for no other.
 
     Raises:
         ValueError: another task.
     """
-    if task == "T2 missing":
+    if task in OBJECT_TASKS:
         for objects in OBJECTS:
             identity = f"{objects.name}, seed {seed}"
             yield Entry(objects.name, seed, identity, partial(_objects_alone, objects, seed))
-    elif task == "T1a relations":
+    elif task in RELATION_TASKS:
         for relations in RELATIONS:
             identity = f"{relations.name}, seed {seed}"
             yield Entry(relations.name, seed, identity, partial(_relations, relations, seed))
     else:
-        raise ValueError(f"{task!r} is neither T1a relations nor T2 missing")
+        raise ValueError(f"{task!r} is none of {(*RELATION_TASKS, *OBJECT_TASKS)}")
 
 
 def reference_entries() -> Iterator[Entry]:

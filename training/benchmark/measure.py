@@ -19,7 +19,7 @@ from pathlib import Path
 
 from training.benchmark.entries import Entry, Material, Rival
 from training.evaluation.report import SourceReport, digest, measure, pooled
-from training.evaluation.tasks import WHOLE_SET, Setting
+from training.evaluation.tasks import ONCE, WHOLE_SET, Setting
 
 # Called with (row, source, what is being done).
 Progress = Callable[[str, str, str], None]
@@ -56,7 +56,9 @@ class Plan:
 
     def asked(self, source: str) -> list[str]:
         """The tasks that are measured on a source."""
-        return [task for task in self.tasks if source != POOLED or task in WHOLE_SET]
+        if source == POOLED:
+            return [task for task in self.tasks if task in WHOLE_SET]
+        return [task for task in self.tasks if task not in ONCE]
 
     def known(self, entry: Entry) -> dict[str, SourceReport]:
         """The finished reports of a row, by source.

@@ -26,7 +26,10 @@ SHUFFLED = "shuffled"
 
 YARDSTICKS = {
     "T1a relations": ("relation popularity", "R-precision, distinct classes"),
+    "T1 pairs": ("relation popularity", "accuracy"),
     "T2 missing": ("popularity", "MRR"),
+    "T2 partial": ("popularity", "MRR, 50 %"),
+    "T3 signature": ("popularity", "hit@1"),
 }
 """What rows that learnt from shuffled scenes are asked: the row they must fall to, and in what."""
 
@@ -132,9 +135,9 @@ def shuffled_text(shuffled: Mapping[str, Results]) -> str:
 
 Rows trained on scenes whose objects were permuted between scenes: each scene has as many classes as
 before and each class is in as many scenes, but what is there together is chance. Test scenes are
-real. To be expected: MRR falls to that of popularity, R-precision over distinct classes to that of
-relation popularity. A row that stays above was told something that training scenes do not say.
-A star: the row in bold is better, with the whole interval.
+real. To be expected: MRR and hit@1 fall to those of popularity, R-precision over distinct classes
+and the accuracy of pairs to those of relation popularity. A row that stays above was told something
+that training scenes do not say. A star: the row in bold is better, with the whole interval.
 """
     ]
     for task, results in shuffled.items():

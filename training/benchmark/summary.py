@@ -10,20 +10,43 @@ import numpy as np
 
 from training.benchmark.remarks import Asked, remarks
 from training.evaluation.answers import QUESTIONS
+from training.evaluation.asking import SENSITIVITIES
+from training.evaluation.everyday import LINES
+from training.evaluation.evidence import KINDS
 from training.evaluation.intervals import Figure, Floats, Metric, paired_difference
+from training.evaluation.partial import SHARES
 from training.evaluation.report import SourceReport
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
 
 PRIMARY: dict[str, tuple[str, ...]] = {
     "T1a relations": ("R-precision, distinct classes", "R-precision, instance counts"),
+    "T1 pairs": ("accuracy", "log-loss", "accuracy, unseen pairs"),
+    "T1 with evidence": tuple(f"change of R-precision, {kind}" for kind in KINDS[:2]),
     "T1b completion": ("R-precision",),
     "T2 missing": ("MRR", "top-1", "top-10"),
     "T2 missing, room type given": ("MRR", "MRR, room type withheld"),
+    "T2 partial": (
+        *(f"MRR, {share}" for share in SHARES),
+        "precision@5, 50 %",
+        "change of MRR, 50 %",
+    ),
+    "T2 with evidence": tuple(f"change of MRR, {kind}" for kind in KINDS),
     "T2-at missing at a place": ("MRR", "MRR, on-top"),
     "T3 outliers, uniform": ("hit@1", "AUROC", "alarms in untouched scenes", "intruders caught"),
     "T3 outliers, by popularity": ("hit@1",),
     "T3 outliers, same room type": ("hit@1",),
+    "T3 signature": (
+        "hit@1",
+        "hit@1, log-odds alone",
+        *(f"caught, {name}" for name in SENSITIVITIES),
+    ),
+    "T3 sensitivity": tuple(
+        f"{figure}, {name}"
+        for name in SENSITIVITIES
+        for figure in ("alarms", "caught, uniform", "caught, by popularity")
+    ),
+    "T3 with evidence": tuple(f"change of hit@1, {kind}" for kind in KINDS),
     "T3b placement": ("hit@1",),
     "T4 generate": (
         "MMD², free",
@@ -38,6 +61,7 @@ PRIMARY: dict[str, tuple[str, ...]] = {
     "Calibration": tuple(
         f"{figure}, {question}" for figure in ("ECE", "Brier skill") for question in QUESTIONS
     ),
+    "Everyday": LINES,
 }
 """What the Markdown tables show; the JSON holds every metric."""
 
@@ -58,7 +82,7 @@ SEED_PRIMARY: dict[str, tuple[str, ...]] = {
 UNLISTED = "An unlisted relation counts as wrong"
 """What a precision of relations means: annotators list a part of what holds."""
 
-_RELATION_TASKS = ("T1a", "T1b")
+_RELATION_TASKS = ("T1a", "T1b", "T1 with")
 
 _LOWER_IS_BETTER = (
     "MMD²",
@@ -69,6 +93,10 @@ _LOWER_IS_BETTER = (
     "alarms",
     "ECE",
     "error",
+    "log-loss",
+    "outliers: plain scenes with an alarm",
+    "generate: the scene has what never belongs",
+    "generate: scenes of fewer",
 )
 
 

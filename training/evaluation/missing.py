@@ -149,7 +149,7 @@ def _removed(
     removable = (scenes.v > 0) & ~structure
     enough = removable.sum(1) >= 2
     row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
-    probe = _Probe(len(row))
+    probe = Probe(len(row))
     for start in range(0, len(row), block):
         r, t = row[start : start + block], target[start : start + block]
         v = scenes.v[r].scatter(1, t.unsqueeze(1), 0.0)
@@ -160,7 +160,7 @@ def _removed(
     probe.ask_again(score)
 
 
-class _Probe:
+class Probe:
     """Rows of all blocks, shown once more in another order and company.
 
     Who knows whose turn it is, by counting or by relations that dangle where an object was, answers

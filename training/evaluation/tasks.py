@@ -6,7 +6,6 @@ A task that the contender does not take part in, or for which the scenes hold no
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -16,13 +15,17 @@ from torch import Tensor
 from app.scene import CANONICAL
 from training.batches import SceneTensors
 from training.evaluation.answers import QUESTIONS, collect, uncalibrated
-from training.evaluation.cases import some_scenes
 from training.evaluation.completion import complete_scenes
 from training.evaluation.contenders import Contender
 from training.evaluation.density import independent_density
+from training.evaluation.everyday import everyday_task
+from training.evaluation.evidence import (
+    missing_evidence_task,
+    outliers_evidence_task,
+    relations_evidence_task,
+)
 from training.evaluation.generation import (
     generation_metrics,
-    halves,
     independent_sampler,
     median_distance,
     scene_sampler,
@@ -35,6 +38,8 @@ from training.evaluation.missing import (
     missing_metrics,
 )
 from training.evaluation.outliers import by_popularity, by_room, intruder_scores
+from training.evaluation.pairs import pairs_task
+from training.evaluation.partial import partial_task
 from training.evaluation.placed import leave_one_out_at
 from training.evaluation.placement import placement_scores
 from training.evaluation.relations import (
@@ -45,68 +50,24 @@ from training.evaluation.relations import (
     score_scenes,
     unseen,
 )
+from training.evaluation.setting import Outcome, Setting, Task
+from training.evaluation.signature import sensitivity_task, signature_task
 from training.trainer import subset
+
+__all__ = [
+    "FIRST",
+    "ONCE",
+    "TASKS",
+    "WHOLE_SET",
+    "Outcome",
+    "Setting",
+    "Task",
+    "floor_contender",
+    "independent_contender",
+]
 
 _COSTLY = 3
 
-
-@dataclass(frozen=True, eq=False)
-class Setting:
-    """What a contender is asked about.
-
-    Attributes:
-        scenes: held-out scenes.
-        structure: (V,) bool.
-        train: training scenes of the same source or sources; tasks that need them are left out
-            where there are none.
-        seen: (T, 3), the triples that the contender may have learnt from.
-        limit: at most so many scenes where a task is slow: all but T1a, T1b and T2; a third of it
-            where a scene costs most: T2-at and Calibration.
-        seed: of the questions.
-    """
-
-    scenes: SceneTensors
-    structure: Tensor
-    train: SceneTensors | None = None
-    seen: Tensor | None = None
-    limit: int | None = 600
-    seed: int = 0
-
-    def some(self, related: bool = False, *, share: int = 1) -> SceneTensors:
-        """At most `limit` / `share` scenes, only annotated ones if `related`."""
-        scenes = self.scenes
-        if related:
-            kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
-            scenes = subset(scenes, torch.tensor(kept, dtype=torch.int64))
-        most = None if self.limit is None else max(1, self.limit // share)
-        return some_scenes(scenes, most, self.seed)
-
-    def halves(self) -> tuple[SceneTensors, SceneTensors]:
-        """Scenes to compare drawn ones with, and a second half, each within the limit."""
-        first, second = halves(self.scenes)
-        return (
-            some_scenes(first, self.limit, self.seed),
-            some_scenes(second, self.limit, self.seed),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Metrics of one task.
-
-    Attributes:
-        metrics: name to metric, the primary one first.
-        scenes, skipped: how many were asked about, and how many of them could not be scored.
-        notes: what has to be said beside the figures, such as a bandwidth.
-    """
-
-    metrics: dict[str, Metric]
-    scenes: int
-    skipped: int
-    notes: dict[str, float] = field(default_factory=dict)
-
-
-Task = Callable[[Contender, Setting], Outcome | None]
 
 FIRST = (1, 2, 5, 10, 20, 50, 100)
 """Numbers of predictions, per scene, among which annotated relations are looked for."""
@@ -367,7 +328,10 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
     return Outcome(metrics, len(scenes), skipped) if metrics else None
 
 
-WHOLE_SET = ("T4 generate",)
+ONCE = ("Everyday",)
+"""Tasks that do not depend on the scenes: measured on the set of all sources alone."""
+
+WHOLE_SET = ("T4 generate", *ONCE)
 """Tasks whose metrics are of a set of scenes as a whole: of several sources they are measured anew.
 
 The others' are pooled from what was found of each source.
@@ -375,15 +339,23 @@ The others' are pooled from what was found of each source.
 
 TASKS: dict[str, Task] = {
     "T1a relations": relations_task,
+    "T1 pairs": pairs_task,
+    "T1 with evidence": relations_evidence_task,
     "T1b completion": completion_task,
     "T2 missing": missing_task,
     "T2 missing, room type given": missing_in_room_task,
+    "T2 partial": partial_task,
+    "T2 with evidence": missing_evidence_task,
     "T2-at missing at a place": placed_task,
     "T3 outliers, uniform": outliers_task,
     "T3 outliers, by popularity": partial(outliers_task, law=by_popularity),
     "T3 outliers, same room type": partial(outliers_task, law=by_room),
+    "T3 signature": signature_task,
+    "T3 sensitivity": sensitivity_task,
+    "T3 with evidence": outliers_evidence_task,
     "T3b placement": placement_task,
     "T4 generate": generation_task,
     "Density": density_task,
     "Calibration": calibration_task,
+    "Everyday": everyday_task,
 }

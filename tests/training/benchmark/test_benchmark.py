@@ -24,7 +24,7 @@ from training.benchmark.domains import default_configs, read_domains
 from training.benchmark.entries import baseline_entries, plain_baseline_entries
 from training.benchmark.measure import slug
 from training.benchmark.plots import read_curve, recall_points
-from training.benchmark.sections import shuffled_text
+from training.benchmark.sections import YARDSTICKS, shuffled_text
 from training.benchmark.summary import Cell, Difference, Results, is_better
 from training.cli import app
 from training.config import ConfigError, load_config
@@ -139,12 +139,17 @@ def test_the_seed_protocol_has_a_section_of_its_own(finished, results):
 
 
 def test_the_shuffled_control_has_a_section_of_its_own(finished, results):
-    """With the rows that were wanted, and those that the others must fall to."""
+    """With the rows that were wanted, and those that the others must fall to.
+
+    So few scenes say nothing of what is typical of a room: T3 signature has no question.
+    """
     control = results["shuffled"]
     rows = {task: {cell["row"] for cell in part["cells"]} for task, part in control.items()}
     assert rows == {
         "T1a relations": {"relation popularity", "frequency table"} | MACHINES,
+        "T1 pairs": {"relation popularity", "frequency table"} | MACHINES,
         "T2 missing": {"popularity", "EASE"} | MACHINES,
+        "T2 partial": {"popularity", "EASE"} | MACHINES,
     }
     for task, part in control.items():
         assert {cell["task"] for cell in part["cells"]} == {task}
@@ -191,11 +196,11 @@ def test_rows_above_the_yardstick_are_named():
     assert "with the whole interval: no row." in none
 
 
-def test_only_two_tasks_are_asked_on_shuffled_scenes(tmp_path):
-    code, output = run(write(tmp_path), "--quick", "--shuffled", "--task", "T3", *HERE)
+def test_only_tasks_with_a_yardstick_are_asked_on_shuffled_scenes(tmp_path):
+    code, output = run(write(tmp_path), "--quick", "--shuffled", "--task", "T4", *HERE)
     assert code == 1
-    assert "only T1a relations and T2 missing are asked" in output
-    with pytest.raises(ValueError, match="'Density' is neither T1a relations nor T2 missing"):
+    assert f"only {', '.join(YARDSTICKS)} are asked" in output
+    with pytest.raises(ValueError, match="'Density' is none of"):
         list(plain_baseline_entries(0, "Density"))
 
 
@@ -289,7 +294,9 @@ def test_some_tasks_are_measured_and_the_rest_later(tmp_path, monkeypatch):
     code, output = run(*arguments, "--task", "T1")
     assert code == 0, output
     more = json.loads((tmp_path / "rooms/rooms-triway/seed-0/rooms.json").read_text())["tasks"]
-    assert set(more) == {"T2 missing", "T1a relations", "T1b completion"}
+    assert set(more) == {
+        "T2 missing", "T1a relations", "T1 pairs", "T1 with evidence", "T1b completion",
+    }  # fmt: skip
     kept, first = (t["T2 missing"]["outcome"]["metrics"]["MRR"]["made_of"] for t in (more, tasks))
     assert kept == first
 
@@ -362,7 +369,7 @@ def test_tasks_go_by_name_or_by_how_they_begin():
     assert "Density" not in chosen_tasks(None, quick=True)
     assert chosen_tasks(["T2 missing"], quick=True) == ("T2 missing",)
     assert chosen_tasks(["Density", "T1"], quick=True) == (
-        "T1a relations", "T1b completion", "Density",
+        "T1a relations", "T1 pairs", "T1 with evidence", "T1b completion", "Density",
     )  # fmt: skip
 
 

@@ -1,0 +1,52 @@
+"""The shipped default holds what it has reached on everyday facts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from app.registry import Store, load_model_set
+from training.evaluation.everyday import EVERYDAY, LINES, ask_everyday, facts_file
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+FOLDER = REPOSITORY / EVERYDAY
+
+AT_LEAST = {
+    "relations: the fact is the likeliest of eight": 16,
+    "relations: the fact is the likeliest vertical one": 31,
+    "relations: the fact has p of at least .5": 8,
+    "missing: an expected object is among five": 20,
+    "missing_at: an expected object is among five": 10,
+    "outliers: the intruder comes first": 65,
+    "outliers: the intruder is flagged at the default": 15,
+    "generate: the scene has what makes the room": 275,
+}
+AT_MOST = {
+    "outliers: plain scenes with an alarm at the default": 0,
+    "generate: the scene has what never belongs": 10,
+    "generate: scenes of fewer than three classes": 29,
+}
+ASKED = (43, 43, 43, 20, 10, 67, 67, 10, 320, 320, 320)
+
+
+@pytest.fixture(scope="module")
+def found() -> dict[str, tuple[int, int]]:
+    if facts_file(FOLDER) is None:
+        pytest.skip("the facts are not here")
+    return ask_everyday(
+        load_model_set(Store(REPOSITORY / "model_store")).resolve("default"), FOLDER
+    )
+
+
+def test_every_fact_is_asked(found):
+    assert tuple(asked for _, asked in found.values()) == ASKED
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_no_line_falls_back(found, line):
+    hits, _ = found[line]
+    if line in AT_LEAST:
+        assert hits >= AT_LEAST[line]
+    else:
+        assert hits <= AT_MOST[line]

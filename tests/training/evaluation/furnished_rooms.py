@@ -1,0 +1,39 @@
+"""Furnished rooms of the generator, and a model of them."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+
+from app.boltzmann import MachineSpec, build
+from app.registry import Artifact
+from training.batches import SceneTensors, scene_tensors
+from training.datasets import annotated_classes, encode, generate_rooms, rooms_vocabulary
+from training.draft import draft_artifact
+
+VOCABULARY = rooms_vocabulary()
+STRUCTURE = torch.from_numpy(VOCABULARY.structure.copy())
+
+
+@cache
+def rooms(count: int, seed: int) -> SceneTensors:
+    scenes = encode(generate_rooms(count, seed), VOCABULARY)
+    return scene_tensors(scenes, annotated_classes(scenes, VOCABULARY), len(VOCABULARY))
+
+
+@cache
+def room_model() -> Artifact:
+    """An untrained machine with random weights."""
+    spec = MachineSpec(
+        "triway", V=len(VOCABULARY), A=4, H1=6, K=3, T=0, C=len(VOCABULARY.room_types), form="local"
+    )
+    machine = build(spec)
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for parameter in machine.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
+    calibration = draft_artifact(machine, VOCABULARY).calibration
+    slope = calibration.outlier.model_copy(update={"slope": -1.0})
+    calibration = calibration.model_copy(update={"outlier": slope})
+    return draft_artifact(machine.eval().requires_grad_(False), VOCABULARY, calibration)

@@ -1,0 +1,193 @@
+"""Everyday facts: asked as a client of the service asks them, by one module, for acceptance."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import uvicorn
+
+from app.main import create_app
+from app.registry import Store, load_model_set
+from app.settings import Settings
+from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
+from training.evaluation.contenders import Contender
+from training.evaluation.everyday import (
+    EVERYDAY,
+    LINES,
+    ask_everyday,
+    everyday_task,
+    facts_digest,
+    facts_file,
+)
+from training.evaluation.report import SourceReport, digest, evaluate, run
+from training.evaluation.setting import Setting
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+FOLDER = REPOSITORY / EVERYDAY
+STORE = REPOSITORY / "model_store"
+ROOM = "bedroom"
+FACTS = {
+    "relations": [
+        {"subject": "lamp", "relation": "on-top", "object": "nightstand"},
+        {"subject": "lamp", "relation": "under", "object": "zeppelin"},
+        {"subject": "zeppelin", "relation": "under", "object": "airship"},
+    ],
+    "missing": [
+        {"objects": ["bed", "zeppelin"], "expected": ["pillow", "lamp"]},
+        {"objects": ["zeppelin"], "expected": ["pillow"]},
+    ],
+    "missing_at": [
+        {
+            "objects": ["bed", "nightstand"],
+            "at": {"relation": "on-top", "object": "nightstand"},
+            "expected": ["lamp", "book"],
+        },
+        {"objects": ["bed"], "at": {"relation": "on-top", "object": "desk"}, "expected": ["lamp"]},
+        {
+            "objects": ["bed", "nightstand"],
+            "at": {"relation": "on-top", "object": "night stand"},
+            "expected": ["lamp", "book"],
+        },
+    ],
+    "plain": [{"room": ROOM, "objects": ["bed", "pillow", "lamp"]}],
+    "intruders": [
+        {"room": ROOM, "objects": ["bed", "pillow", "lamp", "lamp"], "intruder": "toilet"}
+    ],
+    "rooms": [{"room": ROOM, "one_of": ["bed"], "never": ["toilet"]}],
+    "seeds": [5, 6],
+}
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    (tmp_path / "facts.json").write_text(json.dumps(FACTS))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[str]:
+    """The address of a service of the shipped store, in this process."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    app = create_app(Settings(store=STORE, access_log=False))
+    server = uvicorn.Server(uvicorn.Config(app, port=port, log_config=None))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    deadline = time.monotonic() + 60
+    while not server.started and time.monotonic() < deadline:
+        time.sleep(0.02)
+    yield f"http://127.0.0.1:{port}"
+    server.should_exit = True
+    thread.join()
+
+
+def score(monkeypatch, capsys, *arguments: str) -> dict[str, tuple[int, int]]:
+    """What the script that came with the facts prints."""
+    monkeypatch.setattr(sys, "argv", ["score.py", *arguments])
+    runpy.run_path(str(FOLDER / "score.py"), run_name="__main__")
+    lines: dict[str, str] = json.loads(capsys.readouterr().out)
+    return {name: tuple(map(int, value.split("/"))) for name, value in lines.items()}
+
+
+needs_facts = pytest.mark.skipif(facts_file(FOLDER) is None, reason="the facts are not here")
+
+
+@needs_facts
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["indoor-triway", "indoor-rbm", "everyday-triway"])
+@pytest.mark.parametrize("made", [False, True], ids=["the facts", "made ones"])
+def test_the_service_gives_the_same_eleven_lines(service, model, made, folder, monkeypatch, capsys):
+    place = folder if made else FOLDER
+    artifact = load_model_set(Store(STORE)).resolve(model)
+    expected = score(monkeypatch, capsys, service, str(place / "facts.json"), "--model", model)
+    found = ask_everyday(artifact, place)
+    assert found == expected
+    assert tuple(found) == LINES
+
+
+def test_unknown_labels_count_as_missed(folder):
+    found = ask_everyday(room_model(), folder)
+    assert [found[line][1] for line in LINES] == [3, 3, 3, 2, 3, 1, 1, 1, 16, 16, 16]
+    assert found["missing: an expected object is among five"][0] <= 1
+
+
+def test_the_task_has_a_metric_for_each_line(folder):
+    setting = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
+    contender = Contender(artifact=room_model())
+    outcome = everyday_task(contender, setting)
+    assert tuple(outcome.metrics) == LINES
+    for line, (hits, asked) in ask_everyday(room_model(), folder).items():
+        assert outcome.metrics[line].value == pytest.approx(hits / asked)
+        assert outcome.metrics[line].n == asked
+    assert everyday_task(Contender(), setting) is None
+
+
+def test_an_absent_folder_leaves_the_task_out(tmp_path):
+    contender = Contender(artifact=room_model())
+    for place in (None, tmp_path / "nowhere"):
+        assert everyday_task(contender, Setting(rooms(5, 1), STRUCTURE, everyday=place)) is None
+    with pytest.raises(FileNotFoundError, match=r"no facts\.json"):
+        ask_everyday(room_model(), tmp_path)
+    assert facts_digest(tmp_path) == ""
+
+
+def test_other_facts_are_other_questions(folder):
+    before = Setting(rooms(5, 1), STRUCTURE, everyday=folder)
+    report = SourceReport("pooled", digest(before))
+    assert list(run(Contender(), before, report, tasks=("Everyday",))) == ["Everyday"]
+    (folder / "facts.json").write_text(json.dumps(FACTS | {"seeds": [7]}))
+    with pytest.raises(ValueError, match="other scenes or questions"):
+        list(run(Contender(), before, report, tasks=("T2 missing",)))
+
+
+def test_a_card_has_the_lines_once(folder):
+    rows = evaluate(room_model(), rooms(8, 1), STRUCTURE, rooms(9, 2), limit=2, everyday=folder)
+    found = [(row.source, row.metric) for row in rows if row.task == "Everyday"]
+    assert found == [("facts", line) for line in LINES]
+
+
+def test_no_other_module_reads_the_facts():
+    """Neither the file nor its folder is named elsewhere (a domain of models has its name)."""
+    named = re.compile(r"facts\.json|shared/everyday|/\s*[\"']everyday\b|[\"']\S*/everyday\b")
+    own = REPOSITORY / "training/evaluation/everyday.py"
+    sources = [*(REPOSITORY / "training").rglob("*"), *(REPOSITORY / "app").rglob("*.py")]
+    for path in sources:
+        if path.suffix in (".py", ".toml", ".json") and path != own:
+            text = path.read_text(encoding="utf-8")
+            assert not named.search(text), f"{path} names the everyday facts"
+
+
+def test_no_training_or_tuning_asks_the_facts():
+    """What imports the module publishes or compares finished models."""
+    used = re.compile(r"evaluation(?:\.everyday| import everyday)|ask_everyday")
+    users = {
+        str(path.relative_to(REPOSITORY))
+        for path in (REPOSITORY / "training").rglob("*.py")
+        if used.search(path.read_text(encoding="utf-8"))
+    }
+    users.discard("training/evaluation/everyday.py")
+    assert users == {
+        "training/benchmark/compare.py",
+        "training/benchmark/summary.py",
+        "training/cli.py",
+        "training/evaluation/report.py",
+        "training/evaluation/tasks.py",
+        "training/publish.py",
+    }
+
+
+def test_publishing_asks_after_everything_is_fitted():
+    """The facts are opened by `evaluate` alone, which takes a calibrated model."""
+    text = (REPOSITORY / "training/publish.py").read_text(encoding="utf-8")
+    assert text.count("EVERYDAY") == 2
+    assert text.index("everyday=EVERYDAY") > text.index("judge(calibrated)")

@@ -1,0 +1,219 @@
+"""T1 pairs: which of eight relations is it, between two classes that stand one on another?
+
+Asked are the pairs of different classes of a scene for which a vertical relation (on-top, under,
+above, below) is listed, in that scene: all its objects are given as labels, no relation is. The
+eight are the four canonical relations, read both ways. A pair may have several listed relations;
+each of them is right.
+
+    accuracy   the likeliest of the eight is listed (ties in expectation)
+    log-loss   -log of the listed relations' share of the eight probabilities, in nats
+
+Structure classes are no ends. Scenes without such a pair are skipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from app.registry import Artifact
+from app.scene import CANONICAL
+from training.batches import SceneTensors, seen_triples
+from training.datasets import EncodedScene
+from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
+from training.evaluation.contenders import Contender
+from training.evaluation.intervals import Metric
+from training.evaluation.metrics import Ratio
+from training.evaluation.relations import RelationScore, telling
+from training.evaluation.setting import Outcome, Setting
+from training.trainer import subset
+
+VERTICAL = (CANONICAL.index("on-top"), CANONICAL.index("above"))
+
+# A relation that is held impossible costs this much at most, about 21 nats.
+_LEAST = 1e-9
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePairs:
+    """The asked pairs of one scene.
+
+    Attributes:
+        place: of the scene in its set; scene: it.
+        ends: (P, 2) places in the scene's classes, the first below the second.
+        listed: (P, 8) bool, relations of the first to the second, then back.
+    """
+
+    place: int
+    scene: EncodedScene
+    ends: NDArray[np.int64]
+    listed: NDArray[np.bool_]
+
+    @property
+    def classes(self) -> NDArray[np.int64]:
+        """(P, 2), the lower one first."""
+        ends: NDArray[np.int64] = self.scene.evidence.classes[self.ends]
+        return ends
+
+
+# Probabilities (P, 8) of the asked pairs of a scene.
+PairScore = Callable[[ScenePairs], Floats]
+
+
+def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
+    """The pairs of every scene that has any."""
+    plain = ~structure.numpy()
+    found = []
+    for place, scene in enumerate(scenes.scenes):
+        holds = scene.evidence.holds
+        vertical = holds[[a for a in VERTICAL if a < len(holds)]].any(0)
+        usable = plain[scene.evidence.classes]
+        pair = np.triu(vertical | vertical.T, 1) & usable[:, None] & usable
+        ends = np.argwhere(pair)
+        if len(ends):
+            x, y = ends.T
+            listed = np.concatenate([holds[:, x, y], holds[:, y, x]]).T
+            found.append(ScenePairs(place, scene, ends, listed))
+    return found
+
+
+def service_score(artifact: Artifact) -> PairScore:
+    """Probabilities of `/relations`, between the first instances of both classes."""
+
+    def score(asked: ScenePairs) -> Floats:
+        scene, own = asked.scene, asked.scene.evidence.classes
+        first = [int(np.flatnonzero(scene.instance_classes == c)[0]) for c in own]
+        ends = [(first[x], first[y]) for x, y in asked.ends.tolist()]
+        both = ends + [(y, x) for x, y in ends]
+        p = relation_probabilities(artifact, labels_alone(scene), both)
+        x, y = np.array(ends).T
+        return np.concatenate([p[:, x, y], p[:, y, x]]).T
+
+    return score
+
+
+def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
+    """The same of a score of relations by classes, whose values are log-odds."""
+
+    @torch.no_grad()
+    def score(asked: ScenePairs) -> Floats:
+        batch = scenes.batch(torch.tensor([asked.place]))
+        blind = telling(batch, torch.zeros_like(batch.observed))
+        p = relations(blind)[0].double().sigmoid().numpy()
+        x, y = asked.ends.T
+        return np.concatenate([p[:, x, y], p[:, y, x]]).T
+
+    return score
+
+
+@dataclass(frozen=True, eq=False)
+class PairAnswers:
+    """All asked pairs.
+
+    Attributes:
+        scene: (N,); classes: (N, 2); p: (N, 8); listed: (N, 8) bool.
+        scenes: how many were given.
+    """
+
+    scene: NDArray[np.int64]
+    classes: NDArray[np.int64]
+    p: Floats
+    listed: NDArray[np.bool_]
+    scenes: int
+
+    def where(self, mask: NDArray[np.bool_]) -> PairAnswers:
+        """Some of them."""
+        return PairAnswers(
+            self.scene[mask], self.classes[mask], self.p[mask], self.listed[mask], self.scenes
+        )
+
+    def accuracy(self) -> Ratio:
+        """The likeliest of the eight is listed."""
+        best = self.p == self.p.max(1, keepdims=True)
+        right = (best & self.listed).sum(1) / best.sum(1)
+        return Ratio.of_items(self.scene, right, self.scenes)
+
+    def upright(self) -> Ratio:
+        """The likeliest of the four vertical relations is listed."""
+        columns = [a + back for back in (0, self.p.shape[1] // 2) for a in VERTICAL]
+        return replace(self, p=self.p[:, columns], listed=self.listed[:, columns]).accuracy()
+
+    def log_loss(self) -> Ratio:
+        """-log of the listed relations' share."""
+        total = self.p.sum(1)
+        share = np.divide(
+            (self.p * self.listed).sum(1), total, where=total > 0, out=self.listed.mean(1)
+        )
+        return Ratio.of_items(self.scene, -np.log(np.maximum(share, _LEAST)), self.scenes)
+
+
+def answer_pairs(asked: list[ScenePairs], score: PairScore, scenes: int) -> PairAnswers:
+    """Ask for the pairs of all scenes.
+
+    Raises:
+        LeakError: see `ask_every`.
+    """
+    found = ask_every(score, asked)
+    return PairAnswers(
+        scene=np.repeat([one.place for one in asked], [len(one.ends) for one in asked]),
+        classes=np.concatenate([one.classes for one in asked]),
+        p=np.concatenate(found),
+        listed=np.concatenate([one.listed for one in asked]),
+        scenes=scenes,
+    )
+
+
+def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T1 pairs; the primary metric is the accuracy over all of them."""
+    if contender.artifact is None and contender.relations is None:
+        return None
+    related = {one.place for one in vertical_pairs(setting.scenes, setting.structure)}
+    if not related:
+        return None
+    index = torch.tensor(sorted(related), dtype=torch.int64)
+    scenes = replace(setting, scenes=subset(setting.scenes, index)).some()
+    asked = vertical_pairs(scenes, setting.structure)
+    if contender.artifact is not None:
+        score = service_score(contender.artifact)
+    else:
+        assert contender.relations is not None  # one of the two is there  # noqa: S101
+        score = baseline_score(scenes, contender.relations)
+    answers = answer_pairs(asked, score, len(scenes))
+    metrics: dict[str, Metric] = {
+        "accuracy": answers.accuracy(),
+        "accuracy, vertical": answers.upright(),
+        "log-loss": answers.log_loss(),
+    }
+    new = _unseen(answers.classes, setting)
+    if new is not None and new.any():
+        some = answers.where(new)
+        metrics["accuracy, unseen pairs"] = some.accuracy()
+        metrics["log-loss, unseen pairs"] = some.log_loss()
+    return Outcome(metrics, len(scenes), 0)
+
+
+def _unseen(classes: NDArray[np.int64], setting: Setting) -> NDArray[np.bool_] | None:
+    """(N,) no relation of the two classes is listed in training; None where that is unknown.
+
+    By all that the contender may have learnt from, which is more than scenes of one source.
+    """
+    V = setting.scenes.v.shape[1]
+    triples = setting.seen
+    if triples is None:
+        if setting.train is None:
+            return None
+        triples = seen_triples(setting.train.scenes, V)
+    known = np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1)
+    return ~np.isin(_keys(classes, V), _keys(known, V))
+
+
+def _keys(pairs: NDArray[np.int64], classes: int) -> NDArray[np.int64]:
+    keys: NDArray[np.int64] = pairs[:, 0] * classes + pairs[:, 1]
+    return keys
