@@ -132,7 +132,6 @@ class ObjectsConfig(_Section):
     learning_rate: float = Field(default=0.2, gt=0, description="at the start; falls to 0")
     chains: int = Field(default=64, ge=1)
     batch_size: int = Field(default=32, ge=1)
-    room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of withheld room types")
 
 
 class PolishConfig(_Section):

@@ -7,8 +7,11 @@ In the local form relations sum to one, so that log p(v) has a gradient of its o
 and the same for b, c1, c2, J and Q. The first expectation is a mean field (exact with one layer),
 the second runs over Gibbs chains that go on between the updates. The rate falls linearly to 0, so
 that the chains follow a machine that stands still in the end, and the weights are averaged over the
-last part of the run. Each chain keeps a room type (or none) of a training scene: data and chains
-have the same mixture of conditions.
+last part of the run.
+
+Room types come afterwards, with the other weights as they are: Q[t] by the gradient of
+log p(v | t), a few chains for each type. Trained together, the few chains of a type could not
+follow it.
 
 Scenes count by their weight, and only those whose object list is nearly complete take part.
 
@@ -35,6 +38,12 @@ OBJECT_WEIGHTS = ("b", "c1", "c2", "W", "J", "Q")
 # The last part of the run is averaged, by a running mean that then forgets as slowly as this.
 _AVERAGED = 0.3
 _FORGETTING = 0.002
+# The phase of the room types: chains and scenes of each type in an update, updates, rate, and the
+# precision of the weights in scenes.
+_PER_ROOM = 12
+_ROOM_UPDATES = 1500
+_ROOM_RATE = 0.2
+_ROOM_PRIOR = 0.5
 # Sweeps between the last update and the stored samples.
 _SWEEPS = 200
 # Updates between two calls of `progress`.
@@ -74,14 +83,14 @@ def fit_objects(
     if machine.spec.form != "local":
         raise ValueError("objects are trained by themselves in the local form only")
     generator = torch.Generator().manual_seed(seed)
-    scenes = _Scenes(train, config.room_dropout, generator)
-    weights = {name: machine.get_parameter(name) for name in OBJECT_WEIGHTS}
+    scenes = _Scenes(train, generator)
+    weights = {name: machine.get_parameter(name) for name in OBJECT_WEIGHTS if name != "Q"}
     updates = config.epochs * max(1, round(scenes.size / config.batch_size))
     with torch.no_grad():
-        chains = _begin(machine, *scenes.draw(config.chains))
+        chains = _begin(machine, *_withheld(*scenes.draw(config.chains)))
         average = {name: weight.clone() for name, weight in weights.items()}
         for update in range(updates):
-            v, room = scenes.draw(config.batch_size)
+            v, room = _withheld(*scenes.draw(config.batch_size))
             rate = config.learning_rate * (1 - update / updates)
             _update(machine, weights, v, room, chains, rate, generator)
             late = update - (1 - _AVERAGED) * updates
@@ -94,6 +103,39 @@ def fit_objects(
                 progress((update + 1) / updates)
         for name, weight in weights.items():
             weight.copy_(average[name])
+        _fit_rooms(machine, scenes, generator)
+
+
+def _withheld(v: Tensor, room: Tensor) -> tuple[Tensor, Tensor]:
+    return v, torch.full_like(room, -1)
+
+
+def _fit_rooms(machine: BoltzmannMachine, scenes: _Scenes, generator: torch.Generator) -> None:
+    """Train Q by log p(v | t), every room type of the scenes for itself."""
+    counts = torch.bincount(scenes.room[scenes.room >= 0], minlength=len(machine.Q))
+    rooms = counts.nonzero().squeeze(1)
+    if not len(rooms):
+        return
+    of = [(scenes.room == t).nonzero().squeeze(1) for t in rooms.tolist()]
+    room = rooms.repeat_interleave(_PER_ROOM)
+
+    def draw() -> Tensor:
+        picks = [
+            index[torch.randint(len(index), (_PER_ROOM,), generator=generator)] for index in of
+        ]
+        return scenes.v[torch.cat(picks)]
+
+    chains = _begin(machine, draw(), room)
+    decay = (_ROOM_PRIOR / counts[rooms]).unsqueeze(1)
+    average = machine.Q.clone()
+    for update in range(_ROOM_UPDATES):
+        rate = _ROOM_RATE * (1 - update / _ROOM_UPDATES)
+        data = mean_field(machine, Evidence(draw(), room=room)).y.sigmoid()
+        step = (data - _sweep(machine, chains, generator)).unflatten(0, (len(rooms), -1)).mean(1)
+        machine.Q[rooms] += rate * (step - decay * machine.Q[rooms])
+        late = update - (1 - _AVERAGED) * _ROOM_UPDATES
+        average.lerp_(machine.Q, 1.0 if late <= 0 else 1 / (late + 1))
+    machine.Q.copy_(average)
 
 
 @torch.no_grad()
@@ -107,7 +149,7 @@ def store_samples(
     if not machine.spec.N:
         return
     generator = torch.Generator().manual_seed(seed + 1)
-    scenes = _Scenes(train, 0.0, generator)
+    scenes = _Scenes(train, generator)
     v, room = scenes.draw(machine.spec.N)
     hidden = torch.rand(len(v), generator=generator) < room_dropout
     chains = _begin(machine, v, torch.where(hidden, -1, room))
@@ -120,17 +162,17 @@ def store_samples(
 class _Scenes:
     """Complete scenes, drawn by weight; `size` is their total weight."""
 
-    def __init__(self, train: SceneTensors, room_dropout: float, generator: torch.Generator):
+    def __init__(self, train: SceneTensors, generator: torch.Generator):
         kept = train.complete.nonzero().squeeze(1)
         if not len(kept):
             raise ValueError("no scene of the training part has a complete list of objects")
         self.v, self.room, self.weight = train.v[kept], train.room[kept], train.weight[kept]
         self.size = float(self.weight.sum())
-        self._dropout, self._generator = room_dropout, generator
+        self._generator = generator
         self._order, self._place = torch.zeros(0, dtype=torch.int64), 0
 
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
-        """Presence and room types of some scenes, (B, V) and (B,), a share of types withheld."""
+        """Presence and room types of some scenes, (B, V) and (B,)."""
         parts = []
         while count:
             if self._place == len(self._order):
@@ -139,8 +181,7 @@ class _Scenes:
             self._place, count = self._place + len(part), count - len(part)
             parts.append(part)
         index = torch.cat(parts)
-        hidden = torch.rand(len(index), generator=self._generator) < self._dropout
-        return self.v[index], torch.where(hidden, -1, self.room[index])
+        return self.v[index], self.room[index]
 
     def _shuffle(self) -> None:
         """A pass over the scenes: each as often as its weight says, in random order."""
@@ -168,9 +209,9 @@ def _update(
     generator: torch.Generator,
 ) -> None:
     field = mean_field(machine, Evidence(v, room=room))
-    _add(weights, v, field.y.sigmoid(), field.h2, room, rate / len(v))
+    _add(weights, v, field.y.sigmoid(), field.h2, rate / len(v))
     mean = _sweep(machine, chains, generator)
-    _add(weights, chains.v, mean, chains.h2, chains.room, -rate / len(chains.v))
+    _add(weights, chains.v, mean, chains.h2, -rate / len(chains.v))
 
 
 def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generator) -> Tensor:
@@ -187,9 +228,7 @@ def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generato
     return mean
 
 
-def _add(
-    weights: dict[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, room: Tensor, rate: float
-) -> None:
+def _add(weights: dict[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate: float) -> None:
     """Add the gradient of -E, summed over rows, times the rate."""
     weights["b"].add_(v.sum(0), alpha=rate)
     weights["c1"].add_(h1.sum(0), alpha=rate)
@@ -197,6 +236,3 @@ def _add(
     if h2.shape[1]:
         weights["c2"].add_(h2.sum(0), alpha=rate)
         weights["J"].addmm_(h1.T, h2, alpha=rate)
-    known = (room >= 0).nonzero().squeeze(1)
-    if len(known) and len(weights["Q"]):
-        weights["Q"].index_add_(0, room[known], h1[known], alpha=rate)

@@ -266,7 +266,7 @@ class Trainer:
             began = time.perf_counter()
             seed = self.config.training.seed
             fit_objects(self.machine, self.data.train, self.config.objects, seed, objects)
-            store_samples(self.machine, self.data.train, self.config.objects.room_dropout, seed)
+            store_samples(self.machine, self.data.train, self.config.objective.room_dropout, seed)
             self.objects_trained = True
             self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
             self.seconds += time.perf_counter() - began
