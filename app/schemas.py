@@ -383,8 +383,8 @@ class SceneWarning(Reply):
         Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"],
         Field(
             description="a position beyond 100 m (are these millimetres?); a side below 1 mm or "
-            "above 20 m; all objects equally far away; vertical relations unobserved for want of "
-            "sizes"
+            "above 20 m; one depth for all objects in an optical frame; vertical relations that "
+            "are unobserved because sizes are unknown"
         ),
     ]
     message: str

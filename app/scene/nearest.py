@@ -4,8 +4,9 @@
     words      the same last word, and how many of the others are shared: "coffee mug" is a "mug"
 
 The similarity of two names is the larger of the two. `training.evaluation.nearest` measures how
-often the nearest class is right; docs/decisions/labels.md holds the figures and those of word
-vectors, which did not help.
+often the nearest class is right. Word vectors are left out: the class with the largest cosine is
+right for 40 % of held-out aliases, and at no cosine for 85 % or more (GloVe 6B, 100 dimensions,
+20,000 words).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ misspelt names of the `indoor` vocabulary together: 1275 of 1335; of held-out al
 """
 
 _LEAST: Final = 0.6  # "asdf" is not a misspelt "scarf"
-_FARTHER: Final = 0.15  # a suggestion this much less similar than the best one is noise
+_FARTHER: Final = 0.1  # a suggestion this much less similar than the best one is noise
 
 
 class Match(NamedTuple):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from statistics import median
 from typing import Final, Literal
 
-from app.scene.frames import is_world_fixed
+from app.scene.frames import is_optical, is_world_fixed
 from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from app.schemas import SceneRequest, SceneWarning
@@ -47,11 +47,11 @@ def scene_warnings(
             f"a side below {SMALLEST * 1e3:g} mm or above {LARGEST:g} m: sizes are metres",
             [thing for thing in sized if not _is_plausible(thing.size)],
         )
-    if len(placed) >= _LEAST_FLAT and _is_flat(placed):
+    if request.frame_id is not None and is_optical(request.frame_id) and _is_flat(given):
         _add(
             found,
             "flat-scene",
-            "all positions are equally far along the viewing axis: is the depth missing?",
+            "all positions have one depth along the optical axis: is the depth missing?",
             placed,
         )
     if scene.poses is not None and len(placed) > 1:
@@ -88,10 +88,10 @@ def _is_plausible(size: Point | None) -> bool:
     return size is None or (min(size) >= SMALLEST and max(size) <= LARGEST)
 
 
-def _is_flat(placed: Sequence[SceneObject]) -> bool:
-    """Whether all have the same depth: x, in viewer axes."""
-    depths = [thing.position[0] for thing in placed if thing.position is not None]
-    return max(depths) - min(depths) <= _SAME_DEPTH
+def _is_flat(given: Scene) -> bool:
+    """Whether all have the same depth along the optical axis, which is x in body axes."""
+    depths = [thing.position[0] for thing in given.objects if thing.position is not None]
+    return len(depths) >= _LEAST_FLAT and max(depths) - min(depths) <= _SAME_DEPTH
 
 
 def _unsized(placed: Sequence[SceneObject], vocabulary: Vocabulary) -> list[SceneObject]:
