@@ -95,7 +95,7 @@ def main(artifact: Path) -> None:
     vocabulary = manifest.vocabulary.vocabulary()
     aliases, typos = held_out_aliases(vocabulary), misspelt(vocabulary)
     print(f"{len(aliases)} held-out aliases, {len(typos)} misspelt names; accepted, right:")
-    for threshold in (0.6, 0.7, 0.75, 0.8, ACCEPTED, 0.875, 0.9, 0.92):
+    for threshold in sorted({0.6, 0.7, 0.75, ACCEPTED, 0.85, 0.9}):
         parts = [precision(part, threshold) for part in (aliases, typos, aliases + typos)]
         text = "  ".join(f"{a:5} {r:5} {r / max(a, 1):6.1%}" for a, r in parts)
         print(f"{threshold:5.3f}  {text}")
