@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from app.schemas import (
+    Mapped,
     MissingOptions,
     ModelReference,
     Name,
@@ -21,6 +22,7 @@ from app.schemas import (
     Request,
     SceneObject,
     SceneRequest,
+    SceneWarning,
     Stamp,
 )
 
@@ -179,6 +181,10 @@ class AnswerMessage(Reply):
     frame_id: str | None = None
     stamp: Stamp | None = None
     ignored: list[str] = Field(default_factory=list)
+    mapped: list[Mapped] = Field(default_factory=list)
+    warnings: list[SceneWarning] = Field(default_factory=list)
+    coverage: Annotated[float | None, Field(description="as in the answer of `/missing`")] = None
+    threshold: Annotated[float | None, Field(description="as in the answer of `/outliers`")] = None
     changes: Annotated[
         dict[str, ListChanges], Field(description="lists by their names in the answers of POST")
     ]

@@ -29,6 +29,8 @@ MAX_SEED = 2**63 - 1
 MAX_RELATIONS = 65536
 """No setting allows more, and a million wrong ones would take seconds to name."""
 
+UnknownLabels = Literal["error", "ignore", "nearest"]
+Sensitivity = Literal["low", "medium", "high"]
 RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "above", "below"]
 
 
@@ -210,8 +212,11 @@ class SceneRequest(Request):
         Field(ge=0, le=MAX_SEED, description="only `/generate` draws; the others ignore it"),
     ] = None
     unknown_labels: Annotated[
-        Literal["error", "ignore"],
-        Field(description="refuse labels the model does not know, or answer without them"),
+        UnknownLabels,
+        Field(
+            description="labels the model does not know: refuse them, answer without them, or map "
+            "each to the nearest class (`mapped`); a label that is like none is refused"
+        ),
     ] = "error"
 
 
@@ -242,6 +247,17 @@ class RelationsRequest(RelationsOptions, SceneRequest):
 class MissingOptions(Request):
     """What `/missing` is asked beside the scene."""
 
+    coverage: Annotated[
+        float | None,
+        Field(
+            ge=0,
+            le=1,
+            allow_inf_nan=False,
+            description="probability that an object which is there is listed: 1 where the whole "
+            "scene is seen, so that an unlisted class counts as absent; 0 where unlisted classes "
+            "say nothing; left out: the model's own",
+        ),
+    ] = None
     top_k: Annotated[
         int, Field(ge=1, description="how many objects at most; not above the vocabulary")
     ] = 10
@@ -261,14 +277,21 @@ class MissingRequest(MissingOptions, SceneRequest):
 class OutliersOptions(Request):
     """What `/outliers` is asked beside the scene."""
 
+    sensitivity: Annotated[
+        Sensitivity,
+        Field(
+            description="how readily an alarm is raised: in about 2, 10 or 20 % of untouched "
+            "scenes of the hardest large source"
+        ),
+    ] = "medium"
     threshold: Annotated[
         float | None,
         Field(
             ge=0,
             le=1,
             allow_inf_nan=False,
-            description="call an object an outlier from this probability on; left out: the model's "
-            "own, which raises an alarm in at most 5 % of untouched scenes",
+            description="an object is an outlier from this probability on; left out: the model's "
+            "threshold for `sensitivity`",
         ),
     ] = None
 
@@ -341,6 +364,33 @@ class ObservedRelation:
     object: str
 
 
+class Mapped(Reply):
+    """A label that the model does not know, and the class that stands for it."""
+
+    model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
+
+    label: Annotated[str, Field(description="as given: of an object, a candidate, or the room")]
+    class_: Annotated[str, Field(alias="class", description="the canonical label")]
+    similarity: Annotated[
+        float, Field(ge=0, le=1, description="of the names, by spelling and common words")
+    ]
+
+
+class SceneWarning(Reply):
+    """Something in the scene that is probably a mistake. The scene is answered all the same."""
+
+    code: Annotated[
+        Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"],
+        Field(
+            description="a position beyond 100 m (are these millimetres?); a side below 1 mm or "
+            "above 20 m; one depth for all objects in an optical frame; vertical relations that "
+            "are unobserved because sizes are unknown"
+        ),
+    ]
+    message: str
+    objects: Annotated[list[str], Field(description="ids of the objects concerned")]
+
+
 class Answer(Reply):
     """What every answer carries."""
 
@@ -354,6 +404,16 @@ class Answer(Reply):
             description="with `unknown_labels: ignore`: ids of the objects, and the candidates and "
             "room type, that this model does not know and the answer left out"
         ),
+    ] = []
+    mapped: Annotated[
+        list[Mapped],
+        Field(
+            description="with `unknown_labels: nearest`: labels this model does not know, and the "
+            "class that each was taken for"
+        ),
+    ] = []
+    warnings: Annotated[
+        list[SceneWarning], Field(description="what is probably a mistake in the scene")
     ] = []
     observed_relations: Annotated[
         list[ObservedRelation] | None,
@@ -388,10 +448,21 @@ class Disagreement:
     observed_probability: Probability
 
 
-class RelationsAnswer(Answer):
-    """Relations, best first. `probability`: an annotator would list this relation for this pair."""
+class ExpectedRelation(ScoredRelation):
+    """A relation and the probability that it holds, given that both objects are in the scene."""
 
-    relations: list[ScoredRelation]
+    observed: Annotated[bool, Field(description="the request states it, or positions show it")] = (
+        False
+    )
+
+
+class RelationsAnswer(Answer):
+    """Relations, best first.
+
+    `probability`: the relation holds between the two, given that both are in the scene.
+    """
+
+    relations: list[ExpectedRelation]
     disagreements: Annotated[
         list[Disagreement],
         Field(
@@ -452,10 +523,10 @@ class Because:
 
 
 class MissingObject(Reply):
-    """A class that is absent.
+    """A class that is not listed.
 
-    `probability`: this is what was taken away, given that exactly one thing was. `log_odds`: of its
-    presence against its absence.
+    `probability`: the object is there although it was not listed, given `coverage`. `log_odds`: of
+    its presence, before calibration.
     """
 
     label: str
@@ -472,15 +543,20 @@ class MissingObject(Reply):
 
 
 class MissingAnswer(Answer):
-    """Absent classes, likeliest first; over all of them the probabilities sum to 1."""
+    """Unlisted classes, likeliest first; their probabilities do not sum to one."""
 
+    coverage: Annotated[
+        Probability | None,
+        Field(description="probability that a present object is listed, as it was in force"),
+    ] = None
     missing: list[MissingObject]
 
 
 class Outlier(Reply):
     """How badly one object fits.
 
-    `probability`: it is an intruder, where half of the scenes are clean.
+    `probability`: it does not belong, where half of the scenes hold an intruder. `log_odds`: of its
+    class being present, given the rest of the scene.
     """
 
     object: str
@@ -488,7 +564,25 @@ class Outlier(Reply):
     probability: Probability
     log_odds: Finite
     is_outlier: bool
-    because: list[Because]
+    because: Annotated[
+        list[Because],
+        Field(
+            description="objects that support the verdict, strongest first, at most 3: of an "
+            "outlier those that make it unlikely, of any other those that make it likely"
+        ),
+    ]
+    usually_with: Annotated[
+        list[str],
+        Field(description="of an outlier: absent classes that would make it likely, at most 3"),
+    ] = []
+
+
+class MisplacedRelation(ScoredRelation):
+    """A relation as the request spelled it, and the probability that it is false."""
+
+    is_misplaced: Annotated[
+        bool, Field(description="the probability reaches the threshold for `sensitivity`")
+    ] = False
 
 
 class OutliersAnswer(Answer):
@@ -497,8 +591,12 @@ class OutliersAnswer(Answer):
     In `misplaced`, `probability`: the relation is false.
     """
 
+    threshold: Annotated[
+        Probability | None,
+        Field(description="probability from which an object is an outlier, as it was in force"),
+    ] = None
     outliers: list[Outlier]
-    misplaced: list[ScoredRelation]
+    misplaced: list[MisplacedRelation]
 
 
 class GeneratedScene(Reply):

@@ -150,7 +150,8 @@ UNKNOWN_LABELS: Final = ProblemType(
     422,
     "The model does not know some of the labels",
     "`errors` points at each label and suggests the nearest known ones. With `unknown_labels` set "
-    "to `ignore` the service answers without them and lists them in `ignored`. "
+    "to `ignore` the service answers without them and lists them in `ignored`; with `nearest` it "
+    "maps each to the nearest class, lists it in `mapped`, and refuses labels that are like none. "
     "GET /models/{name}/vocabulary lists every label.",
 )
 CONTRADICTORY_EVIDENCE: Final = ProblemType(

@@ -89,6 +89,10 @@ _IGNORED: Final[dict[str, Any]] = {
     "objects": ["bed", "nightstand", "flux capacitor"],
     "unknown_labels": "ignore",
 }
+_NEAREST: Final[dict[str, Any]] = {
+    "objects": ["bed", "nigthstand", "big lamp"],
+    "unknown_labels": "nearest",
+}
 _UNKNOWN: Final = Example(
     "a label that the model does not know",
     {"objects": ["bed", "nigthstand"]},
@@ -115,6 +119,7 @@ _SCENES: Final[dict[str, Example]] = {
     "camera": Example("poses in a camera's optical frame, without sizes", _CAMERA),
     "map": Example("poses in a map, seen from a viewpoint", _MAP),
     "ignore": Example("without the labels that the model does not know", _IGNORED),
+    "nearest": Example("unknown labels mapped to the nearest class", _NEAREST),
 }
 _REFUSED: Final[dict[str, Example]] = {
     "unknown-labels": _UNKNOWN,
@@ -162,6 +167,10 @@ REQUESTS: Final[dict[str, dict[str, Example]]] = {
             "what is missing from the desk?",
             {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
         ),
+        "coverage": Example(
+            "the whole scene is listed: what is not listed is absent",
+            {**_LABELS, "coverage": 1.0},
+        ),
         "candidates": Example(
             "which of these is missing?",
             {**_LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3},
@@ -185,6 +194,10 @@ REQUESTS: Final[dict[str, dict[str, Example]]] = {
                     {"subject": "bed", "relation": "on-top", "object": "nightstand"},
                 ],
             },
+        ),
+        "sensitivity": Example(
+            "alarms more readily",
+            {"objects": [*_LABELS["objects"], "toilet"], "sensitivity": "high"},
         ),
         "threshold": Example(
             "a threshold of one's own",

@@ -14,7 +14,7 @@ _MODEL: Final = {
     "variant": "triway",
     "digest": "4e706b9f30e062589ec5cace2744da497a49f08f095626ee533c50f22dad94d4",
 }
-_ENVELOPE: Final = {"model": _MODEL, "request_id": _ID, "ignored": []}
+_ENVELOPE: Final = {"model": _MODEL, "request_id": _ID, "ignored": [], "mapped": [], "warnings": []}
 
 _UNKNOWN: Final = {
     "type": "/problems/unknown-labels",
@@ -38,8 +38,15 @@ _RELATIONS: Final = _ENVELOPE | {
             "relation": "on-top",
             "object": "nightstand_1",
             "probability": 0.83,
+            "observed": True,
         },
-        {"subject": "nightstand_1", "relation": "left", "object": "bed", "probability": 0.41},
+        {
+            "subject": "nightstand_1",
+            "relation": "left",
+            "object": "bed",
+            "probability": 0.41,
+            "observed": False,
+        },
     ],
     "disagreements": [
         {
@@ -53,6 +60,7 @@ _RELATIONS: Final = _ENVELOPE | {
     ],
 }
 _MISSING: Final = _ENVELOPE | {
+    "coverage": 0.5,
     "missing": [
         {
             "label": "pillow",
@@ -75,9 +83,10 @@ _MISSING: Final = _ENVELOPE | {
                 {"object": "lamp_1", "log_odds_change": -0.2},
             ],
         }
-    ]
+    ],
 }
 _OUTLIERS: Final = _ENVELOPE | {
+    "threshold": 0.7,
     "outliers": [
         {
             "object": "toilet",
@@ -86,6 +95,7 @@ _OUTLIERS: Final = _ENVELOPE | {
             "log_odds": -5.2,
             "is_outlier": True,
             "because": [{"object": "bed", "log_odds_change": -2.7}],
+            "usually_with": ["toilet paper", "sink", "faucet"],
         },
         {
             "object": "bed",
@@ -93,7 +103,8 @@ _OUTLIERS: Final = _ENVELOPE | {
             "probability": 0.03,
             "log_odds": 2.4,
             "is_outlier": False,
-            "because": [],
+            "because": [{"object": "lamp_1", "log_odds_change": 0.9}],
+            "usually_with": [],
         },
     ],
     "misplaced": [
@@ -102,6 +113,7 @@ _OUTLIERS: Final = _ENVELOPE | {
             "relation": "on-top",
             "object": "nightstand_1",
             "probability": 0.05,
+            "is_misplaced": False,
         }
     ],
 }

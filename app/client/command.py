@@ -36,7 +36,7 @@ from app.client.messages import MessageError
 from app.client.offline import OfflineClient
 from app.client.sync import Client
 from app.client.vision_msgs import from_message, is_message
-from app.schemas import RelationName
+from app.schemas import RelationName, Sensitivity, UnknownLabels
 
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
 
@@ -105,6 +105,8 @@ class Asked:
             # Whoever reads on has no margin: nothing is cut or wrapped.
             console.width = 10_000
         console.print(table(answer))
+        for note in tables.notes(answer):
+            print(note, file=sys.stderr)
 
 
 def _version(wanted: bool) -> None:
@@ -157,6 +159,12 @@ TopK = Annotated[int | None, typer.Option("--top-k", help="How many at most.")]
 Unknown = Annotated[
     bool, typer.Option("--ignore-unknown", help="Answer without labels the model does not know.")
 ]
+UnknownChoice = Annotated[
+    UnknownLabels | None,
+    typer.Option(
+        "--unknown-labels", help="Refuse them, ignore them, or take the nearest class of each."
+    ),
+]
 
 
 @app.command()
@@ -173,6 +181,7 @@ def relations(
         bool, typer.Option("--opposites", help="Also right, behind, under and below.")
     ] = False,
     ignore_unknown: Unknown = False,
+    unknown_labels: UnknownChoice = None,
 ) -> None:
     """How do these objects stand to each other?"""
     asked: Asked = context.obj
@@ -181,7 +190,7 @@ def relations(
             things,
             relation,
             room,
-            ignore_unknown,
+            _treatment(ignore_unknown, unknown_labels),
             top_k=top_k,
             min_probability=min_probability,
             include_opposites=opposites or None,
@@ -193,6 +202,9 @@ def relations(
 def missing(
     context: typer.Context,
     things: Things = None,
+    coverage: Annotated[
+        float | None, typer.Option(help="Share of what is there that is listed, 0 to 1.")
+    ] = None,
     at: Annotated[str | None, typer.Option(help='At this place, as in "on-top desk".')] = None,
     candidate: Annotated[
         list[str] | None, typer.Option(help="Only this label; repeatable.")
@@ -201,6 +213,7 @@ def missing(
     room: Room = None,
     top_k: TopK = None,
     ignore_unknown: Unknown = False,
+    unknown_labels: UnknownChoice = None,
 ) -> None:
     """What else should be here, and where?"""
     asked: Asked = context.obj
@@ -209,8 +222,9 @@ def missing(
             things,
             relation,
             room,
-            ignore_unknown,
+            _treatment(ignore_unknown, unknown_labels),
             top_k=top_k,
+            coverage=coverage,
             at=None if at is None else _anchor(at),
             candidates=candidate or None,
         )
@@ -221,17 +235,28 @@ def missing(
 def outliers(
     context: typer.Context,
     things: Things = None,
+    sensitivity: Annotated[
+        Sensitivity | None, typer.Option(help="How readily an alarm is raised.")
+    ] = None,
     threshold: Annotated[
         float | None, typer.Option(help="An outlier from this probability on.")
     ] = None,
     relation: Stated = None,
     room: Room = None,
     ignore_unknown: Unknown = False,
+    unknown_labels: UnknownChoice = None,
 ) -> None:
     """What does not belong here, or stands in the wrong place?"""
     asked: Asked = context.obj
     with _failing(), asked.open() as client:
-        request = _request(things, relation, room, ignore_unknown, threshold=threshold)
+        request = _request(
+            things,
+            relation,
+            room,
+            _treatment(ignore_unknown, unknown_labels),
+            sensitivity=sensitivity,
+            threshold=threshold,
+        )
         asked.show(client.outliers(request), tables.outliers)
 
 
@@ -250,6 +275,7 @@ def generate(
     relation: Stated = None,
     room: Room = None,
     ignore_unknown: Unknown = False,
+    unknown_labels: UnknownChoice = None,
 ) -> None:
     """What would a scene like this look like?"""
     asked: Asked = context.obj
@@ -261,7 +287,7 @@ def generate(
             things,
             relation,
             room,
-            ignore_unknown,
+            _treatment(ignore_unknown, unknown_labels),
             from_nothing=True,
             count=count,
             seed=seed,
@@ -321,7 +347,7 @@ def _request(
     things: list[str] | None,
     stated: list[str] | None,
     room: str | None,
-    ignore_unknown: bool,
+    unknown_labels: UnknownLabels | None,
     *,
     from_nothing: bool = False,
     **options: Any,
@@ -335,8 +361,15 @@ def _request(
     request = _read(files[0]) if files else {"objects": things or []}
     options["relations"] = [_relation(text) for text in stated] if stated else None
     options["room_type"] = room
-    options["unknown_labels"] = "ignore" if ignore_unknown else None
+    options["unknown_labels"] = unknown_labels
     return request | {name: value for name, value in options.items() if value is not None}
+
+
+def _treatment(ignore_unknown: bool, unknown_labels: UnknownLabels | None) -> UnknownLabels | None:
+    """Of unknown labels: `--ignore-unknown` is short for `--unknown-labels ignore`."""
+    if ignore_unknown and unknown_labels not in (None, "ignore"):
+        _fail("--ignore-unknown and --unknown-labels disagree", MEANINGLESS)
+    return "ignore" if ignore_unknown else unknown_labels
 
 
 def _is_file(thing: str) -> bool:

@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypedDict
 
-from app.schemas import Anchor, Detection, Pair, Relation, RelationName, Stamp, Viewpoint
+from app.schemas import (
+    Anchor,
+    Detection,
+    Pair,
+    Relation,
+    RelationName,
+    Sensitivity,
+    Stamp,
+    UnknownLabels,
+    Viewpoint,
+)
 
 Body: TypeAlias = Mapping[str, Any]
 """Any part of a request, as in the HTTP contract."""
@@ -25,7 +35,7 @@ class SceneFields(TypedDict, total=False):
     viewpoint: Viewpoint | Body
     model: str
     seed: int
-    unknown_labels: Literal["error", "ignore"]
+    unknown_labels: UnknownLabels
 
 
 class RelationsFields(SceneFields, total=False):
@@ -40,6 +50,7 @@ class RelationsFields(SceneFields, total=False):
 class MissingFields(SceneFields, total=False):
     """The fields of `MissingRequest`; ``at`` may be ``("on-top", "desk")``."""
 
+    coverage: float
     top_k: int
     candidates: Iterable[str]
     at: Anchor | Body | tuple[RelationName, str]
@@ -48,6 +59,7 @@ class MissingFields(SceneFields, total=False):
 class OutliersFields(SceneFields, total=False):
     """The fields of `OutliersRequest`."""
 
+    sensitivity: Sensitivity
     threshold: float
 
 

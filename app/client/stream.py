@@ -33,12 +33,13 @@ from app.messages import (
 from app.schemas import (
     Detection,
     Disagreement,
+    ExpectedRelation,
+    MisplacedRelation,
     MissingObject,
     ModelReference,
     ObservedRelation,
     Outlier,
     Problem,
-    ScoredRelation,
 )
 
 T = TypeVar("T")
@@ -294,14 +295,14 @@ class StreamClient:
         return self._parsed("outliers", list[Outlier])
 
     @property
-    def misplaced(self) -> list[ScoredRelation]:
+    def misplaced(self) -> list[MisplacedRelation]:
         """As `POST /outliers` gives them, least likely first."""
-        return self._parsed("misplaced", list[ScoredRelation])
+        return self._parsed("misplaced", list[MisplacedRelation])
 
     @property
-    def relations(self) -> list[ScoredRelation]:
+    def relations(self) -> list[ExpectedRelation]:
         """As `POST /relations` gives them, best first."""
-        return self._parsed("relations", list[ScoredRelation])
+        return self._parsed("relations", list[ExpectedRelation])
 
     @property
     def disagreements(self) -> list[Disagreement]:

@@ -29,10 +29,16 @@ MOST_MISPLACED: Final = 10
 def relations(answer: RelationsAnswer) -> RenderableType:
     """Relations, best first, and what was stated and is not believed."""
     rows = [
-        (entry.subject, entry.relation, entry.object, _share(entry.probability))
+        (
+            entry.subject,
+            entry.relation,
+            entry.object,
+            _share(entry.probability),
+            "observed" if getattr(entry, "observed", False) else "",
+        )
         for entry in answer.relations
     ]
-    stated = _table("subject", "relation", "object", "probability", rows=rows)
+    stated = _table("subject", "relation", "object", "probability", "", rows=rows)
     # A service of an earlier version says nothing of them.
     doubted = [
         (
@@ -75,21 +81,42 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
             f"{entry.log_odds:+.2f}",
             "outlier" if entry.is_outlier else "",
             _reasons(entry.because),
+            ", ".join(getattr(entry, "usually_with", None) or ()),
         )
         for entry in answer.outliers
     ]
-    found = _table("object", "label", "probability", "log-odds", "", "because", rows=rows)
+    heads = ("object", "label", "probability", "log-odds", "", "because", "usually with")
+    found = _table(*heads, rows=rows)
     if not answer.misplaced:
         return found
     wrong = [
-        (entry.subject, entry.relation, entry.object, _share(entry.probability))
+        (
+            entry.subject,
+            entry.relation,
+            entry.object,
+            _share(entry.probability),
+            "misplaced" if getattr(entry, "is_misplaced", False) else "",
+        )
         for entry in answer.misplaced[:MOST_MISPLACED]
     ]
-    columns = ("subject", "relation", "object", "probability of being wrong")
+    columns = ("subject", "relation", "object", "probability of being wrong", "")
     title = "relations as given"
     if len(wrong) < len(answer.misplaced):
         title += f": the {len(wrong)} likeliest to be wrong of {len(answer.misplaced)}"
     return Group(found, _table(*columns, rows=wrong, title=title))
+
+
+def notes(answer: Any) -> list[str]:
+    """What an answer says of its scene: labels that were mapped, and warnings."""
+    mapped = [
+        f"{entry.label}: taken for {entry.class_} (similarity {entry.similarity:.2f})"
+        for entry in getattr(answer, "mapped", None) or ()
+    ]
+    warnings = [
+        f"{entry.code}: {', '.join(entry.objects)}: {entry.message}"
+        for entry in getattr(answer, "warnings", None) or ()
+    ]
+    return mapped + warnings
 
 
 def generate(answer: GenerateAnswer) -> RenderableType:

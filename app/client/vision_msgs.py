@@ -89,7 +89,7 @@ def from_detection3d_array(
     min_score: float = 0.0,
     boxes: bool = True,
     viewpoint: Viewpoint | None = None,
-    unknown_labels: Literal["error", "ignore"] = "ignore",
+    unknown_labels: Literal["error", "ignore", "nearest"] = "ignore",
 ) -> SceneFields:
     """Objects with poses; the service derives their relations in the axes of ``frame_id``.
 
@@ -123,7 +123,7 @@ def from_detection2d_array(
     label_map: LabelMap | None = None,
     *,
     min_score: float = 0.0,
-    unknown_labels: Literal["error", "ignore"] = "ignore",
+    unknown_labels: Literal["error", "ignore", "nearest"] = "ignore",
 ) -> SceneFields:
     """Objects without poses, and which of two neighbours in the image is left of the other.
 
@@ -149,7 +149,7 @@ def from_message(
     min_score: float = 0.0,
     boxes: bool = True,
     viewpoint: Viewpoint | None = None,
-    unknown_labels: Literal["error", "ignore"] = "ignore",
+    unknown_labels: Literal["error", "ignore", "nearest"] = "ignore",
 ) -> SceneFields:
     """The fields of either message, told apart by its boxes.
 
@@ -382,8 +382,8 @@ class _Reader:
 
     def finish(self, fields: dict[str, Any], unknown_labels: str) -> SceneFields:
         """Add what stands in the header."""
-        if unknown_labels not in ("error", "ignore"):
-            raise MessageError("unknown_labels must be 'error' or 'ignore'")
+        if unknown_labels not in ("error", "ignore", "nearest"):
+            raise MessageError("unknown_labels must be 'error', 'ignore' or 'nearest'")
         fields["unknown_labels"] = unknown_labels
         if self.frame is not None:
             fields["frame_id"] = self.frame

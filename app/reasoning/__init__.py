@@ -20,13 +20,14 @@ from app.reasoning.answers import (
     MissingAnswer,
     Offset,
     OutlierAnswer,
+    OutliersFound,
     Placement,
     RelationAnswer,
 )
 from app.reasoning.contexts import contexts
 from app.reasoning.generate import generate
 from app.reasoning.missing import missing
-from app.reasoning.outliers import misplaced, outliers
+from app.reasoning.outliers import Sensitivity, misplaced, outliers
 from app.reasoning.relations import relations
 
 __all__ = [
@@ -38,8 +39,10 @@ __all__ = [
     "MissingAnswer",
     "Offset",
     "OutlierAnswer",
+    "OutliersFound",
     "Placement",
     "RelationAnswer",
+    "Sensitivity",
     "contexts",
     "generate",
     "misplaced",

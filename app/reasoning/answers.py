@@ -123,13 +123,31 @@ class OutlierAnswer(NamedTuple):
 
 
 class MisplacedAnswer(NamedTuple):
-    """A relation of the scene and the probability that it is false."""
+    """A relation of the scene and the probability that it is false.
+
+    Attributes:
+        is_misplaced: the probability reaches the threshold.
+    """
 
     subject: int
     relation: str
     object: int
     probability: float
     is_misplaced: bool = False
+
+
+class OutliersFound(NamedTuple):
+    """What does not belong, and what stands in the wrong place.
+
+    Attributes:
+        threshold: probability from which an object is an outlier.
+        outliers: every object, least fitting first.
+        misplaced: every stated relation, least likely first.
+    """
+
+    threshold: float
+    outliers: tuple[OutlierAnswer, ...]
+    misplaced: tuple[MisplacedAnswer, ...]
 
 
 @dataclass(frozen=True, slots=True)

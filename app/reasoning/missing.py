@@ -29,6 +29,7 @@ def missing(
     candidates: Sequence[int] | None = None,
     at: tuple[str, int] | None = None,
     axes: Axes | None = _VIEWER,
+    coverage: float | None = None,  # noqa: ARG001
     details: bool = True,
 ) -> tuple[MissingAnswer, ...]:
     """Absent classes by the probability that they were taken away, likeliest first.
@@ -43,6 +44,7 @@ def missing(
         at: (relation, position of an object): the missing thing stood so to that object.
         axes: the viewer's, in the frame that offsets are answered in (`viewer_axes`); None where
             nobody knows where the viewer looks.
+        coverage: probability that a class which is present is listed; by default the model's.
         details: also say where each would stand, and what speaks for it.
 
     Raises:

@@ -2,71 +2,115 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any, Final, Literal
 
-from app.reasoning.answers import Because, MisplacedAnswer, OutlierAnswer, entries
+import numpy as np
+from numpy.typing import NDArray
+
+from app.reasoning.answers import (
+    Because,
+    MisplacedAnswer,
+    OutlierAnswer,
+    OutliersFound,
+    entries,
+)
 from app.reasoning.calibration import false_log_odds, intruder_line, sigmoid
+from app.reasoning.companions import companions
 from app.reasoning.listing import least_fitting
 from app.reasoning.posterior import Posterior, posterior
 from app.reasoning.reasons import EXPLAINED, strongest_reasons
 from app.registry.artifact import Artifact
+from app.registry.description import Thresholds
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
 
+Sensitivity = Literal["low", "medium", "high"]
+
 # Reasons for one object cost n rows. Where a scene shows very many relations, they are given for
 # fewer objects, so that their rows hold about so many relation units in all.
-_REASON_UNITS = 1 << 22
+_REASON_UNITS: Final = 1 << 22
 
 
 def outliers(
-    artifact: Artifact, scene: Scene, *, threshold: float | None = None, details: bool = True
-) -> tuple[tuple[OutlierAnswer, ...], tuple[MisplacedAnswer, ...]]:
+    artifact: Artifact,
+    scene: Scene,
+    *,
+    sensitivity: Sensitivity = "medium",
+    threshold: float | None = None,
+    details: bool = True,
+) -> OutliersFound:
     """Every object, least fitting first, and every stated relation, least likely first.
 
     An object is judged by the log-odds of its class given the rest of the scene: all instances of
     the class, and all relations that touch it, are taken out first. So instances of one class
-    score alike. Ties go by position.
+    score alike. Intruders are often common things in the wrong room: their prior is proportional
+    to popularity^alpha, so alpha times the log-odds of the class in a training scene is subtracted
+    from its log-odds here. Ties go by position.
 
     Args:
-        threshold: probability from which an object is called an outlier; by default the model's.
-        details: also say what speaks for and against each object.
+        sensitivity: which of the model's thresholds decide.
+        threshold: probability from which an object is an outlier; replaces that of `sensitivity`.
+        details: also name the objects that support each verdict, and what goes with an outlier.
 
     Raises:
         ValueError: a threshold outside [0, 1].
     """
     calibration = artifact.calibration
     if threshold is None:
-        threshold = calibration.outlier_threshold
+        threshold = _threshold(calibration.outlier_thresholds, sensitivity)
     if not 0 <= threshold <= 1:
         raise ValueError(f"threshold must be in [0, 1], not {threshold}")
     if not scene.objects:
-        return (), ()
+        return OutliersFound(threshold, (), ())
     given = posterior(artifact, scene)
+    classes = given.present.classes
     log_odds = given.log_odds_given_rest()
     order, p = least_fitting(
-        *intruder_line(calibration, len(log_odds)), log_odds, given.present.row
+        *intruder_line(calibration, len(log_odds)),
+        _adjusted(artifact, classes, log_odds),
+        given.present.row,
     )
     row = given.present.row[order]
-    rows, probability, labels = row.tolist(), p[row], artifact.vocabulary.labels
+    rows, labels, is_outlier = row.tolist(), artifact.vocabulary.labels, p >= threshold
     explained = list(dict.fromkeys(rows[: _affordable(given)])) if details else []
-    reasons = _reasons(given, explained) if explained else {}
+    reasons = _reasons(given, explained, is_outlier) if explained else {}
+    flagged = [one for one in explained if is_outlier[one]]
+    usual = companions(artifact, classes, classes[flagged]) if flagged else []
+    company = dict(zip(flagged, usual, strict=True))
     found = entries(
         OutlierAnswer,
         order.tolist(),
-        [labels[index] for index in given.present.classes[row].tolist()],
-        probability.tolist(),
+        [labels[index] for index in classes[row].tolist()],
+        p[row].tolist(),
         log_odds[row].tolist(),
-        (probability >= threshold).tolist(),
+        is_outlier[row].tolist(),
         [reasons.get(one, ()) for one in rows],
+        [company.get(one, ()) for one in rows],
     )
-    return tuple(found), _misplaced(artifact, given, scene)
+    return OutliersFound(threshold, tuple(found), _misplaced(artifact, given, scene, sensitivity))
 
 
-def misplaced(artifact: Artifact, scene: Scene) -> tuple[MisplacedAnswer, ...]:
-    """Every stated relation, least likely first: what `outliers` says of them, and no more."""
+def misplaced(
+    artifact: Artifact, scene: Scene, *, sensitivity: Sensitivity = "medium"
+) -> tuple[MisplacedAnswer, ...]:
+    """Every stated relation, least likely first: the second list of `outliers` alone."""
     if not scene.objects:
         return ()
-    return _misplaced(artifact, posterior(artifact, scene), scene)
+    return _misplaced(artifact, posterior(artifact, scene), scene, sensitivity)
+
+
+def _threshold(presets: Thresholds, sensitivity: Sensitivity) -> float:
+    return {"low": presets.low, "medium": presets.medium, "high": presets.high}[sensitivity]
+
+
+def _adjusted(
+    artifact: Artifact, classes: NDArray[np.int64], log_odds: NDArray[np.floating[Any]]
+) -> NDArray[np.floating[Any]]:
+    """Log-odds of presence, less alpha times those of the class in a training scene, (n,)."""
+    popularity = artifact.popularity
+    if popularity is None:
+        return log_odds
+    return log_odds - artifact.calibration.popularity_weight * popularity[classes]
 
 
 def _affordable(given: Posterior) -> int:
@@ -75,30 +119,44 @@ def _affordable(given: Posterior) -> int:
     return min(EXPLAINED, max(1, _REASON_UNITS // per_object))
 
 
-def _reasons(given: Posterior, explained: list[int]) -> dict[int, tuple[Because, ...]]:
-    """For each explained class, the other classes that change its log-odds most."""
+def _reasons(
+    given: Posterior, explained: list[int], is_outlier: NDArray[np.bool_]
+) -> dict[int, tuple[Because, ...]]:
+    """For each explained class, the other classes that support its verdict most.
+
+    Of an outlier those that lower its log-odds, of any other those that raise it.
+    """
     if len(given.present.classes) < 2:
         return dict.fromkeys(explained, ())
     rows = np.array(explained, dtype=np.int64)
-    found = strongest_reasons(given.present, given.reasons(rows), rows)
-    return dict(zip(explained, found, strict=True))
+    change = given.reasons(rows)
+    change = np.where(is_outlier[rows, None] == (change < 0), change, 0)
+    found = strongest_reasons(given.present, change, rows)
+    return {
+        one: tuple([reason for reason in reasons if reason.log_odds_change])
+        for one, reasons in zip(explained, found, strict=True)
+    }
 
 
-def _misplaced(artifact: Artifact, given: Posterior, scene: Scene) -> tuple[MisplacedAnswer, ...]:
+def _misplaced(
+    artifact: Artifact, given: Posterior, scene: Scene, sensitivity: Sensitivity
+) -> tuple[MisplacedAnswer, ...]:
     """The scene's relations that the machine knows, least likely first, ties by their order."""
     stated = [triple for triple in scene.relations or () if triple[0] < artifact.machine.spec.A]
     if not stated:
         return ()
-    row = given.present.row
+    calibration, row = artifact.calibration, given.present.row
     relation, subject, object_ = np.array(stated).T.copy()
     log_odds = given.unit_log_odds(relation, row[subject], row[object_])
     order = np.argsort(log_odds, kind="stable")
+    p = sigmoid(false_log_odds(calibration, log_odds[order]))
     return tuple(
         entries(
             MisplacedAnswer,
             subject[order].tolist(),
             [CANONICAL[number] for number in relation[order].tolist()],
             object_[order].tolist(),
-            sigmoid(false_log_odds(artifact.calibration, log_odds[order])).tolist(),
+            p.tolist(),
+            (p >= _threshold(calibration.misplaced_thresholds, sensitivity)).tolist(),
         )
     )

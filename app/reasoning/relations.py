@@ -13,7 +13,7 @@ from app.reasoning.listing import likeliest_relations, pairs_of_things
 from app.reasoning.posterior import posterior, relations_given
 from app.reasoning.present import Present
 from app.registry.artifact import Artifact
-from app.scene.relations import CANONICAL, OPPOSITES
+from app.scene.relations import CANONICAL, OPPOSITES, canonicalise
 from app.scene.scene import Scene
 
 
@@ -64,7 +64,16 @@ def relations(
     names += tuple([OPPOSITES[name] for name in names])
     subjects, objects, kinds, probabilities = (values.tolist() for values in found)
     kinds = [names[kind] for kind in kinds]
-    answers = entries(RelationAnswer, subjects, kinds, objects, probabilities)
+    stated = set(scene.relations or ())
+    observed = (
+        [
+            canonicalise(subject, kind, object_) in stated
+            for subject, kind, object_ in zip(subjects, kinds, objects, strict=True)
+        ]
+        if stated
+        else [False] * len(kinds)
+    )
+    answers = entries(RelationAnswer, subjects, kinds, objects, probabilities, observed)
     return tuple(answers), disagreements(
         artifact, scene, given, asked, top_k=top_k, min_probability=min_probability
     )

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from app.registry.card import render_card
@@ -72,6 +73,17 @@ class Artifact:
     def relation_slopes(self) -> RelationSlopes:
         """The calibration of relations in arrays."""
         return RelationSlopes.of(self.calibration)
+
+    @cached_property
+    def popularity(self) -> NDArray[np.float64] | None:
+        """(V,) log-odds of each class in a training scene; None where the calibration has none."""
+        found = self.calibration.popularity
+        return np.array(found) if found else None
+
+    @cached_property
+    def empty_gain(self) -> NDArray[np.float32]:
+        """(V,) what the context adds to the log-odds of each class in an otherwise empty scene."""
+        return self.scorer.row_gain(self.machine.c1.detach().float().numpy())
 
     @cached_property
     def scene_chains(self) -> SceneChains | None:

@@ -128,6 +128,12 @@ def label_key(label: str) -> str:
     return label
 
 
+def split_words(label: str) -> tuple[str, ...]:
+    """The words of a label in the singular, folded as in `label_key`."""
+    folded = unicodedata.normalize("NFKC", label).casefold()
+    return tuple(singular(word) for word in _SEPARATORS.split(folded) if word)
+
+
 def _fold_unicode(label: str) -> str:
     composed = unicodedata.normalize("NFKC", label).casefold()
     return singular(_SEPARATORS.sub("", unicodedata.normalize("NFKC", composed)))

@@ -10,14 +10,11 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from rapidfuzz import fuzz, process
 
 from app.scene.labels import head_of, label_key
+from app.scene.nearest import Match, NameIndex
 
 Extents = tuple[float, float, float]
-
-# Below this similarity (0-100) a suggestion is noise: "asdf" is not a misspelt "scarf".
-_SUGGESTION_CUTOFF = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,24 +145,27 @@ class Vocabulary:
         return self._room_by_key.get(label_key(room))
 
     @cached_property
-    def _names(self) -> dict[str, int]:
-        return {name.casefold().replace("_", " "): i for name, i in self._by_spelling.items()}
+    def _names(self) -> NameIndex:
+        return NameIndex(list(self._by_spelling.items()))
+
+    @cached_property
+    def _room_names(self) -> NameIndex:
+        return NameIndex([(room, index) for index, room in enumerate(self._room_types)])
+
+    def nearest(self, label: str, limit: int = 3) -> tuple[Match, ...]:
+        """The classes with names like ``label``, most similar first; only plausible ones.
+
+        Compares with every name and alias: costs far more than `index`.
+        """
+        return self._names.nearest(label, limit)
+
+    def nearest_room(self, room: str, limit: int = 3) -> tuple[Match, ...]:
+        """The same for room types."""
+        return self._room_names.nearest(room, limit)
 
     def suggest(self, label: str, limit: int = 3) -> tuple[str, ...]:
-        """At most ``limit`` canonical labels whose names or aliases look most like ``label``.
-
-        Meant for error messages: it compares with every name, so it costs far more than `index`.
-        """
-        matches = process.extract(
-            label.casefold().replace("_", " "),
-            list(self._names),
-            scorer=fuzz.WRatio,
-            limit=4 * limit,
-            score_cutoff=_SUGGESTION_CUTOFF,
-        )
-        # Several aliases of one class may match; dict.fromkeys keeps the best place of each.
-        found = dict.fromkeys(self._objects[self._names[name]].label for name, _, _ in matches)
-        return tuple(found)[:limit]
+        """The canonical labels of the classes with names like ``label``, for error messages."""
+        return tuple(self._objects[match.entry].label for match in self.nearest(label, limit))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values; `from_dict` reads them back."""

@@ -7,16 +7,23 @@ write each as an object takes twice the time (docs/decisions/answers.md).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, TypeAlias
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic_core import from_json, to_json
 
 from app import reasoning
+from app.compiling import compiled
+from app.scene.relations import CANONICAL, canonicalise, opposite
 from app.schemas import ModelReference, SceneRequest
 from app.serving.reading import Reading
 
 Answer: TypeAlias = dict[str, Any]
+
+DIGITS: Final = 6
+"""Significant digits of probabilities, log-odds and metres."""
 
 
 def envelope(
@@ -28,10 +35,19 @@ def envelope(
         fields["frame_id"] = request.frame_id
     if request.stamp is not None:
         fields["stamp"] = request.stamp
-    fields["ignored"] = list(reading.ignored)
+    fields |= scene_notes(reading)
     if reading.observed is not None:
         fields["observed_relations"] = reading.observed
     return fields
+
+
+def scene_notes(reading: Reading) -> Answer:
+    """What every answer says of how the scene was read."""
+    return {
+        "ignored": list(reading.unknown.ignored),
+        "mapped": list(reading.unknown.mapped.values()),
+        "warnings": reading.warnings,
+    }
 
 
 def relations(
@@ -39,60 +55,89 @@ def relations(
     found: Sequence[reasoning.RelationAnswer],
     disagreements: Sequence[reasoning.Disagreement],
     reading: Reading,
+    *,
+    min_probability: float,
 ) -> Answer:
-    """See `app.schemas.RelationsAnswer`."""
+    """See `app.schemas.RelationsAnswer`; what is less likely when rounded is left out."""
     ids = reading.ids
-    envelope["relations"] = _scored(found, ids)
-    envelope["disagreements"] = [
+    rounded = significant([entry.probability for entry in found])
+    envelope["relations"] = [
         {
-            "subject": ids[entry.subject],
-            "object": ids[entry.object],
-            "observed": list(entry.observed),
-            "expected": entry.expected,
-            "probability": entry.probability,
-            "observed_probability": entry.observed_probability,
+            "subject": ids[x],
+            "relation": relation,
+            "object": ids[y],
+            "probability": probability,
+            "observed": observed,
         }
-        for entry in disagreements
+        for (x, relation, y, _, observed), probability in zip(found, rounded, strict=True)
+        if probability >= min_probability
     ]
+    envelope["disagreements"] = [_disagreement(entry, reading) for entry in disagreements]
     return envelope
 
 
-def missing(envelope: Answer, found: Sequence[reasoning.MissingAnswer], reading: Reading) -> Answer:
+def missing(
+    envelope: Answer,
+    coverage: float,
+    found: Sequence[reasoning.MissingAnswer],
+    reading: Reading,
+) -> Answer:
     """See `app.schemas.MissingAnswer`."""
     ids = reading.ids
+    envelope["coverage"] = coverage
+    numbers: list[float] = []
+    for _, probability, log_odds, placements, because in found:
+        numbers += probability, log_odds
+        for _, _, share, offset in placements:
+            numbers.append(share)
+            if offset is not None:
+                numbers += offset[0]
+                numbers += offset[1]
+        numbers += [change for _, change in because]
+    rounded = iter(significant(numbers))
     envelope["missing"] = [
         {
             "label": label,
-            "probability": probability,
-            "log_odds": log_odds,
-            "placements": [_placement(place, ids) for place in placements],
-            "because": _because(because, ids),
+            "probability": next(rounded),
+            "log_odds": next(rounded),
+            "placements": [_placement(place, ids, rounded) for place in placements],
+            "because": _because(because, ids, rounded),
         }
-        for label, probability, log_odds, placements, because in found
+        for label, _, _, placements, because in found
     ]
     return envelope
 
 
-def outliers(
-    envelope: Answer,
-    found: Sequence[reasoning.OutlierAnswer],
-    misplaced: Sequence[reasoning.MisplacedAnswer],
-    reading: Reading,
-) -> Answer:
+def outliers(envelope: Answer, found: reasoning.OutliersFound, reading: Reading) -> Answer:
     """See `app.schemas.OutliersAnswer`."""
     ids = reading.ids
+    envelope["threshold"] = float(f"{found.threshold:.{DIGITS}g}")
+    numbers: list[float] = []
+    for entry in found.outliers:
+        numbers += entry.probability, entry.log_odds
+        numbers += [change for _, change in entry.because]
+    numbers += [entry.probability for entry in found.misplaced]
+    rounded = iter(significant(numbers))
     envelope["outliers"] = [
         {
             "object": ids[place],
             "label": label,
-            "probability": probability,
-            "log_odds": log_odds,
+            "probability": next(rounded),
+            "log_odds": next(rounded),
             "is_outlier": is_outlier,
-            "because": _because(because, ids),
+            "because": _because(because, ids, rounded),
+            "usually_with": list(usually_with),
         }
-        for place, label, probability, log_odds, is_outlier, because in found
+        for place, label, _, _, is_outlier, because, usually_with in found.outliers
     ]
-    envelope["misplaced"] = _scored(misplaced, ids)
+    envelope["misplaced"] = [
+        {
+            **_spelled(entry.subject, entry.relation, entry.object, reading),
+            "probability": next(rounded),
+            "is_misplaced": entry.is_misplaced,
+        }
+        for entry in found.misplaced
+    ]
     return envelope
 
 
@@ -106,7 +151,7 @@ def generate(envelope: Answer, seed: int, drawn: Sequence[reasoning.GeneratedSce
                 {"subject": subject, "relation": relation, "object": other}
                 for subject, relation, other in scene.relations
             ],
-            "log_score": scene.log_score,
+            "log_score": float(f"{scene.log_score:.{DIGITS}g}"),
             "context": scene.context,
         }
         for scene in drawn
@@ -129,24 +174,74 @@ def written(answer: Any) -> bytes:
     return body
 
 
-def _because(causes: Sequence[reasoning.Because], ids: Sequence[str]) -> list[Answer]:
-    return [{"object": ids[place], "log_odds_change": change} for place, change in causes]
+def significant(numbers: Sequence[float]) -> list[float]:
+    """The same numbers to `DIGITS` significant digits."""
+    values = np.array(numbers, dtype=np.float64)
+    exact = _round(values)
+    rounded: list[float] = values.tolist()
+    if not exact:
+        return [float(f"{value:.{DIGITS}g}") for value in rounded]
+    return rounded
 
 
-def _scored(
-    found: Sequence[reasoning.RelationAnswer | reasoning.MisplacedAnswer], ids: Sequence[str]
+# Exact doubles: a whole number divided by one of them is the double nearest to the decimal number.
+_POWERS: Final = np.array([10.0**power for power in range(23)])
+
+
+@compiled
+def _round(values: NDArray[np.float64]) -> bool:
+    """Round numbers in place; False if one is too small or too large for exact powers of ten."""
+    exact = True
+    for k in range(len(values)):
+        size = np.abs(values[k])
+        if 1e-16 < size < 1e5:
+            shift = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
+            scale = _POWERS[shift]
+            values[k] = np.rint(values[k] * scale) / scale
+        elif size != 0.0:
+            exact = False
+    return exact
+
+
+def _because(
+    causes: Sequence[reasoning.Because], ids: Sequence[str], rounded: Iterator[float]
 ) -> list[Answer]:
-    return [
-        {"subject": ids[x], "relation": relation, "object": ids[y], "probability": probability}
-        for x, relation, y, probability in found
-    ]
+    return [{"object": ids[place], "log_odds_change": next(rounded)} for place, _ in causes]
 
 
-def _placement(place: reasoning.Placement, ids: Sequence[str]) -> Answer:
-    relation, object_, probability, offset = place
-    entry: Answer = {"relation": relation, "object": ids[object_], "probability": probability}
+def _placement(place: reasoning.Placement, ids: Sequence[str], rounded: Iterator[float]) -> Answer:
+    relation, object_, _, offset = place
+    entry: Answer = {"relation": relation, "object": ids[object_], "probability": next(rounded)}
     if offset is not None:
-        (x, y, z), (u, v, w), scenes = offset
-        mean, std = {"x": x, "y": y, "z": z}, {"x": u, "y": v, "z": w}
-        entry["offset"] = {"mean": mean, "std": std, "scenes": scenes}
+        mean = {"x": next(rounded), "y": next(rounded), "z": next(rounded)}
+        std = {"x": next(rounded), "y": next(rounded), "z": next(rounded)}
+        entry["offset"] = {"mean": mean, "std": std, "scenes": offset.scenes}
     return entry
+
+
+def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Answer:
+    """A canonical relation as the request spelled it."""
+    ids = reading.ids
+    if (CANONICAL.index(relation), subject, object_) in reading.flipped:
+        subject, relation, object_ = object_, opposite(relation), subject
+    return {"subject": ids[subject], "relation": relation, "object": ids[object_]}
+
+
+def _disagreement(entry: reasoning.Disagreement, reading: Reading) -> Answer:
+    """A disagreement from the end that the request spelled its relation from."""
+    subject, object_, observed, expected, probability, observed_probability = entry
+    triples = {canonicalise(subject, relation, object_) for relation in observed}
+    # Canonical triples of the pair from this end are flipped if the request spelled the other end.
+    from_here = {(triple[1] == subject) != (triple in reading.flipped) for triple in triples}
+    if from_here == {False} and reading.flipped:
+        subject, object_ = object_, subject
+        observed, expected = tuple(map(opposite, observed)), opposite(expected)
+    ids = reading.ids
+    return {
+        "subject": ids[subject],
+        "object": ids[object_],
+        "observed": list(observed),
+        "expected": expected,
+        "probability": float(f"{probability:.{DIGITS}g}"),
+        "observed_probability": float(f"{observed_probability:.{DIGITS}g}"),
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
+from dataclasses import replace
 
 from app import reasoning
 from app.scene.frames import viewer_axes
@@ -19,7 +20,7 @@ from app.serving import answers
 from app.serving.answers import Answer
 from app.serving.errors import Location, Reason
 from app.serving.models import ServedModel
-from app.serving.reading import Faults, Reading, unknown_label
+from app.serving.reading import Faults, Reading
 from app.serving.session import Session
 
 DRAWN_SEED_BITS = 53
@@ -40,12 +41,17 @@ async def relations(session: Session, request: RelationsRequest) -> Answer:
         reasoning.relations,
         reading.scene,
         top_k=request.top_k,
-        min_probability=request.min_probability,
+        # What is left out is decided by the probability as it is answered: rounded.
+        min_probability=request.min_probability * (1 - 1e-5),
         pairs=pairs,
         include_opposites=request.include_opposites,
     )
     return answers.relations(
-        _envelope(session, request, model, reading), found, disagreements, reading
+        _envelope(session, request, model, reading),
+        found,
+        disagreements,
+        reading,
+        min_probability=request.min_probability,
     )
 
 
@@ -57,12 +63,14 @@ async def missing(session: Session, request: MissingRequest) -> Answer:
         QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request)
+    if request.candidates is not None:
+        reading = replace(reading, unknown=reading.unknown.copy())
     faults = Faults()
     # The default is for vocabularies of any size; a number of one's own is not cut down in silence.
     if request.top_k > len(model.vocabulary) and "top_k" in request.model_fields_set:
         message = f"must not be above {len(model.vocabulary)}, the size of the model's vocabulary"
         faults.add(Reason.INVALID, ("top_k",), message)
-    candidates, dropped = _candidates(request, model, faults)
+    candidates = _candidates(request, model, reading, faults)
     at = _place(request, model, reading, faults)
     faults.raise_any()
     viewpoint = request.viewpoint
@@ -74,10 +82,12 @@ async def missing(session: Session, request: MissingRequest) -> Answer:
         candidates=candidates,
         at=at,
         axes=viewer_axes(request.frame_id, None if viewpoint is None else viewpoint.yaw),
+        coverage=request.coverage,
     )
-    envelope = _envelope(session, request, model, reading)
-    envelope["ignored"] += dropped
-    return answers.missing(envelope, found, reading)
+    coverage = request.coverage
+    if coverage is None:
+        coverage = model.artifact.calibration.coverage
+    return answers.missing(_envelope(session, request, model, reading), coverage, found, reading)
 
 
 async def outliers(session: Session, request: OutliersRequest) -> Answer:
@@ -88,10 +98,14 @@ async def outliers(session: Session, request: OutliersRequest) -> Answer:
         QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request)
-    found, misplaced = await session.ask(
-        model, reasoning.outliers, reading.scene, threshold=request.threshold
+    found = await session.ask(
+        model,
+        reasoning.outliers,
+        reading.scene,
+        sensitivity=request.sensitivity,
+        threshold=request.threshold,
     )
-    return answers.outliers(_envelope(session, request, model, reading), found, misplaced, reading)
+    return answers.outliers(_envelope(session, request, model, reading), found, reading)
 
 
 async def generate(session: Session, request: GenerateRequest) -> Answer:
@@ -150,22 +164,19 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
 
 
 def _candidates(
-    request: MissingRequest, model: ServedModel, faults: Faults
-) -> tuple[list[int] | None, list[str]]:
-    """Classes to rank, and the labels among them that were ignored."""
+    request: MissingRequest, model: ServedModel, reading: Reading, faults: Faults
+) -> list[int] | None:
+    """Classes to rank."""
     if request.candidates is None:
-        return None, []
+        return None
     indices: dict[int, None] = {}
-    dropped = []
     for place, label in enumerate(request.candidates):
         index = model.vocabulary.index(label)
+        if index is None:
+            index = reading.unknown.resolve(label, label, ("candidates", place), faults)
         if index is not None:
             indices[index] = None
-        elif request.unknown_labels == "ignore":
-            dropped.append(label)
-        else:
-            unknown_label(model.vocabulary, label, ("candidates", place), faults)
-    return list(indices), dropped
+    return list(indices)
 
 
 def _place(

@@ -8,23 +8,34 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from difflib import get_close_matches
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 from app.scene.frames import body_pose, is_optical
 from app.scene.geometry import Viewpoint
 from app.scene.labels import label_key
+from app.scene.nearest import ACCEPTED, Match
 from app.scene.observe import observe
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
-from app.schemas import Detection, ObservedRelation, SceneRequest
+from app.schemas import (
+    Detection,
+    Mapped,
+    ObservedRelation,
+    SceneRequest,
+    SceneWarning,
+    UnknownLabels,
+)
 from app.serving.errors import Fault, Location, Reason, RequestError
+from app.serving.warnings import scene_warnings
 
 MAX_SUGGESTED: Final = 32
-"""How many unknown labels of one request get suggestions."""
+"""How many unknown labels of one request are looked up, to suggest or to take the nearest class."""
+
+
+Triple = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,20 +72,93 @@ class Faults:
 
 
 @dataclass(slots=True)
+class Unknown:
+    """What becomes of the labels of one request that the model does not know.
+
+    Attributes:
+        treatment: `SceneRequest.unknown_labels`.
+        ignored: names of what was left out.
+        mapped: labels by the class that stands for each.
+    """
+
+    vocabulary: Vocabulary
+    treatment: UnknownLabels
+    ignored: list[str] = field(default_factory=list)
+    mapped: dict[str, Mapped] = field(default_factory=dict)
+    _looked_up: dict[tuple[str, bool], tuple[Match, ...]] = field(default_factory=dict)
+
+    def resolve(
+        self, label: str, name: str, location: Location, faults: Faults, *, is_room: bool = False
+    ) -> int | None:
+        """The class, or room type, that stands for an unknown label.
+
+        Args:
+            name: noted as ignored, where unknown labels are.
+            location: of the label, for the fault that is noted where it is refused.
+
+        Returns:
+            None where it is ignored or refused.
+        """
+        if self.treatment == "ignore":
+            self.ignored.append(name)
+            return None
+        matches = self._nearest(label, is_room=is_room)
+        known = self.vocabulary.room_types if is_room else self.vocabulary.labels
+        if self.treatment == "nearest" and matches and matches[0].similarity >= ACCEPTED:
+            found, similarity = matches[0]
+            self.mapped[label] = Mapped(
+                label=label, class_=known[found], similarity=round(similarity, 3)
+            )
+            return found
+        message = "the model does not know this label"
+        if is_room:
+            message = "the model does not know this room type"
+            if not known:
+                message = "this model knows no room types"
+        few = len(faults.found.get(Reason.UNKNOWN_LABELS, ())) < MAX_SUGGESTED
+        suggestions = [known[match.entry] for match in matches] if few else ()
+        faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)
+        return None
+
+    def copy(self) -> Unknown:
+        """For a question with labels of its own: the reading stays as it is."""
+        return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
+
+    def _nearest(self, label: str, *, is_room: bool) -> tuple[Match, ...]:
+        # A look-up takes about 0.1 ms, and a request may hold hundreds of unknown labels.
+        key = label, is_room
+        if key not in self._looked_up:
+            if len(self._looked_up) >= MAX_SUGGESTED:
+                return ()
+            look_up = self.vocabulary.nearest_room if is_room else self.vocabulary.nearest
+            self._looked_up[key] = look_up(label)
+        return self._looked_up[key]
+
+
+@dataclass(slots=True)
 class Reading:
     """A request as the models see it, made once and never changed.
 
     Attributes:
         scene: the known objects, what holds between them, and the room.
-        ignored: names of what the model does not know, left out as the request allowed.
+        unknown: what became of the labels that the model does not know.
         observed: relations derived from poses; None where there was nothing to derive from.
         names: how the request may name its objects.
+        flipped: canonical triples of `scene` that the request spelled from the other end.
+        warnings: what is probably a mistake.
     """
 
     scene: Scene
-    ignored: tuple[str, ...]
+    unknown: Unknown
     observed: list[ObservedRelation] | None
     names: Names
+    flipped: frozenset[Triple]
+    warnings: list[SceneWarning]
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """Names of what the model does not know, left out as the request allowed."""
+        return tuple(self.unknown.ignored)
 
     @property
     def ids(self) -> list[str]:
@@ -161,15 +245,16 @@ def read_scene(
     Raises:
         RequestError: everything that is wrong with it, of the gravest kind found.
     """
-    given, ignored, names = _given(request, vocabulary, limits, may_be_empty=may_be_empty)
+    given = _given(request, vocabulary, limits, may_be_empty=may_be_empty)
     scene = observe(
-        given,
+        given.scene,
         frame_id=request.frame_id,
         viewpoint=_viewpoint(request),
         typical_sizes=vocabulary.sizes,
     )
     observed = None if scene.poses is None else _relations(scene)
-    return Reading(scene, tuple(ignored), observed, names)
+    warnings = scene_warnings(given.scene, scene, vocabulary, request)
+    return Reading(scene, given.unknown, observed, given.names, given.flipped, warnings)
 
 
 def check_scene(request: SceneRequest, vocabulary: Vocabulary, limits: Limits) -> Names:
@@ -178,13 +263,21 @@ def check_scene(request: SceneRequest, vocabulary: Vocabulary, limits: Limits) -
     Raises:
         RequestError: as `read_scene`, which then reads it without fault.
     """
-    return _given(request, vocabulary, limits, may_be_empty=True)[2]
+    return _given(request, vocabulary, limits, may_be_empty=True).names
+
+
+class _Given(NamedTuple):
+    """What a request says; see `Reading`."""
+
+    scene: Scene
+    unknown: Unknown
+    names: Names
+    flipped: frozenset[Triple]
 
 
 def _given(
     request: SceneRequest, vocabulary: Vocabulary, limits: Limits, *, may_be_empty: bool
-) -> tuple[Scene, list[str], Names]:
-    """What a request says, the names of what is left out, and names for the rest."""
+) -> _Given:
     faults = Faults()
     if len(request.objects) > limits.objects:
         faults.add(
@@ -199,48 +292,35 @@ def _given(
     faults.raise_any()
 
     ids = _ids(request.objects, faults)
-    tolerant = request.unknown_labels == "ignore"
+    unknown = Unknown(vocabulary, request.unknown_labels)
     objects: list[SceneObject] = []
-    unknown: list[tuple[str, str]] = []
+    left_out: list[tuple[str, str]] = []
     optical = request.frame_id is not None and is_optical(request.frame_id)
     for place, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
         label = entry if isinstance(entry, str) else entry.label
         index = vocabulary.index(label)
-        if index is not None:
-            if isinstance(entry, str):
-                objects.append(SceneObject(name, label, index))
-            else:
-                objects.append(_scene_object(name, entry, index, optical=optical))
-        elif tolerant:
-            unknown.append((name, label))
-        else:
+        if index is None:
             location: Location = ("objects", place)
             if not isinstance(entry, str):
                 location = (*location, "label")
-            unknown_label(vocabulary, label, location, faults)
-    ignored = [name for name, _ in unknown]
-    room = _room(request, vocabulary, ignored, faults)
+            index = unknown.resolve(label, name, location, faults)
+        if index is None:
+            left_out.append((name, label))
+        elif isinstance(entry, str):
+            objects.append(SceneObject(name, label, index))
+        else:
+            objects.append(_scene_object(name, entry, index, optical=optical))
+    room = _room(request, vocabulary, unknown, faults)
     faults.raise_any()
     if not objects and not may_be_empty:
         faults.add(Reason.INVALID, ("objects",), "the model knows none of the objects")
         faults.raise_any()
 
-    names = Names(objects, unknown, vocabulary)
-    triples = _triples(request, names, tolerant, faults)
+    names = Names(objects, left_out, vocabulary)
+    triples, flipped = _triples(request, names, bool(left_out), faults)
     faults.raise_any()
-    return Scene(tuple(objects), triples, request.relations_complete, room), ignored, names
-
-
-def unknown_label(vocabulary: Vocabulary, label: str, location: Location, faults: Faults) -> None:
-    """Note a label that the vocabulary does not have, with the nearest ones it has."""
-    # A look through the whole vocabulary takes about 0.3 ms, and a request may hold hundreds.
-    affordable = len(faults.found.get(Reason.UNKNOWN_LABELS, ())) < MAX_SUGGESTED
-    faults.add(
-        Reason.UNKNOWN_LABELS,
-        location,
-        "the model does not know this label",
-        vocabulary.suggest(label) if affordable else (),
-    )
+    scene = Scene(tuple(objects), triples, request.relations_complete, room)
+    return _Given(scene, unknown, names, flipped)
 
 
 def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
@@ -300,36 +380,29 @@ def _scene_object(
 
 
 def _room(
-    request: SceneRequest, vocabulary: Vocabulary, ignored: list[str], faults: Faults
+    request: SceneRequest, vocabulary: Vocabulary, unknown: Unknown, faults: Faults
 ) -> int | None:
-    if request.room_type is None:
+    name = request.room_type
+    if name is None:
         return None
-    room = vocabulary.room_index(request.room_type)
+    room = vocabulary.room_index(name)
     if room is not None:
         return room
-    if request.unknown_labels == "ignore":
-        ignored.append(request.room_type)
-    else:
-        faults.add(
-            Reason.UNKNOWN_LABELS,
-            ("room_type",),
-            "the model does not know this room type"
-            if vocabulary.room_types
-            else "this model knows no room types",
-            get_close_matches(request.room_type.casefold(), vocabulary.room_types),
-        )
-    return None
+    return unknown.resolve(name, name, ("room_type",), faults, is_room=True)
 
 
 def _triples(
-    request: SceneRequest, names: Names, tolerant: bool, faults: Faults
-) -> tuple[tuple[int, int, int], ...] | None:
+    request: SceneRequest, names: Names, some_ignored: bool, faults: Faults
+) -> tuple[tuple[Triple, ...] | None, frozenset[Triple]]:
+    """The canonical triples, and those of them that are spelled from the other end."""
     if request.relations is None:
-        return None
-    triples: dict[tuple[int, int, int], None] = {}
+        return None, frozenset()
+    triples: dict[Triple, bool] = {}
     for place, relation in enumerate(request.relations):
         location: Location = ("relations", place)
-        if tolerant and (names.is_ignored(relation.subject) or names.is_ignored(relation.object)):
+        if some_ignored and (
+            names.is_ignored(relation.subject) or names.is_ignored(relation.object)
+        ):
             continue
         subject = names.find(relation.subject, (*location, "subject"), faults)
         other = names.find(relation.object, (*location, "object"), faults)
@@ -343,8 +416,8 @@ def _triples(
         if (index, j, i) in triples:
             message = "contradicts an earlier relation, which says the opposite of this pair"
             faults.add(Reason.CONTRADICTION, location, message)
-        triples[index, i, j] = None
-    return tuple(triples)
+        triples.setdefault((index, i, j), i != subject)
+    return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])
 
 
 def _viewpoint(request: SceneRequest) -> Viewpoint | None:

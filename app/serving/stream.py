@@ -35,7 +35,7 @@ from app.schemas import (
     SceneRequest,
 )
 from app.serving import questions
-from app.serving.answers import written
+from app.serving.answers import scene_notes, written
 from app.serving.errors import Fault, Location, Reason, RequestError
 from app.serving.metrics import Metrics
 from app.serving.reading import Faults, Names
@@ -48,6 +48,7 @@ _DEFAULT_ASK: Final = Ask(missing=MissingOptions(), outliers=OutliersOptions())
 # What a whole scene leaves as it is, unless it says otherwise.
 _KEPT: Final = frozenset({"model", "unknown_labels"})
 _FIELDS: Final = frozenset(SceneRequest.model_fields) - {"objects", "seed"}
+_IN_FORCE: Final = frozenset({"coverage", "threshold"})
 _ANSWERS: Final[dict[str, type[Answer]]] = {
     "missing": MissingAnswer,
     "outliers": OutliersAnswer,
@@ -228,13 +229,16 @@ class _Found:
     """Whole answers about one scene.
 
     Attributes:
+        notes: fields of `Answer` about the scene: what was ignored or mapped, and warnings.
+        in_force: settings of the answers that may be the model's own.
         lists: the lists of the answers, by name, as JSON has them.
         failures: questions that this scene cannot be asked.
     """
 
     model: ModelReference
     request: SceneRequest
-    ignored: list[str]
+    notes: dict[str, Any]
+    in_force: dict[str, Any]
     lists: dict[str, list[Entry]]
     failures: dict[str, RequestError]
 
@@ -242,7 +246,7 @@ class _Found:
 async def _answer(state: SceneState, view: Session) -> _Found:
     request = state.request()
     model, reading = view.read(request, may_be_empty=True)
-    found = _Found(model.reference, request, list(reading.ignored), {}, {})
+    found = _Found(model.reference, request, scene_notes(reading), {}, {}, {})
     if reading.observed is not None:
         found.lists["observed_relations"] = [
             {"subject": seen.subject, "relation": seen.relation, "object": seen.object}
@@ -271,6 +275,7 @@ async def _answer(state: SceneState, view: Session) -> _Found:
             # Without the frames, of which one has this dictionary.
             found.failures[name] = error.with_traceback(None)
         else:
+            found.in_force.update({own: answer[own] for own in _IN_FORCE & answer.keys()})
             lists = {own: answer[own] for own in _own(_ANSWERS[name])}
             written(lists)  # no number that is not finite leaves, as in an answer to a request
             found.lists.update(lists)
@@ -279,7 +284,9 @@ async def _answer(state: SceneState, view: Session) -> _Found:
 
 def _own(kind: type[Answer]) -> list[str]:
     """The lists that one question's answer has and the others' have not."""
-    return [name for name in kind.model_fields if name not in Answer.model_fields]
+    return [
+        name for name in kind.model_fields if name not in Answer.model_fields.keys() | _IN_FORCE
+    ]
 
 
 def _alarms(before: Mapping[str, list[Entry]], after: Mapping[str, list[Entry]]) -> Alarms:
@@ -371,7 +378,8 @@ class StreamSession:
             model=found.model,
             frame_id=found.request.frame_id,
             stamp=found.request.stamp,
-            ignored=found.ignored,
+            **found.notes,
+            **found.in_force,
             changes=changes,
             dropped=dropped,
             alarms=_alarms(lists, found.lists),

@@ -11,6 +11,7 @@ from app.registry import Artifact
 from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
+from app.serving.answers import significant
 
 STEPS = 1
 """Gibbs sweeps of the drawing: more take their time and warm nothing further."""
@@ -39,9 +40,10 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
         for one in (scene, bare):
             reasoning.missing(artifact, one, at=("on-top", 0))
             reasoning.missing(artifact, one, at=("under", 0))
-    outliers, misplaced = reasoning.outliers(artifact, scene)
+    # With threshold 0 every object is an outlier: reasons and companions are asked for, too.
+    _, outliers, misplaced = reasoning.outliers(artifact, scene, threshold=0.0)
     for one in scenes[1:]:
-        outliers += reasoning.outliers(artifact, one)[0]
+        outliers += reasoning.outliers(artifact, one).outliers
     generated = reasoning.generate(artifact, scene, count=2, seed=0, steps=STEPS)
     numbers = [entry.probability for both in stand for found in both for entry in found]
     numbers += [number for entry in missing for number in (entry.probability, entry.log_odds)]
@@ -49,7 +51,7 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     numbers += [number for entry in outliers for number in (entry.probability, entry.log_odds)]
     numbers += [entry.probability for entry in misplaced]
     numbers += [entry.log_score for entry in generated]
-    if not all(map(math.isfinite, numbers)):
+    if not all(map(math.isfinite, significant(numbers))):
         raise ValueError("the model gives answers that are not finite")
     return reasoning.contexts(artifact)
 

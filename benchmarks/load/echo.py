@@ -20,7 +20,9 @@ from app.schemas import (
     Because,
     Detection,
     Disagreement,
+    ExpectedRelation,
     Health,
+    MisplacedRelation,
     MissingAnswer,
     MissingObject,
     MissingRequest,
@@ -34,7 +36,6 @@ from app.schemas import (
     RelationsAnswer,
     RelationsRequest,
     SceneRequest,
-    ScoredRelation,
     Vector,
 )
 from app.serving.logs import log_config
@@ -88,7 +89,7 @@ async def relations(request: RelationsRequest, request_id: RequestId) -> Relatio
     return RelationsAnswer(
         **_envelope(request, request_id),
         relations=[
-            ScoredRelation(
+            ExpectedRelation(
                 subject=names[k % len(names)],
                 relation="left",
                 object=names[-1 - k % len(names)],
@@ -153,7 +154,7 @@ async def outliers(request: OutliersRequest, request_id: RequestId) -> OutliersA
             for name in names
         ],
         misplaced=[
-            ScoredRelation(
+            MisplacedRelation(
                 subject=relation.subject,
                 relation=relation.relation,
                 object=relation.object,

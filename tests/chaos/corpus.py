@@ -77,11 +77,12 @@ VALID: Final[dict[str, dict[str, Any]]] = {
     },
     "/missing": SCENE
     | {
+        "coverage": 0.5,
         "top_k": 3,
         "candidates": ["chair", "pillow"],
         "at": {"relation": "on-top", "object": "desk_1"},
     },
-    "/outliers": SCENE | {"threshold": 0.5},
+    "/outliers": SCENE | {"sensitivity": "high", "threshold": 0.5},
     "/generate": SCENE | {"count": 1, "steps": 2, "temperature": 1.0, "context": {"h1": [0, 1]}},
     ALIAS: {"model": "home@1.1.0", "expected": "home@1.1.0"},
 }

@@ -18,6 +18,7 @@ import pytest
 from app import reasoning
 from app.registry import Artifact, Store
 from app.schemas import MissingRequest
+from app.serving.answers import significant
 from app.serving.reading import Limits, read_scene
 from benchmarks.load.connections import prepared
 from tests.chaos.load import ConstantLoad
@@ -52,7 +53,9 @@ def offline(artifact: Artifact) -> Answers:
         request = MissingRequest.model_validate(body)
         scene = read_scene(request, artifact.vocabulary, Limits()).scene
         found = reasoning.missing(artifact, scene, top_k=request.top_k)
-        answers.append([(entry.label, entry.probability, entry.log_odds) for entry in found])
+        rounded = [significant([entry.probability, entry.log_odds]) for entry in found]
+        labels = [entry.label for entry in found]
+        answers.append([(name, *pair) for name, pair in zip(labels, rounded, strict=True)])
     return answers
 
 

@@ -33,6 +33,10 @@ def say(stream: ClientConnection, kind: str, **fields: Any) -> None:
     stream.send(json.dumps({"type": kind, **fields}))
 
 
+NOTES = {"ignored", "mapped", "warnings"}
+"""Lists of an answer that are about the scene."""
+
+
 def hear(stream: ClientConnection) -> dict[str, Any]:
     """The next message."""
     found: dict[str, Any] = json.loads(stream.recv(timeout=30))
@@ -53,8 +57,7 @@ def posted(client: httpx.Client, scene: dict[str, Any], ask: dict[str, Any]) -> 
         assert response.status_code == 200, response.text
         own = response.json().items()
         lists |= {name: value for name, value in own if isinstance(value, list)}
-    lists.pop("ignored")
-    return lists
+    return {name: own for name, own in lists.items() if name not in NOTES}
 
 
 def updates(count: int, seed: int, *, poses: bool = True) -> Iterator[tuple[dict, dict]]:

@@ -87,8 +87,9 @@ async def test_a_defect_spoils_one_entry_only(
         if any(thing.label == "sofa" for thing in scene.objects):
             if fault == "raised":
                 raise ZeroDivisionError("secret detail")
-            ((first, *others), misplaced) = real(artifact, scene, **parameters)
-            return (first._replace(log_odds=fault), *others), misplaced
+            found = real(artifact, scene, **parameters)
+            first, *others = found.outliers
+            return found._replace(outliers=(first._replace(log_odds=fault), *others))
         return real(artifact, scene, **parameters)
 
     monkeypatch.setattr(questions.reasoning, "outliers", fail_on_sofas)

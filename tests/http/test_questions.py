@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from app.schemas import (
     OutliersAnswer,
     RelationsAnswer,
 )
+from app.serving.answers import significant
 from tests.http.conftest import serve
 from tests.http.stores import VOCABULARY, publish
 
@@ -162,17 +164,15 @@ async def test_disagreements_name_the_pairs_as_they_were_stated(
     """Whatever is stated of a pair, the same is expected of it."""
     monkeypatch.setattr(import_module("app.reasoning.disagreements"), "EXPECTED", 0)
     objects = ["bed", "chair", {"id": "l", "label": "lamp"}]
-    expected = []
+    expected: list[str] = []
     for relation in (*CANONICAL, *map(opposite, CANONICAL)):
         stated = [{"subject": "l", "relation": relation, "object": "bed"}]
         answer = await ask(client, "relations", objects=objects, relations=stated)
         for entry in answer["disagreements"]:
-            canonical = relation in CANONICAL
-            ends = [entry["subject"], entry["object"]]
-            assert ends == (["l", "bed"] if canonical else ["bed", "l"])
-            assert entry["observed"] == [relation if canonical else opposite(relation)]
+            assert [entry["subject"], entry["object"]] == ["l", "bed"]
+            assert entry["observed"] == [relation]
             assert entry["probability"] > entry["observed_probability"]
-            expected.append(entry["expected"] if canonical else opposite(entry["expected"]))
+            expected.append(entry["expected"])
             assert expected[-1] != relation
     # All but the likeliest relation itself.
     assert len(expected) == 7
@@ -342,3 +342,115 @@ async def test_the_place_that_was_asked_about_comes_first(client: httpx.AsyncCli
             values = [other["probability"] for other in others]
             assert values == sorted(values, reverse=True)
             assert len(entry["placements"]) == 3
+
+
+# ----------------------------------------------------------------------- what is in force, notes
+
+
+async def test_coverage_is_the_models_unless_given(client: httpx.AsyncClient) -> None:
+    assert (await ask(client, "missing", **SCENE))["coverage"] == 0.5
+    assert (await ask(client, "missing", **SCENE, coverage=0.125))["coverage"] == 0.125
+    for wrong in (-0.1, 1.5, "0.5", True):
+        response = await client.post("/missing", json=SCENE | {"coverage": wrong})
+        assert response.status_code == 422
+
+
+async def test_sensitivity_is_medium_unless_given(client: httpx.AsyncClient) -> None:
+    plain = await ask(client, "outliers", **SCENE)
+    assert plain["threshold"] == 0.5
+    medium = await ask(client, "outliers", **SCENE, sensitivity="medium")
+    assert medium | {"request_id": ""} == plain | {"request_id": ""}
+    own = await ask(client, "outliers", **SCENE, sensitivity="low", threshold=0.25)
+    assert own["threshold"] == 0.25
+    response = await client.post("/outliers", json=SCENE | {"sensitivity": "utmost"})
+    assert response.status_code == 422
+
+
+async def test_misplaced_relations_are_spelled_as_in_the_request(
+    client: httpx.AsyncClient,
+) -> None:
+    given = [
+        {"subject": "lamp", "relation": "under", "object": "bed"},
+        {"subject": "lamp", "relation": "left", "object": "bed"},
+        {"subject": "desk", "relation": "behind", "object": "lamp"},
+    ]
+    answer = await ask(client, "outliers", objects=["bed", "lamp", "desk"], relations=given)
+    found = [
+        {name: one[name] for name in ("subject", "relation", "object")}
+        for one in answer["misplaced"]
+    ]
+    assert sorted(found, key=str) == sorted(given, key=str)
+    assert all(type(one["is_misplaced"]) is bool for one in answer["misplaced"])
+
+
+async def test_observed_relations_are_marked_from_either_end(client: httpx.AsyncClient) -> None:
+    given = [{"subject": "bed", "relation": "right", "object": "lamp"}]
+    answer = await ask(
+        client,
+        "relations",
+        objects=["bed", "lamp", "desk"],
+        relations=given,
+        include_opposites=True,
+        top_k=4096,
+    )
+    marked = {
+        (one["subject"], one["relation"], one["object"])
+        for one in answer["relations"]
+        if one["observed"]
+    }
+    assert marked == {("bed", "right", "lamp"), ("lamp", "left", "bed")}
+
+
+async def test_mapped_labels_are_told_with_their_class(client: httpx.AsyncClient) -> None:
+    answer = await ask(
+        client,
+        "missing",
+        objects=["bed", "nigthstand"],
+        candidates=["TV", "big lamp"],
+        unknown_labels="nearest",
+    )
+    mapped = [(one["label"], one["class"]) for one in answer["mapped"]]
+    assert mapped == [("nigthstand", "nightstand"), ("big lamp", "lamp")]
+    assert {one["label"] for one in answer["missing"]} == {"television", "lamp"}
+    response = await client.post(
+        "/missing", json={"objects": ["bed"], "candidates": ["droid"], "unknown_labels": "nearest"}
+    )
+    assert response.status_code == 422
+    assert response.json()["errors"][0]["pointer"] == "#/candidates/0"
+
+
+async def test_every_answer_has_its_notes(client: httpx.AsyncClient) -> None:
+    for question in ANSWERS:
+        answer = await ask(client, question, objects=["bed", "lamp"])
+        assert (answer["ignored"], answer["mapped"], answer["warnings"]) == ([], [], [])
+        odd = {"label": "lamp", "size": {"x": 200.0, "y": 200.0, "z": 400.0}}
+        (warning,) = (await ask(client, question, objects=["bed", odd]))["warnings"]
+        assert warning["code"] == "implausible-size"
+        assert warning["objects"] == ["lamp"]
+        assert warning["message"]
+
+
+@pytest.mark.parametrize("question", ANSWERS)
+async def test_numbers_have_six_significant_digits(
+    client: httpx.AsyncClient, question: str
+) -> None:
+    answer = await ask(client, question, **SCENE)
+    for number in _numbers(answer):
+        assert number == float(f"{number:.6g}")
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [number for entry in value for number in _numbers(entry)]
+    return [value] if isinstance(value, float) else []
+
+
+def test_rounding_is_that_of_the_decimal_number() -> None:
+    draw = random.Random(0)
+    numbers = [draw.uniform(-1, 1) * 10 ** draw.uniform(-15, 5) for _ in range(5000)]
+    assert significant(numbers) == [float(f"{number:.6g}") for number in numbers]
+    odd = [0.0, 1.0, -1.0, 1e-300, 1e300, 123456.7, 999999.96, 5e-324, 0.1 + 0.2]
+    assert significant(odd) == [float(f"{number:.6g}") for number in odd]
+    assert significant([]) == []

@@ -387,3 +387,104 @@ def test_any_poses_can_be_read(objects: list[Any]) -> None:
     reading = read(objects=objects)
     pairs = {(entry.subject, entry.relation, entry.object) for entry in reading.observed or ()}
     assert not {(o, name, s) for s, name, o in pairs} & pairs
+
+
+# ----------------------------------------------------------------------------------- nearest
+
+
+def test_unknown_labels_can_be_taken_for_the_nearest_class() -> None:
+    reading = read(
+        objects=["bed", "nigthstand", {"id": "x", "label": "big lamp"}, "nigthstand"],
+        relations=[
+            {"subject": "big lamp", "relation": "left", "object": "bed"},
+            {"subject": "lamp", "relation": "front", "object": "bed"},
+        ],
+        room_type="bedrom",
+        unknown_labels="nearest",
+    )
+    assert ids(reading) == ["bed", "nigthstand_1", "x", "nigthstand_2"]
+    labels = [VOCABULARY.labels[thing.class_index or 0] for thing in reading.scene.objects]
+    assert labels == ["bed", "nightstand", "lamp", "nightstand"]
+    assert reading.scene.relations == ((0, 2, 0), (1, 2, 0))
+    assert reading.scene.room_type == 0
+    mapped = [(one.label, one.class_) for one in reading.unknown.mapped.values()]
+    assert mapped == [("nigthstand", "nightstand"), ("big lamp", "lamp"), ("bedrom", "bedroom")]
+    assert all(0.8 <= one.similarity <= 1 for one in reading.unknown.mapped.values())
+    assert reading.ignored == ()
+
+
+def test_a_label_that_is_like_none_is_refused_all_the_same() -> None:
+    reason, where = faults(objects=["bed", "droid", "big lamp"], unknown_labels="nearest")
+    assert (reason, where) == (Reason.UNKNOWN_LABELS, [("objects", 1)])
+
+
+def test_so_many_labels_are_looked_up_and_no_more() -> None:
+    many = [f"big{'g' * k} lamp" for k in range(MAX_SUGGESTED + 5)]
+    with pytest.raises(RequestError) as error:
+        read(objects=many, unknown_labels="nearest")
+    assert [fault.location for fault in error.value.faults] == [
+        ("objects", MAX_SUGGESTED + k) for k in range(5)
+    ]
+
+
+# ---------------------------------------------------------------------------------- spelling
+
+
+def test_the_reading_keeps_which_relations_are_spelled_from_the_other_end() -> None:
+    given = [relation("bed", "right", "lamp"), relation("bed", "front", "lamp")]
+    reading = read(objects=["bed", "lamp"], relations=given)
+    assert reading.scene.relations == ((0, 1, 0), (1, 0, 1))
+    assert reading.flipped == {(0, 1, 0)}
+    assert read(objects=LAMP_ON_DESK).flipped == frozenset()
+
+
+# ---------------------------------------------------------------------------------- warnings
+
+
+def warned(**request: Any) -> list[tuple[str, list[str]]]:
+    return [(one.code, one.objects) for one in read(**request).warnings]
+
+
+def test_a_plain_scene_has_no_warnings() -> None:
+    assert warned(objects=["bed", "lamp"]) == []
+    assert warned(objects=LAMP_ON_DESK) == []
+    assert warned(objects=LAMP_ON_DESK, frame_id="map") == []
+
+
+def test_millimetres_are_noticed() -> None:
+    far = {"id": "far", "label": "chair", "position": at(2000, 300, 400), "size": at(1, 1, 1)}
+    assert warned(objects=[*LAMP_ON_DESK, far]) == [("implausible-position", ["far"])]
+    sizes = [{"id": "a", "label": "bed", "size": at(500, 2, 1)}]
+    sizes += [{"id": "b", "label": "bed", "size": at(1, 0.0005, 1)}]
+    assert warned(objects=sizes) == [("implausible-size", ["a", "b"])]
+
+
+def test_a_map_may_be_large() -> None:
+    moved = [
+        {**one, "position": {**one["position"], "x": one["position"]["x"] + 500}}
+        for one in LAMP_ON_DESK
+    ]
+    assert warned(objects=moved) == [("implausible-position", ["d", "l"])]
+    assert warned(objects=moved, frame_id="map") == []
+    viewpoint = {"x": 499.0, "y": 0.0, "yaw": 0.0}
+    assert warned(objects=moved, frame_id="map", viewpoint=viewpoint) == []
+
+
+def test_a_camera_without_depth_is_noticed() -> None:
+    size = at(0.2, 0.2, 0.2)
+    objects = [
+        {"id": str(k), "label": "book", "position": at(0.4 * k, 0.1 * k, 0), "size": size}
+        for k in range(3)
+    ]
+    camera = "camera_optical_frame"
+    assert warned(objects=objects, frame_id=camera) == [("flat-scene", ["0", "1", "2"])]
+    assert warned(objects=objects[:2], frame_id=camera) == []
+    assert warned(objects=objects, frame_id="base_link") == []
+
+
+def test_sizes_that_nobody_knows_are_noticed() -> None:
+    """The vocabulary has typical sizes of lamps and desks, of beds it has none."""
+    bed = {"id": "b", "label": "bed", "position": at(2, 1, 0.3)}
+    bare = [{key: value for key, value in one.items() if key != "size"} for one in LAMP_ON_DESK]
+    assert warned(objects=[*bare, bed]) == [("unknown-sizes", ["b"])]
+    assert warned(objects=[*bare, bed], relations=[]) == []

@@ -81,7 +81,7 @@ def test_placements_use_the_calibration_of_relations():
 def test_intruders_by_log_odds_and_size():
     entry = CountSlope(intercept=0.5, slope=-0.7, log_count=0.3)
     artifact = larger_artifact("triway-local", outlier=entry)
-    found, _ = outliers(artifact, scene_of([0, 1, 1, 2]))
+    found = outliers(artifact, scene_of([0, 1, 1, 2])).outliers
     for answer in found:
         z = 0.5 - 0.7 * answer.log_odds + 0.3 * math.log(3)
         assert answer.probability == pytest.approx(sigmoid(z), abs=1e-5)
@@ -90,9 +90,9 @@ def test_intruders_by_log_odds_and_size():
 
 def test_false_relations():
     scene = scene_of([0, 1, 2], [(2, 1, 0), (0, 1, 2)])
-    _, plain = outliers(larger_artifact("triway-local"), scene)
+    plain = outliers(larger_artifact("triway-local"), scene).misplaced
     changed = larger_artifact("triway-local", misplaced=Slope(intercept=0.4, slope=-0.5))
-    _, scaled = outliers(changed, scene)
+    scaled = outliers(changed, scene).misplaced
     for one, other in zip(plain, scaled, strict=True):
         assert (one.subject, one.relation, one.object) == (
             other.subject,

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.reasoning import misplaced, missing, outliers, relations
+from app.registry.description import Thresholds
 from app.scene import CANONICAL, OPPOSITES, RELATIONS, Scene, canonicalise, contradiction
 from tests.reasoning.artifacts import LABELS, LARGER, STRUCTURE, larger_artifact, scene_of
 
@@ -248,7 +249,7 @@ def test_pairs_choose_ordered_pairs(name, scene, data, opposites):
 @given(names, scenes())
 def test_outliers(name, scene):
     """Every object once, least fitting first; instances of one class alike."""
-    found, unlikely = outliers(ARTIFACTS[name], scene)
+    _, found, unlikely = outliers(ARTIFACTS[name], scene)
     assert misplaced(ARTIFACTS[name], scene) == unlikely
     assert sorted(answer.object for answer in found) == list(range(len(scene.objects)))
     keys = [(answer.log_odds, answer.object) for answer in found]
@@ -258,7 +259,13 @@ def test_outliers(name, scene):
         assert answer.label == scene.objects[answer.object].label
         assert math.isfinite(answer.log_odds)
         by_class.setdefault(answer.label, set()).add((answer.log_odds, answer.because))
-        assert len(answer.because) == min(3, len({t.label for t in scene.objects}) - 1)
+        assert len(answer.because) <= min(3, len({t.label for t in scene.objects}) - 1)
+        changes = [because.log_odds_change for because in answer.because]
+        assert all((change < 0) == answer.is_outlier for change in changes)
+        assert changes == sorted(changes, key=abs, reverse=True)
+        assert answer.is_outlier or answer.usually_with == ()
+        assert len(answer.usually_with) <= 3
+        assert not set(answer.usually_with) & {t.label for t in scene.objects}
         others = [scene.objects[because.object].label for because in answer.because]
         assert answer.label not in others
         assert len(set(others)) == len(others)
@@ -273,16 +280,19 @@ def test_outliers(name, scene):
 @few
 @given(names, scenes(), st.floats(0, 1))
 def test_the_threshold_decides(name, scene, threshold):
-    found, _ = outliers(ARTIFACTS[name], scene, threshold=threshold)
-    for answer in found:
+    found = outliers(ARTIFACTS[name], scene, threshold=threshold)
+    assert found.threshold == threshold
+    for answer in found.outliers:
         assert answer.is_outlier == (answer.probability >= threshold)
 
 
 def test_the_default_threshold_is_the_calibrated_one():
     for threshold in (0.0, 1.0):
-        artifact = larger_artifact("triway-local", outlier_threshold=threshold)
-        found, _ = outliers(artifact, scene_of([0, 1, 2]))
-        assert {answer.is_outlier for answer in found} == {threshold == 0.0}
+        presets = Thresholds(medium=threshold)
+        artifact = larger_artifact("triway-local", outlier_thresholds=presets)
+        found = outliers(artifact, scene_of([0, 1, 2]))
+        assert found.threshold == threshold
+        assert {answer.is_outlier for answer in found.outliers} == {threshold == 0.0}
 
 
 @few
@@ -309,7 +319,8 @@ def test_the_order_of_the_objects_does_not_matter(name, scene, random):
     assert [(a.label, a.probability) for a in missing(artifact, scene)] == [
         (a.label, a.probability) for a in missing(artifact, other)
     ]
-    (found, misplaced), (found2, misplaced2) = outliers(artifact, scene), outliers(artifact, other)
+    _, found, misplaced = outliers(artifact, scene)
+    _, found2, misplaced2 = outliers(artifact, other)
     assert {(a.object, a.log_odds) for a in found} == {
         (order[a.object], a.log_odds) for a in found2
     }
@@ -331,7 +342,7 @@ def test_the_same_scene_gets_the_same_answer(name, scene):
 def test_nothing_but_an_empty_scene(name):
     empty = scene_of([])
     assert relations(ARTIFACTS[name], empty) == ((), ())
-    assert outliers(ARTIFACTS[name], empty) == ((), ())
+    assert outliers(ARTIFACTS[name], empty) == (0.5, (), ())
     answers = missing(ARTIFACTS[name], empty, top_k=len(LABELS))
     assert len(answers) == len(LABELS) - len(STRUCTURE)
     assert all(answer.placements == () for answer in answers)
@@ -414,7 +425,7 @@ def test_details_change_nothing_else(name, scene):
     assert bare == tuple(
         answer._replace(placements=(), because=()) for answer in missing(artifact, scene)
     )
-    judged, stated = outliers(artifact, scene, details=False)
-    explained, again = outliers(artifact, scene)
-    assert judged == tuple(answer._replace(because=()) for answer in explained)
+    _, judged, stated = outliers(artifact, scene, details=False)
+    _, explained, again = outliers(artifact, scene)
+    assert judged == tuple(answer._replace(because=(), usually_with=()) for answer in explained)
     assert stated == again

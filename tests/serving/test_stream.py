@@ -74,7 +74,7 @@ class Service:
             request = kind.model_validate({"objects": objects, **fields, **own})
             answer = self.runner.run(question(self.view(), request))  # type: ignore[operator]
             lists |= json.loads(written(answer))
-        envelope = set(Answer.model_fields) - {"observed_relations"}
+        envelope = set(Answer.model_fields) - {"observed_relations"} | {"coverage", "threshold"}
         return {name: entries for name, entries in lists.items() if name not in envelope}
 
 
@@ -276,8 +276,9 @@ def test_no_number_that_is_not_finite_is_told(
     real = questions.reasoning.outliers
 
     def broken(artifact: Any, scene: Any, **parameters: Any) -> Any:
-        ((first, *others), misplaced) = real(artifact, scene, **parameters)
-        return (first._replace(probability=math.nan), *others), misplaced
+        found = real(artifact, scene, **parameters)
+        first, *others = found.outliers
+        return found._replace(outliers=(first._replace(probability=math.nan), *others))
 
     session = StreamSession()
     service.take(session, type="open", ask=ASK)

@@ -149,7 +149,7 @@ def test_from_rooms_to_answers(tmp_path, variant):
     )
     assert missing(artifact, scene)
     assert relations(artifact, scene)[0]
-    assert len(outliers(artifact, scene)[0]) == 3
+    assert len(outliers(artifact, scene).outliers) == 3
     assert len(generate(artifact, scene, seed=0, steps=5)) == 1
 
 

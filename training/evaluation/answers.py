@@ -199,7 +199,7 @@ def ask_outliers(
         intruder = len(scene.objects)
         thing = SceneObject(id="intruder", label=artifact.vocabulary.labels[c], class_index=c)
         scene = replace(scene, objects=(*scene.objects, thing))
-    found, _ = outliers(artifact, scene, details=False)
+    found = outliers(artifact, scene, details=False).outliers
     usable = [not structure[thing.class_index] for thing in scene.objects]
     return [(a.probability, a.object == intruder) for a in found if usable[a.object]]
 

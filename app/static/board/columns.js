@@ -1,6 +1,6 @@
 /** The answers in words: for each question a column for each model. */
 
-import { holds, listed, observedKeys } from './edges.js';
+import { listed } from './edges.js';
 import { accept, ghostsOf } from './ghosts.js';
 import { bar, copy, el, redraw } from './dom.js';
 import { curl, python } from './calls.js';
@@ -15,12 +15,20 @@ const signed = (value) => (value > 0 ? `+${value.toFixed(1)}` : value.toFixed(1)
 const reasons = (because) =>
   because.map(({ object, log_odds_change: change }) => `${object} ${signed(change)}`).join(', ');
 
-/** What speaks against an object first, then what speaks for it. */
-const sides = (because) =>
+/** What supports the verdict on an object: what speaks against an outlier, and for any other. */
+const support = ({ is_outlier: out, because, usually_with: company = [] }) =>
   [
-    ['against', because.filter((one) => one.log_odds_change < 0)],
-    ['for', because.filter((one) => one.log_odds_change >= 0)],
-  ].filter(([, own]) => own.length).map(([side, own]) => `${side}: ${reasons(own)}`).join(' · ');
+    because.length ? `${out ? 'against' : 'for'}: ${reasons(because)}` : '',
+    company.length ? `usually with: ${company.join(', ')}` : '',
+  ].filter(Boolean).join(' · ');
+
+/** What an answer says of the scene: labels that were left out or taken for others, and warnings. */
+const notes = ({ ignored = [], mapped = [], warnings = [] }) =>
+  [
+    ignored.length ? `Left out: ${ignored.join(', ')}.` : '',
+    mapped.length ? `Taken for others: ${mapped.map((one) => `${one.label} → ${one.class}`).join(', ')}.` : '',
+    ...warnings.map((one) => `Check ${one.objects.join(', ')}: ${one.message}.`),
+  ].filter(Boolean).join(' ');
 
 const ROWS = {
   missing(answer, state, store, column) {
@@ -52,9 +60,9 @@ const ROWS = {
           one.is_outlier ? el('span', { class: 'flag' }, 'does not belong') : null,
           el('span', {}, percent(one.probability))),
         bar(one.probability, 'outliers'),
-        one.because.length ? el('p', { class: 'quiet reasons' }, sides(one.because)) : null));
-    const misplaced = answer.misplaced.filter((one, index) => index < 12 || one.probability >= 0.5).map((one) =>
-      el('li', { class: one.probability >= 0.5 ? 'alarm' : '' },
+        support(one) ? el('p', { class: 'quiet reasons' }, support(one)) : null));
+    const misplaced = answer.misplaced.filter((one, index) => index < 12 || one.is_misplaced).map((one) =>
+      el('li', { class: one.is_misplaced ? 'alarm' : '' },
         el('div', { class: 'headline' }, el('span', { class: 'grow' }, `${one.subject} ${SPOKEN[one.relation]} ${one.object}`),
           el('span', {}, percent(one.probability))),
         bar(one.probability, 'outliers')));
@@ -63,7 +71,6 @@ const ROWS = {
   },
 
   relations(answer, state) {
-    const seen = observedKeys(answer);
     const odd = listed(state, answer.disagreements).map((one) =>
       el('li', { class: 'disagrees' },
         el('div', { class: 'headline' },
@@ -71,10 +78,10 @@ const ROWS = {
           el('span', {}, percent(one.observed_probability))),
         el('p', {}, `expected: ${SPOKEN[one.expected]}, ${percent(one.probability)}`)));
     const rows = listed(state, answer.relations).map((one) =>
-      el('li', { class: holds(seen, one) ? 'holds' : 'expected' },
+      el('li', { class: one.observed ? 'holds' : 'expected' },
         el('div', { class: 'headline' },
           el('span', { class: 'grow' }, `${one.subject} ${SPOKEN[one.relation]} ${one.object}`),
-          holds(seen, one) ? el('span', { class: 'flag' }, 'so it is') : null,
+          one.observed ? el('span', { class: 'flag' }, 'so it is') : null,
           el('span', {}, percent(one.probability))),
         bar(one.probability, 'relations')));
     return [...odd, ...rows];
@@ -160,9 +167,9 @@ export function createColumns(store, parents, askKey) {
     own.told = problem;
     const rows = answer ? ROWS[question](answer, state, store, column) : [];
     redraw(own.rows, rows);
-    const ignored = answer?.ignored?.length ? `Left out: ${answer.ignored.join(', ')}. ` : '';
+    const said = answer ? notes(answer) : '';
     const waiting = status === 'down' ? 'Waiting for the service.' : !state.things.length ? 'Put something on the board first.' : '';
-    own.note.textContent = ignored + (rows.length ? '' : answer ? NOTHING[question] : waiting);
+    own.note.textContent = `${said} ${rows.length ? '' : answer ? NOTHING[question] : waiting}`.trim();
     own.calls.show(question, entry.body);
   }
 

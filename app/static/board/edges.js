@@ -11,30 +11,11 @@
 
 import { percent, SPOKEN } from './words.js';
 
-const OPPOSITE = {
-  left: 'right', right: 'left', front: 'behind', behind: 'front',
-  'on-top': 'under', under: 'on-top', above: 'below', below: 'above',
-};
-
-const keyOf = ({ subject, relation, object }) => JSON.stringify([subject, relation, object]);
-
-/** What positions show, in either direction of speech. */
-export function observedKeys(answer) {
-  const found = new Set();
-  for (const one of answer?.observed_relations ?? []) {
-    found.add(keyOf(one));
-    found.add(keyOf({ subject: one.object, relation: OPPOSITE[one.relation], object: one.subject }));
-  }
-  return found;
-}
-
-/** What is called wrong: objects that do not belong, and relations that are more likely amiss than not. */
+/** What is called wrong: objects that do not belong, and relations in the wrong place. */
 export const wrongIn = (answer) => ({
   outliers: answer.outliers.filter((one) => one.is_outlier),
-  misplaced: answer.misplaced.filter((one) => one.probability >= 0.5),
+  misplaced: answer.misplaced.filter((one) => one.is_misplaced),
 });
-
-export const holds = (keys, relation) => keys.has(keyOf(relation));
 
 /** Which relations the list shows: those of the selected object, if so asked. */
 export const listed = (state, relations) =>
@@ -46,10 +27,9 @@ const ofTab = {
   relations(state) {
     const answer = state.answers[state.shown].relations?.answer;
     if (!answer) return [];
-    const seen = observedKeys(answer);
     const edges = disagreements(state, answer);
     for (const one of listed(state, answer.relations)) {
-      const kind = holds(seen, one) ? 'holds' : 'expected';
+      const kind = one.observed ? 'holds' : 'expected';
       edges.push(edge(one, kind, `${SPOKEN[one.relation]} ${percent(one.probability)}`));
     }
     if (state.observed) {

@@ -53,7 +53,7 @@ export function createGeneration(form, drawn, store, say) {
       ...(withBoard && scene),
       ...(field('room').value && { room_type: field('room').value }),
       model: state.models[state.shown],
-      ...(state.lenient && { unknown_labels: 'ignore' }),
+      ...(state.unknown !== 'error' && { unknown_labels: state.unknown }),
       seed: Number(field('seed').value),
       temperature: Number(field('temperature').value),
       steps,

@@ -30,8 +30,8 @@ const say = (words) => (get('live').textContent = words);
 
 const store = createStore({
   things: [], viewer: { x: 0, y: 0, yaw: 0 }, room: '', models: ['default', ''], shown: 0, tab: 'missing',
-  selected: null, snap: true, at: null, suggestions: 5, threshold: null, least: 0.25, most: 12, own: false,
-  observed: false, lenient: false, answers: [{}, {}], draft: null, words: {}, contexts: {}, down: false,
+  selected: null, snap: true, at: null, suggestions: 5, coverage: null, sensitivity: 'medium', threshold: null, least: 0.25, most: 12, own: false,
+  observed: false, unknown: 'error', answers: [{}, {}], draft: null, words: {}, contexts: {}, down: false,
   complaint: '', epoch: 0, canUndo: false,
 });
 

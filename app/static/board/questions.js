@@ -6,7 +6,7 @@ export const QUESTIONS = ['missing', 'outliers', 'relations'];
 
 /** What of the state a question depends on: when none of it changed, no answer does. */
 export const DEPENDS = [
-  'things', 'viewer', 'room', 'models', 'at', 'threshold', 'suggestions', 'least', 'most', 'lenient',
+  'things', 'viewer', 'room', 'models', 'at', 'coverage', 'sensitivity', 'threshold', 'suggestions', 'least', 'most', 'unknown',
   'words', 'epoch',
 ];
 
@@ -14,8 +14,15 @@ export const DEPENDS = [
 export const sizesOf = (state, model) => state.words[model]?.sizes ?? new Map();
 
 const OWN = {
-  missing: (state) => ({ top_k: state.suggestions, ...(state.at && { at: state.at }) }),
-  outliers: (state) => (state.threshold === null ? {} : { threshold: state.threshold }),
+  missing: (state) => ({
+    top_k: state.suggestions,
+    ...(state.coverage !== null && { coverage: state.coverage }),
+    ...(state.at && { at: state.at }),
+  }),
+  outliers: (state) => ({
+    ...(state.sensitivity !== 'medium' && { sensitivity: state.sensitivity }),
+    ...(state.threshold !== null && { threshold: state.threshold }),
+  }),
   relations: (state) => ({ top_k: state.most, min_probability: state.least }),
 };
 
@@ -25,7 +32,7 @@ export function bodyOf(state, question, model) {
   return {
     ...toScene(state, sizesOf(state, state.models[0])),
     model,
-    ...(state.lenient && { unknown_labels: 'ignore' }),
+    ...(state.unknown !== 'error' && { unknown_labels: state.unknown }),
     ...OWN[question](state),
   };
 }

@@ -14,11 +14,18 @@ const SLIDERS = [
   { id: 'least', words: percent, read: (value) => Number(value) / 100, write: (value) => 100 * value },
   { id: 'most', words: (value) => String(value), read: Number, write: (value) => value },
   {
+    id: 'coverage', read: (value) => Number(value) / 100, write: (value) => 100 * (value ?? 0.5),
+    words: (value) => (value === null ? 'model’s own' : percent(value)),
+  },
+  {
     id: 'threshold', read: (value) => Number(value) / 100, write: (value) => 100 * (value ?? 0.5),
     words: (value) => (value === null ? 'model’s own' : percent(value)),
   },
 ];
-const SWITCHES = ['snap', 'own', 'observed', 'lenient'];
+const SWITCHES = ['snap', 'own', 'observed'];
+const CHOICES = ['sensitivity', 'unknown'];
+/** Settings of which the model has its own. */
+const OWN = ['coverage', 'threshold'];
 
 const LEGENDS = {
   missing: [['ghost', 'suggested: click to put it there'], ['spread', 'four of five stand within']],
@@ -34,7 +41,12 @@ export function settings(store) {
   for (const id of SWITCHES) {
     get(id).addEventListener('change', ({ target }) => store.set({ [id]: target.checked }));
   }
-  get('threshold-off').addEventListener('click', () => store.set({ threshold: null }));
+  for (const id of CHOICES) {
+    get(id).addEventListener('change', ({ target }) => store.set({ [id]: target.value }));
+  }
+  for (const id of OWN) {
+    get(`${id}-off`).addEventListener('click', () => store.set({ [id]: null }));
+  }
   get('at-off').addEventListener('click', () => {
     store.set({ at: null });
     get('tab-missing').focus();
@@ -61,7 +73,8 @@ export function settings(store) {
       slider.setAttribute('aria-valuetext', words(state[id]));
     }
     for (const id of SWITCHES) get(id).checked = state[id];
-    get('threshold-off').disabled = state.threshold === null;
+    for (const id of CHOICES) get(id).value = state[id];
+    for (const id of OWN) get(`${id}-off`).disabled = state[id] === null;
     get('search-error').textContent = state.complaint;
     get('undo').disabled = !state.canUndo;
     document.body.classList.toggle('two', Boolean(state.models[1]));
