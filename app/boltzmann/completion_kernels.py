@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.boltzmann.elementary import exp, exponent, log, logistic, mantissa
+from app.boltzmann.elementary import exp, exponent, log, mantissa
 from app.boltzmann.object_kernels import context_gain, context_halves
 from app.compiling import compiled
 
@@ -119,7 +119,7 @@ def mean_log_odds(gains, bias, completed, added, start, fall, group):
     """Log-odds of the mean over completions of each class being there unlisted, (V,).
 
     Args:
-        gains: (M, V) of the completions, changed here for the added classes.
+        gains: (M, V) of the completions, changed here.
         bias: (V,) b + log(1 - c).
         completed, added, start: see `complete`.
         fall: (V, whole blocks of lanes) e^-W.
@@ -132,11 +132,14 @@ def mean_log_odds(gains, bias, completed, added, start, fall, group):
             gains[m, added[place]] = -context_gain(off, on, fall[added[place]], group)
     present, absent = np.zeros(V, np.float32), np.zeros(V, np.float32)
     for m in range(count):
-        gain = gains[m]
+        # One exponential for both, and neither as a difference.
+        odds = gains[m]
         for i in range(V):
-            present[i] += logistic(bias[i] + gain[i])
+            odds[i] = exp(-bias[i] - odds[i])
         for i in range(V):
-            absent[i] += logistic(-bias[i] - gain[i])
+            present[i] += np.float32(1.0) / (np.float32(1.0) + odds[i])
+        for i in range(V):
+            absent[i] += odds[i] / (np.float32(1.0) + odds[i])
     found = np.empty(V, np.float32)
     for i in range(V):
         found[i] = log(present[i]) - log(absent[i])

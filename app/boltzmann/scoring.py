@@ -97,7 +97,6 @@ class ContextScorer:
             gain[:] = self.gain(torch.from_numpy(x).unsqueeze(0))[0].numpy()
         return gain
 
-
     def rows_gain(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
         """The same for some rows (M, H1), (M, V); to rounding, not to the bit."""
         if self._weights is not None:
