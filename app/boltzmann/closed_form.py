@@ -6,7 +6,9 @@ mean field,
 
     y = x + sum_{e given} slope_e U_e,   slope_e = g_e (r_e - sigmoid(ℓ_e(m))),   m = sigmoid(y)
 
-with g_e the presence of both ends. So in either case
+with g_e the presence of both ends. Where given relations must count for less, their pull is scaled:
+y = x + ω (y - x) and ω slope_e take the place of y and slope_e, with an ω for questions about
+objects and another for those about relations (`Pull`). So in any case
 
     object     log-odds_i = b_i + sum_k [softplus(y_k + W_ik) - softplus(y_k)]
     relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))],  ℓ_e(h1) = ℓ_e(m) + sum_k U_ek (h1_k - m_k)
@@ -36,7 +38,7 @@ from app.boltzmann import given_kernels, object_kernels, relation_kernels
 from app.boltzmann.fantasies import unpack_scenes
 from app.boltzmann.machine import BoltzmannMachine
 from app.boltzmann.matrix_kernels import ROWS
-from app.boltzmann.mean_field import SWEEPS
+from app.boltzmann.mean_field import FULL, SWEEPS, Pull
 from app.boltzmann.scoring import group_size
 from app.boltzmann.triway import Triway
 
@@ -114,10 +116,11 @@ class Context:
         presence: (n,).
         log_counts: (n,) log of the instances of each.
         x: (H1,) logits of h1 given the objects.
-        y: (H1,) given the relations as well.
+        y: (H1,) given the relations as well, as questions about relations see it.
         given: the relations; None where there are none.
-        slopes: (E,).
+        slopes: (E,) as questions about relations see them.
         z: (E, K + 1) the factors (S_i * O_j, 1) of the given units, filled up as the loops need it.
+        object_y, object_slopes: y and slopes as questions about objects see them.
     """
 
     classes: Places
@@ -128,6 +131,8 @@ class Context:
     given: Given | None
     slopes: Floats
     z: Floats
+    object_y: Floats
+    object_slopes: Floats
 
 
 class WithoutEach(NamedTuple):
@@ -204,20 +209,27 @@ class ClosedForm:
         log_counts: Floats,
         room: int | None = None,
         given: Given | None = None,
+        pull: Pull = FULL,
     ) -> Context:
         """The context of a scene.
 
         Args:
             room: index of the room type; None where it is not known.
+            pull: how strongly the given relations act.
         """
         bias = self.c1 if room is None or not len(self.Q) else self.c1 + self.Q[room]
         x = object_kernels.hidden_logits(bias, self.W, classes, presence)
         if given is None or not len(given.a):
-            return Context(classes, presence, log_counts, x, x, None, *_NO_UNITS)
+            slopes, z = _NO_UNITS
+            return Context(classes, presence, log_counts, x, x, None, slopes, z, x, slopes)
         y, slopes, z = given_kernels.fixed_point(
             x, self._weights, classes, log_counts, *_lists(given), given.r, given.g, SWEEPS
         )
-        return Context(classes, presence, log_counts, x, y, given, slopes, z)
+        object_y, object_slopes = _scaled(pull.objects, x, y, slopes)
+        y, slopes = _scaled(pull.relations, x, y, slopes)
+        return Context(
+            classes, presence, log_counts, x, y, given, slopes, z, object_y, object_slopes
+        )
 
     def between(self, context: Context) -> Between:
         """What `relation_log_odds` and `log_odds_apart` need."""
@@ -320,7 +332,7 @@ class ClosedForm:
         """What the rest of a scene does for the log-odds of each of its classes."""
         return WithoutEach(
             *object_kernels.without_each(
-                context.y, self.W, context.classes, self._shares(context), self._group
+                context.object_y, self.W, context.classes, self._shares(context), self._group
             )
         )
 
@@ -333,7 +345,7 @@ class ClosedForm:
         else:
             share = given_kernels.shares(
                 *(self._weights.G, self.W, classes, context.presence, context.z),
-                *(*_lists(context.given), context.slopes),
+                *(*_lists(context.given), context.object_slopes),
             )
         return share
 
@@ -343,7 +355,7 @@ class ClosedForm:
         if context.given is not None:
             common, filled = given_kernels.common_growth(
                 *(self._weights.G, len(context.classes), context.z),
-                *(*_lists(context.given), context.slopes, rows),
+                *(*_lists(context.given), context.object_slopes, rows),
             )
         found: Floats = object_kernels.reasons(*each, rows, common, filled, self._group)
         return found
@@ -351,9 +363,17 @@ class ClosedForm:
     def reasons_for_absent(self, context: Context, candidates: Places) -> Floats:
         """The same of absent classes (N,): what each present one does for them, (N, n)."""
         found: Floats = object_kernels.reasons_for_absent(
-            context.y, self.W, candidates, self._shares(context), self._group
+            context.object_y, self.W, candidates, self._shares(context), self._group
         )
         return found
+
+
+def _scaled(pull: float, x: Floats, y: Floats, slopes: Floats) -> tuple[Floats, Floats]:
+    """x + pull (y - x) and pull slopes; to the bit x at 0, and y and slopes at 1."""
+    if pull >= 1:
+        return y, slopes
+    weight = np.float32(pull)
+    return x + weight * (y - x), weight * slopes
 
 
 def _lists(given: Given) -> tuple[Places, Places, Places]:

@@ -6,7 +6,8 @@ proposal q (the mean-field fixed point) each draw h carries the weight
 
     log w = h·x + sum_e term_e(ℓ_e(h)) - log q(h),   x = c1 + v'W + J h2,
 
-and any expectation over p(h1 | evidence) is a weighted mean. The uniforms behind the draws are
+with the likelihood of observed relations raised to a power (`pull`) where they must count for
+less. Any expectation over p(h1 | evidence) is a weighted mean. The uniforms behind the draws are
 fixed (a scrambled Sobol sequence), so the same evidence always gives the same answer. With two
 layers h2 is held at its mean-field value.
 
@@ -89,14 +90,16 @@ def draw_hidden(
     *,
     draws: int = 64,
     uniforms: Tensor | None = None,
+    pull: float = 1.0,
 ) -> HiddenDraws:
     """Weighted draws of h1 given the evidence.
 
     Args:
         draws: M; a power of two keeps the Sobol sequence balanced.
         uniforms: (M, H1) or (M, B, H1) to use in place of the fixed ones.
+        pull: weight of the observed relations' likelihood, from 0 to 1.
     """
-    field = mean_field(machine, evidence)
+    field = mean_field(machine, evidence, pull=pull)
     if uniforms is None:
         uniforms = fixed_uniforms(draws, machine.spec.H1).to(field.y.dtype)
     if uniforms.dim() == 2:
@@ -110,7 +113,11 @@ def draw_hidden(
         edges, r, observed = relations
         gate = machine.gate(edges, evidence.v)
         logits = machine.relation_logits(edges, evidence.v, h1)
-        target = target + machine.relation_term(logits, gate, r, observed).sum(-1)
+        term = machine.relation_term(logits, gate, r, observed)
+        if pull < 1:
+            unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
+            term = torch.lerp(unseen, term, pull)
+        target = target + term.sum(-1)
     log_weight = target - log_q
     total = log_weight.logsumexp(0)
     count = torch.tensor(float(len(h1)), dtype=y.dtype).log()

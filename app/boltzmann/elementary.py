@@ -27,6 +27,7 @@ _LEAST, _LARGEST = _f(-87.0), _f(88.0)
 _LN2_HIGH, _LN2_LOW = _f(0.693359375), _f(-2.12194440e-4)
 _SQRT_HALF_BITS = _i(0x3F3504F3)
 _MANTISSA_BITS = _i(0x007FFFFF)
+_ONE_BITS = _i(0x3F800000)
 
 
 @intrinsic
@@ -79,6 +80,18 @@ def log(x):
     p = p * m + _f(3.3333331174e-1)
     p = p * m * m * m + exponent * _LN2_LOW - _f(0.5) * m * m
     return (m + p) + exponent * _LN2_HIGH
+
+
+@inlined
+def exponent(x):
+    """The exponent e of x = m 2^e for positive, normal float32, int32."""
+    return (_bits_of_float(x) >> _i(23)) - _i(127)
+
+
+@inlined
+def mantissa(x):
+    """The m in [1, 2) of the same."""
+    return _float_of_bits((_bits_of_float(x) & _MANTISSA_BITS) | _ONE_BITS)
 
 
 @inlined

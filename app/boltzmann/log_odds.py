@@ -62,6 +62,7 @@ def object_log_odds(
     *,
     candidates: Tensor | None = None,
     iterations: int = SWEEPS,
+    pull: float = 1.0,
 ) -> Tensor:
     """Log-odds of candidate objects with the context at the mean-field fixed point, (B, N).
 
@@ -73,8 +74,9 @@ def object_log_odds(
     Args:
         candidates: (B or 1, N) int64; all V classes by default.
         iterations: sweeps of the mean field.
+        pull: weight of the observed relations, see `mean_field`.
     """
-    field = mean_field(machine, evidence, iterations=iterations)
+    field = mean_field(machine, evidence, iterations=iterations, pull=pull)
     if candidates is None:
         gain = machine.b + context_gain(field.y, machine.W)
         candidates = torch.arange(machine.spec.V).unsqueeze(0)

@@ -10,7 +10,8 @@ otherwise. With one layer and nothing but observed relations (seed) or none (loc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -58,6 +59,16 @@ class Evidence:
         return self.edges, self.r, self.observed
 
 
+class Pull(NamedTuple):
+    """How strongly observed relations act on the context, from 0 to 1, by kind of question."""
+
+    objects: float = 1.0
+    relations: float = 1.0
+
+
+FULL = Pull()
+
+
 @dataclass(frozen=True)
 class MeanField:
     """The fixed point: logits y of h1 (B, H1), without relations x (B, H1), means of h2 (B, H2)."""
@@ -68,14 +79,28 @@ class MeanField:
 
 
 def mean_field(
-    machine: BoltzmannMachine, evidence: Evidence, *, iterations: int = SWEEPS, damping: float = 0.8
+    machine: BoltzmannMachine,
+    evidence: Evidence,
+    *,
+    iterations: int = SWEEPS,
+    damping: float = 0.8,
+    pull: float = 1.0,
 ) -> MeanField:
     """One fixed point of h1 and h2 given the evidence; differentiable in the weights.
 
     Args:
         iterations: sweeps over both layers.
         damping: share of the old relation slopes kept in a sweep.
+        pull: weight of the observed relations: between the fixed point without any, 0, and that
+            with all, 1.
     """
+    if pull < 1 and evidence.relations(machine) is not None:
+        without = mean_field(machine, unobserved(evidence), iterations=iterations, damping=damping)
+        with_all = mean_field(machine, evidence, iterations=iterations, damping=damping)
+        pairs = (
+            (getattr(field, name) for field in (without, with_all)) for name in ("y", "x", "h2")
+        )
+        return MeanField(*(torch.lerp(one, other, pull) for one, other in pairs))
     base = x = machine.context_bias(evidence.room) + evidence.v @ machine.W
     relations = evidence.relations(machine)
     two_layers = machine.spec.H2 > 0
@@ -104,3 +129,10 @@ def mean_field(
             h2 = machine.second_layer_logits((x + pull).sigmoid()).sigmoid()
             x = torch.addmm(base, h2, machine.J.T)
     return MeanField(x + pull, x, h2)
+
+
+def unobserved(evidence: Evidence) -> Evidence:
+    """The same with every relation unobserved."""
+    if evidence.observed is None:
+        return evidence
+    return replace(evidence, observed=torch.zeros_like(evidence.observed))

@@ -46,6 +46,24 @@ def _gain(off, on, growth, group, product, total):
 
 
 @compiled
+def context_halves(y, size):
+    """sigmoid(-y) and sigmoid(y), filled up to `size` by units that gain nothing."""
+    off, on = np.ones(size, np.float32), np.zeros(size, np.float32)
+    for k in range(len(y)):
+        off[k] = logistic(-y[k])
+    for k in range(len(y)):
+        on[k] = logistic(y[k])
+    return off, on
+
+
+@compiled
+def context_gain(off, on, growth, group):
+    """sum_k log(off + on growth), from `context_halves`."""
+    product, total = np.empty(_LANES, np.float32), np.empty(_LANES, np.float32)
+    return _gain(off, on, growth, group, product, total)
+
+
+@compiled
 def without_each(y, W, classes, share, group):
     """The gain of each class, its share (n, H1) of y taken out.
 

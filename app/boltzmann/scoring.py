@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from app.boltzmann.elementary import log, logistic
+from app.boltzmann.elementary import exponent, log, logistic, mantissa
 from app.boltzmann.machine import BoltzmannMachine
 from app.compiling import compiled
 
@@ -31,6 +31,7 @@ _LARGEST_WEIGHT = 64.0
 _LARGEST_GROUP = 25
 # Objects are taken in tiles of so many, whose factors stay in the first-level cache.
 _TILE = 64
+_LN2 = np.float32(0.6931471805599453)
 
 
 def group_size(W: Tensor) -> int:
@@ -96,6 +97,14 @@ class ContextScorer:
             gain[:] = self.gain(torch.from_numpy(x).unsqueeze(0))[0].numpy()
         return gain
 
+    def rows_gain(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The same for some rows (M, H1), (M, V); to rounding, not to the bit."""
+        if self._weights is not None:
+            return self.gain(torch.from_numpy(x)).numpy().astype(np.float32)
+        gains = np.empty((len(x), self.V), dtype=np.float32)
+        _gains(x, self._exp, self._group, gains)
+        return gains
+
 
 def _add_logs(row: Tensor, weights: Tensor, gain: Tensor) -> None:
     """The same by one log a factor, in float64, for weights (H1, V)."""
@@ -128,3 +137,36 @@ def _gain(x, exp_w, group, out):
         first = t * width
         for i in range(min(width, len(out) - first)):
             out[first + i] = total[i]
+
+
+@compiled
+def _gains(x, exp_w, group, out):
+    """The same of rows x (M, H1), out (M, V), tile by tile.
+
+    Of a group's product only the exponent is set aside, and one log is taken in the end.
+    """
+    (tiles, units, width), rows = exp_w.shape, len(x)
+    on, off = np.empty((rows, units), np.float32), np.empty((rows, units), np.float32)
+    for m in range(rows):
+        for k in range(units):
+            on[m, k] = logistic(x[m, k])
+        for k in range(units):
+            off[m, k] = logistic(-x[m, k])
+    product, exponents = np.empty(width, np.float32), np.empty(width, np.int32)
+    for t in range(tiles):
+        tile, first = exp_w[t], t * width
+        for m in range(rows):
+            ons, offs, into = on[m], off[m], out[m]
+            for i in range(width):
+                product[i], exponents[i] = np.float32(1.0), np.int32(0)
+            for start in range(0, units, group):
+                for k in range(start, min(start + group, units)):
+                    a, b, row = offs[k], ons[k], tile[k]
+                    for i in range(width):
+                        product[i] *= a + b * row[i]
+                for i in range(width):
+                    exponents[i] += exponent(product[i])
+                for i in range(width):
+                    product[i] = mantissa(product[i])
+            for i in range(min(width, len(out[m]) - first)):
+                into[first + i] = log(product[i]) + _LN2 * np.float32(exponents[i])

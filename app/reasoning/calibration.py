@@ -57,15 +57,17 @@ def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
     return forward / total, backward / total
 
 
-def missing_scores(calibration: Calibration, log_odds: Floats) -> Floats:
-    """Logits of "this class was taken away"."""
-    return log_odds / calibration.missing_temperature
+def missing_logits(calibration: Calibration, log_odds: Floats, listed: int) -> Floats:
+    """Logits of "this class is there unlisted", with so many classes listed."""
+    entry = calibration.missing
+    return entry.intercept + entry.log_count * math.log(listed) + entry.slope * log_odds
 
 
-def placed_scores(calibration: Calibration, log_odds: Floats, log_p: Floats) -> Floats:
-    """Logits of "this class was taken away from there", log_p of the relation that says where."""
-    placed = log_odds / calibration.placed_temperature
-    return placed + calibration.placed_relation_weight * log_p
+def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
+    """The same of "and stands there", log_p of the relation that says where."""
+    entry = calibration.placed
+    constant = entry.intercept + entry.log_count * math.log(listed)
+    return constant + entry.slope * log_odds + entry.log_relation * log_p
 
 
 def intruder_line(calibration: Calibration, classes: int) -> tuple[float, float]:

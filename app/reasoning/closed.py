@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.boltzmann.closed_form import Between, ClosedForm, WithoutEach
-from app.reasoning.given import given_relations
+from app.reasoning.given import given_relations, pull_of
 from app.reasoning.present import present
+from app.reasoning.unlisted import with_unlisted
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 
@@ -22,11 +23,12 @@ class ClosedPosterior:
 
     def __init__(self, artifact: Artifact, closed: ClosedForm, scene: Scene) -> None:
         self.present = present(scene, artifact.machine.spec)
-        self._closed, self._scorer = closed, artifact.scorer
+        self._artifact, self._closed, self._room = artifact, closed, scene.room_type
         self._context = closed.context(
             *(self.present.classes, self.present.presence, self.present.log_counts),
             scene.room_type,
             given_relations(scene, self.present, artifact.machine.spec.A),
+            pull_of(scene, artifact.calibration.evidence),
         )
 
     @property
@@ -36,7 +38,15 @@ class ClosedPosterior:
 
     def absent_log_odds(self, absent: Places) -> Floats:
         """Exact where no relation is given."""
-        return (self._closed.b + self._scorer.row_gain(self._context.y))[absent]
+        return (self._closed.b + self._artifact.scorer.row_gain(self._context.object_y))[absent]
+
+    def absent_posterior(self, absent: Places, coverage: float) -> Floats:
+        """See `with_unlisted`."""
+        found: Floats = with_unlisted(
+            *(self._artifact, self.absent_log_odds(absent), absent, self._context.object_y),
+            *(self.present, self._room, coverage),
+        )
+        return found
 
     def relation_log_odds(self) -> Floats:
         """Normal logits."""

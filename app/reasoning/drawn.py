@@ -17,8 +17,10 @@ from app.boltzmann.draws import HiddenDraws
 from app.boltzmann.log_odds import object_log_odds
 from app.boltzmann.mean_field import Evidence
 from app.reasoning.evidence import DRAWS, draw_context, observe
+from app.reasoning.given import pull_of
 from app.reasoning.present import Present
 from app.reasoning.units import NO_UNIT, Units, mean_log_p, units_between
+from app.reasoning.unlisted import with_unlisted
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 
@@ -51,21 +53,27 @@ class DrawnPosterior:
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
         self.observation = observe(artifact.machine, scene)
         self.present: Present = self.observation.scene
-        self._artifact = artifact
-        self._context: HiddenDraws | None = None
+        self._artifact, self._room = artifact, scene.room_type
+        self._pull = pull_of(scene, artifact.calibration.evidence)
 
     @property
     def unit_count(self) -> int:
         """Those of the evidence; in the seed form, of all that is present."""
         return self.observation.unit_count
 
-    @property
+    @cached_property
     def draws(self) -> HiddenDraws:
-        """Of h1 given the evidence."""
-        if self._context is None:
-            observation = self.observation
-            self._context = draw_context(observation.machine, observation.evidence)
-        return self._context
+        """Of h1 given the evidence, for questions about relations."""
+        observation, pull = self.observation, self._pull.relations
+        return draw_context(observation.machine, observation.evidence, pull=pull)
+
+    @cached_property
+    def object_draws(self) -> HiddenDraws:
+        """The same for questions about objects."""
+        observation, pull = self.observation, self._pull
+        if pull.objects == pull.relations or observation.evidence.edges is None:
+            return self.draws
+        return draw_context(observation.machine, observation.evidence, pull=pull.objects)
 
     @torch.inference_mode()
     def absent_log_odds(self, absent: Places) -> Floats:
@@ -73,9 +81,23 @@ class DrawnPosterior:
         machine, evidence = self.observation.machine, self.observation.evidence
         where = torch.from_numpy(np.asarray(absent, dtype=np.int64))
         if machine.spec.form == "local" and evidence.edges is None:
-            gain = self._artifact.scorer.gain(self.draws.field.y)[0, where]
+            gain = self._artifact.scorer.gain(self.object_draws.field.y)[0, where]
             return _numpy(machine.b[where] + gain)
-        return _numpy(presence_log_odds(machine, evidence, where.unsqueeze(0), self.draws)[0])
+        draws = self.object_draws
+        return _numpy(presence_log_odds(machine, evidence, where.unsqueeze(0), draws)[0])
+
+    @torch.inference_mode()
+    def absent_posterior(self, absent: Places, coverage: float) -> Floats:
+        """See `with_unlisted`; with a second layer, h2 stays at its mean field."""
+        log_odds = self.absent_log_odds(absent)
+        if self._artifact.completions is None:
+            return log_odds
+        y = self.object_draws.field.y[0].numpy()
+        closed = self._artifact.machine.b.numpy() + self._artifact.scorer.row_gain(y)
+        return with_unlisted(
+            *(self._artifact, log_odds, absent, y, self.present, self._room, coverage),
+            closed[absent],
+        )
 
     @torch.inference_mode()
     def relation_log_odds(self) -> Floats:
@@ -126,7 +148,7 @@ class DrawnPosterior:
         gate = machine.gate(units.edges, evidence.v)
         unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
         # Where e is not observed, the difference is zero and the weights stay as they are.
-        said = unseen - machine.relation_term(logits, gate, r, observed)
+        said = self._pull.relations * (unseen - machine.relation_term(logits, gate, r, observed))
         return _Between(units, logits, said, (r * observed).unsqueeze(0))
 
     def _implied(self, *, apart: bool) -> Tensor:
@@ -193,7 +215,9 @@ class DrawnPosterior:
         parts = []
         for classes in torch.arange(n).split(_rows(observation.unit_count * DRAWS)):
             rest = observation.without(alone[classes])
-            draws = None if rest.edges is None else draw_context(machine, rest, rows=n)
+            draws = None
+            if rest.edges is not None:
+                draws = draw_context(machine, rest, rows=n, pull=self._pull.objects)
             candidates = observation.classes[classes].unsqueeze(1)
             parts.append(presence_log_odds(machine, rest, candidates, draws).squeeze(1))
         return _numpy(torch.cat(parts))
@@ -216,6 +240,7 @@ class DrawnPosterior:
                 machine,
                 observation.without(alone[part].any(1)),
                 candidates=observation.classes[part],
+                pull=self._pull.objects,
             )
             for part in pairs.split(_rows(observation.unit_count))
         ]
@@ -240,7 +265,12 @@ class DrawnPosterior:
         size = observation.unit_count + where.shape[1] * max(1, machine.spec.H1)
         log_odds = torch.cat(
             [
-                object_log_odds(machine, observation.without(part), candidates=where)
+                object_log_odds(
+                    machine,
+                    observation.without(part),
+                    candidates=where,
+                    pull=self._pull.objects,
+                )
                 for part in removed.split(_rows(size))
             ]
         )

@@ -33,7 +33,11 @@ _RELATION_DRAWS = 1 << 25
 
 
 def draw_context(
-    machine: BoltzmannMachine, evidence: Evidence, *, rows: int | None = None
+    machine: BoltzmannMachine,
+    evidence: Evidence,
+    *,
+    rows: int | None = None,
+    pull: float = 1.0,
 ) -> HiddenDraws:
     """The fixed, weighted draws of h1 that every estimate uses.
 
@@ -41,13 +45,14 @@ def draw_context(
 
     Args:
         rows: how many rows the question has in all; those of the evidence by default.
+        pull: weight of the observed relations, see `draw_hidden`.
     """
     units = 0 if evidence.edges is None else evidence.edges.shape[-1]
     size = (len(evidence.v) if rows is None else rows) * units
     draws = DRAWS
     while draws > _FEWEST_DRAWS and draws * size > _RELATION_DRAWS:
         draws //= 2
-    return draw_hidden(machine, evidence, draws=draws)
+    return draw_hidden(machine, evidence, draws=draws, pull=pull)
 
 
 @dataclass(frozen=True)

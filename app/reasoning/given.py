@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.boltzmann.closed_form import Given
+from app.boltzmann.mean_field import Pull
 from app.compiling import compiled
 from app.reasoning.present import Present
+from app.registry.description import EvidenceWeights
 from app.scene.evidence import instance_evidence, pooled
 from app.scene.scene import Scene
 
@@ -24,6 +26,13 @@ def given_relations(scene: Scene, present: Present, relations: int) -> Given | N
         return None
     holds, observed = instance_evidence(scene)
     return Given(*_lists(present.row, present.presence, holds, observed, relations))
+
+
+def pull_of(scene: Scene, weights: EvidenceWeights) -> Pull:
+    """How strongly the relations of a scene act on the context."""
+    if scene.poses is None:
+        return Pull(weights.relations_on_objects, weights.relations_on_relations)
+    return Pull(weights.poses_on_objects, weights.poses_on_relations)
 
 
 @compiled

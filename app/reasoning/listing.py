@@ -20,18 +20,15 @@ def absent_things(structure, classes):
 
 
 @compiled
-def likeliest_classes(scores, chosen, count):
-    """The best `count` of the chosen by score, and their shares of the softmax over all, (k,) each.
+def likeliest_classes(logits, chosen, count):
+    """The best `count` of the chosen by logit, and their probabilities, (k,) each.
 
-    By score: probabilities of far ones may all round to zero.
+    By logit: probabilities near 0 or 1 may all round to one number.
     """
-    where = best(scores, chosen, count)
-    largest, total = np.max(scores), np.float64(0.0)
-    for k in range(len(scores)):
-        total += np.exp(scores[k] - largest)
+    where = best(logits, chosen, count)
     p = np.empty(len(where), np.float64)
     for k in range(len(where)):
-        p[k] = np.exp(scores[where[k]] - largest) / total
+        p[k] = 1.0 / (1.0 + np.exp(-np.float64(logits[where[k]])))
     return where, p
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.reasoning.answers import Because, MissingAnswer, Placement, entries
-from app.reasoning.calibration import missing_scores, placed_scores
+from app.reasoning.calibration import missing_logits, placed_logits
 from app.reasoning.listing import absent_things, likeliest_classes
 from app.reasoning.placements import placements
 from app.reasoning.posterior import Posterior, posterior
@@ -28,47 +28,56 @@ def missing(
     top_k: int = 10,
     candidates: Sequence[int] | None = None,
     at: tuple[str, int] | None = None,
+    coverage: float | None = None,
     axes: Axes | None = _VIEWER,
     coverage: float | None = None,  # noqa: ARG001
     details: bool = True,
 ) -> tuple[MissingAnswer, ...]:
-    """Absent classes by the probability that they were taken away, likeliest first.
+    """Unlisted classes by the probability that they are there all the same, likeliest first.
 
-    The probabilities are a softmax over *all* absent classes but structure, so they sum to one over
-    these whatever `top_k` and `candidates` leave of them. A present class is never proposed.
+    A class that is there is listed with probability `coverage`. The lower the coverage, the less an
+    unlisted class counts as absent. Each probability is of its own: they do not sum to one. Listed
+    classes and structure are never proposed.
 
     Args:
         top_k: at most so many.
         candidates: class indices to choose from; present classes and structure among them are
             passed over.
-        at: (relation, position of an object): the missing thing stood so to that object.
+        at: (relation, position of an object): the probability is that a class is there, unlisted,
+            *and* stands so to that object.
+        coverage: from 0 to 1; by default the model's. At 1 unlisted classes count as absent.
         axes: the viewer's, in the frame that offsets are answered in (`viewer_axes`); None where
             nobody knows where the viewer looks.
         coverage: probability that a class which is present is listed; by default the model's.
         details: also say where each would stand, and what speaks for it.
 
     Raises:
-        ValueError: top_k below 1, a candidate outside the vocabulary, an unknown relation, or an
-            anchor that is no object of the scene.
+        ValueError: top_k below 1, a coverage outside [0, 1], a candidate outside the vocabulary, an
+            unknown relation, or an anchor that is no object of the scene.
     """
     spec, calibration = artifact.machine.spec, artifact.calibration
     if top_k < 1:
         raise ValueError(f"top_k must be at least 1, not {top_k}")
+    coverage = calibration.coverage if coverage is None else coverage
+    if not 0 <= coverage <= 1:
+        raise ValueError(f"coverage must be in [0, 1], not {coverage}")
     place = _place(scene, spec.A, at)
     given = posterior(artifact, scene)
-    absent = absent_things(artifact.vocabulary.structure, given.present.classes)
+    structure = artifact.vocabulary.structure
+    absent = absent_things(structure, given.present.classes)
     chosen = _chosen(absent, spec.V, candidates)
     if not chosen.any():
         return ()
-    log_odds = given.absent_log_odds(absent)
+    log_odds = given.absent_posterior(absent, coverage)
+    listed = max(1, int(np.count_nonzero(~structure[given.present.classes])))
     if place is None:
-        scores = missing_scores(calibration, log_odds)
+        logits = missing_logits(calibration, log_odds, listed)
     else:
         relation, anchor, outgoing = place
         row = int(given.present.row[anchor])
         log_p = given.placed_log_p(absent, relation, row, outgoing=outgoing)
-        scores = placed_scores(calibration, log_odds, log_p)
-    where, probabilities = likeliest_classes(scores, chosen, top_k)
+        logits = placed_logits(calibration, log_odds, log_p, listed)
+    where, probabilities = likeliest_classes(logits, chosen, top_k)
     found = absent[where]
     labels = artifact.vocabulary.labels
     standing: Sequence[tuple[Placement, ...]] = [()] * len(found)

@@ -40,6 +40,9 @@ class Posterior(Protocol):
     def absent_log_odds(self, absent: Places) -> Floats:
         """Presence of absent classes (N,), each with all its relations unobserved, (N,)."""
 
+    def absent_posterior(self, absent: Places, coverage: float) -> Floats:
+        """The same where a class which is present is listed with probability `coverage`, (N,)."""
+
     def relation_log_odds(self) -> Floats:
         """Every relation between the classes present, each without itself, (A, n, n)."""
 

@@ -26,6 +26,7 @@ from app.scene.vocabulary import Vocabulary
 if TYPE_CHECKING:  # importing torch takes seconds; writing and listing artifacts does without
     from app.boltzmann import BoltzmannMachine
     from app.boltzmann.closed_form import ClosedForm
+    from app.boltzmann.completions import Completions
     from app.boltzmann.fantasies import Fantasies
     from app.boltzmann.scene_chains import SceneChains
     from app.boltzmann.scoring import ContextScorer
@@ -68,6 +69,15 @@ class Artifact:
         from app.boltzmann.closed_form import ClosedForm
 
         return ClosedForm(self.machine) if ClosedForm.fits(self.machine) else None
+
+    @cached_property
+    def completions(self) -> Completions | None:
+        """Posterior of unlisted classes, prepared; None for machines without stored samples."""
+        from app.boltzmann.completions import Completions
+
+        if not Completions.fits(self.machine):
+            return None
+        return Completions(self.machine, self.vocabulary.structure, self.scorer)
 
     @cached_property
     def relation_slopes(self) -> RelationSlopes:

@@ -56,6 +56,12 @@ class CountSlope(Frozen):
     log_count: float = 0.0
 
 
+class PlacedSlope(CountSlope):
+    """The same for a class at a place: + log_relation·log p(relation | both are there)."""
+
+    log_relation: float = 1.0
+
+
 class PairSlope(CountSlope):
     """The same for a relation between two objects, and + log_classes·log of the scene's classes.
 
@@ -98,12 +104,15 @@ class EvidenceWeights(Frozen):
 class Calibration(Frozen):
     """How a machine's log-odds become the probabilities that the service promises.
 
-    The defaults change nothing.
+    The defaults change no log-odds but those of unlisted classes, see `coverage`.
 
     Attributes:
         coverage: probability that a class which is present is listed, unless a request says.
+        coverage_weight: share of the partial posterior in the log-odds; the rest is the closed form
+            with unlisted classes absent; chosen on validation.
         missing: posterior log-odds of an unlisted class to the calibrated ones; n counts the listed
             classes.
+        placed: the same for an unlisted class that stands at a given place.
         evidence: see `EvidenceWeights`.
         popularity: (V,) log-odds of finding each class in a training scene; empty: all alike.
         popularity_weight: alpha of the prior of an intruder, proportional to popularity^alpha.
@@ -121,7 +130,9 @@ class Calibration(Frozen):
     """
 
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
+    coverage_weight: Annotated[float, Field(ge=0, le=1)] = 0.5
     missing: CountSlope = CountSlope()
+    placed: PlacedSlope = PlacedSlope()
     evidence: EvidenceWeights = EvidenceWeights()
     popularity: tuple[float, ...] = ()
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from app.reasoning import missing, outliers, relations
+from app.registry.description import CountSlope, PlacedSlope
 from app.scene import CANONICAL, OPPOSITES
 from tests.enumeration.implied import relation_by_definition
 from tests.enumeration.small_machines import Joint, enumerate_joint
@@ -124,13 +125,12 @@ def test_missing(case, classes, stated):
     absent = set(range(3)) - set(classes)
     assert {answer.label for answer in answers} == {LABELS[i] for i in absent}
     truth = {LABELS[i]: exact.object(i, classes, triples(classes, stated)) for i in absent}
-    total = sum(map(math.exp, truth.values()))
     exactly = is_exact(artifact, stated)
     near = 1e-9 if exactly else TOLERANCE
     for answer in answers:
         around = 1e-9 if exactly else LOG_ODDS_TOLERANCE
         assert answer.log_odds == pytest.approx(truth[answer.label], abs=around)
-        expected = math.exp(truth[answer.label]) / total
+        expected = 1 / (1 + math.exp(-truth[answer.label]))
         assert answer.probability == pytest.approx(expected, abs=near)
 
 
@@ -172,18 +172,18 @@ def test_missing_at_a_place(case, relation, anchor):
         triple = (0, i, anchor) if relation == "left" else (0, anchor, i)
         p = exact.relation(triple, [anchor, i])
         scores[LABELS[i]] = math.exp(exact.object(i, [anchor])) * max(p, math.exp(-30))
-    total = sum(scores.values())
     for answer in answers:
-        assert answer.probability == pytest.approx(scores[answer.label] / total, abs=TOLERANCE)
+        odds = scores[answer.label]
+        assert answer.probability == pytest.approx(odds / (1 + odds), abs=TOLERANCE)
 
 
 def test_the_place_counts_by_the_calibration(case):
     """Without weight the place says nothing; the log-odds never change."""
     name = next(name for name, spec in EXACT.items() if spec == case[0].machine.spec)
-    unweighted = exact_artifact(name, placed_relation_weight=0.0, placed_temperature=2.0)
-    cooled = exact_artifact(name, missing_temperature=2.0)
+    entry = {"intercept": -0.3, "slope": 0.5, "log_count": 0.2}
+    unweighted = exact_artifact(name, placed=PlacedSlope(**entry, log_relation=0.0))
     there = missing(unweighted, scene_of([0]), at=("left", 0))
-    anywhere = missing(cooled, scene_of([0]))
+    anywhere = missing(exact_artifact(name, missing=CountSlope(**entry)), scene_of([0]))
     assert [a.probability for a in there] == pytest.approx([a.probability for a in anywhere])
     assert [a.log_odds for a in there] == [a.log_odds for a in anywhere]
 

@@ -9,7 +9,7 @@ import pytest
 
 from app.reasoning import missing, outliers, relations
 from app.reasoning.calibration import exclusive, relation_probability
-from app.registry.description import Calibration, CountSlope, PairSlope, Slope
+from app.registry.description import Calibration, CountSlope, PairSlope, PlacedSlope, Slope
 from app.registry.slopes import RelationSlopes
 from tests.reasoning.artifacts import larger_artifact, scene_of
 
@@ -103,11 +103,32 @@ def test_false_relations():
         assert other.probability == pytest.approx(sigmoid(0.4 + 0.5 * z), abs=1e-4)
 
 
-def test_missing_temperature_flattens():
-    scene = scene_of([0, 1])
-    plain = missing(larger_artifact("triway-local"), scene, top_k=9)
-    flat = missing(larger_artifact("triway-local", missing_temperature=3.0), scene, top_k=9)
-    assert [a.label for a in plain] == [a.label for a in flat]
-    weights = [math.exp(a.log_odds / 3) for a in flat]
-    for answer, weight in zip(flat, weights, strict=True):
-        assert answer.probability == pytest.approx(weight / sum(weights), abs=1e-5)
+@pytest.mark.parametrize(
+    ("classes", "listed"), [([0, 1, 1, 8], 2), ([0, 1, 2], 3), ([8], 1), ([], 1)]
+)
+def test_missing_by_log_odds_and_listed_things(classes, listed):
+    """Structure and further instances do not count; there is at least one."""
+    entry = CountSlope(intercept=0.4, slope=0.6, log_count=-0.5)
+    artifact = larger_artifact("triway-local", missing=entry)
+    answers = missing(artifact, scene_of(classes), top_k=9)
+    for answer in answers:
+        z = 0.4 + 0.6 * answer.log_odds - 0.5 * math.log(listed)
+        assert answer.probability == pytest.approx(sigmoid(z), abs=1e-5)
+    assert [a.log_odds for a in answers] == sorted((a.log_odds for a in answers), reverse=True)
+
+
+@pytest.mark.parametrize("relation", ["left", "behind"])
+def test_missing_at_a_place_by_the_relation_too(relation):
+    """To be there and stand so is at most as likely as to be there."""
+    entry = PlacedSlope(intercept=-0.2, slope=0.8, log_count=0.3, log_relation=0.7)
+    artifact, scene = larger_artifact("triway-local", placed=entry), scene_of([0, 1])
+    plain = larger_artifact("triway-local")
+    at = (relation, 1)
+    exact = {a.label: a for a in missing(plain, scene, at=at, top_k=9)}
+    for label, answer in exact.items():
+        assert answer.probability <= sigmoid(answer.log_odds), label
+    for answer in missing(artifact, scene, at=at, top_k=9):
+        p = exact[answer.label].probability
+        log_p = math.log(p / (1 - p)) - answer.log_odds
+        z = -0.2 + 0.8 * answer.log_odds + 0.3 * math.log(2) + 0.7 * log_p
+        assert answer.probability == pytest.approx(sigmoid(z), abs=1e-4)

@@ -49,13 +49,12 @@ def permuted(scene, order):
 
 @few
 @given(names, scenes())
-def test_missing_sums_to_one_over_all_absent_classes(name, scene):
+def test_missing_proposes_all_unlisted_things(name, scene):
     artifact = ARTIFACTS[name]
     answers = missing(artifact, scene, top_k=len(LABELS))
     present = {thing.label for thing in scene.objects}
     assert {answer.label for answer in answers} == set(LABELS) - present - STRUCTURE
-    if answers:
-        assert sum(answer.probability for answer in answers) == pytest.approx(1, abs=1e-5)
+    assert all(0 <= answer.probability <= 1 for answer in answers)
     probabilities = [answer.probability for answer in answers]
     assert probabilities == sorted(probabilities, reverse=True)
 
@@ -375,7 +374,7 @@ def test_missing_at_every_place(name):
     for relation in [*CANONICAL, *OPPOSITES.values()]:
         for anchor in range(3):
             answers = missing(artifact, scene, at=(relation, anchor), top_k=len(LABELS))
-            assert sum(a.probability for a in answers) == pytest.approx(1, abs=1e-5)
+            assert all(0 <= a.probability <= 1 for a in answers)
             probabilities = [a.probability for a in answers]
             assert probabilities == sorted(probabilities, reverse=True)
             seen.add(tuple(probabilities))
@@ -392,6 +391,9 @@ def test_missing_at_every_place(name):
         (relations, {"pairs": [(0, 2)]}, "pair"),
         (relations, {"pairs": [(-1, 0)]}, "pair"),
         (missing, {"top_k": 0}, "top_k"),
+        (missing, {"coverage": -0.1}, "coverage"),
+        (missing, {"coverage": 1.1}, "coverage"),
+        (missing, {"coverage": math.nan}, "coverage"),
         (missing, {"candidates": [9]}, "candidate 9"),
         (missing, {"candidates": [-1]}, "candidate -1"),
         (missing, {"at": ("left", 2)}, "anchor 2"),
