@@ -1,130 +1,88 @@
 """From log-odds to the probabilities the service promises, fitted on validation scenes.
 
-    missing    softmax(log-odds / T): the class that was taken away, given that exactly one was
-    placed     softmax(log-odds / T + w·log p(relation to the anchor)): given where it stood as well
-    outlier    the object is an intruder, where half of the scenes are clean
-    relation   an annotator would list this relation for this pair of instances; fitted apart for
-               scenes of which nothing is said, and for those of which half of the pairs are told
+    missing, placed, outlier   see `training.calibrate_objects`
+    relation   the relation holds between this pair of instances; fitted apart for scenes of which
+               no relation is told, and for those of which half of the pairs are told
     placement  the same for a pair of which one was taken away
     misplaced  the relation is false, where one triple in half of the scenes was altered
 
-Temperatures minimise the negative log-likelihood; the others are logistic regressions (Platt
-scaling).
+All are logistic regressions (Platt scaling) on what each source says holds or does not hold; what
+it leaves unsaid is left out. Sources count by the root of how much they say: one procedural source
+says more than all others together.
 
-Sources: Platt, "Probabilistic outputs for support vector machines" (1999); Guo, Pleiss, Sun and
-Weinberger, "On calibration of modern neural networks" (2017).
+Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize, minimize_scalar
-from sklearn.linear_model import LogisticRegression
 
 from app.reasoning import misplaced
 from app.reasoning.placements import PLACES
 from app.reasoning.posterior import posterior
 from app.reasoning.units import NO_UNIT
-from app.registry import Artifact, Calibration, CountSlope, PairSlope, Slope
-from app.scene import CANONICAL, Scene, SceneObject
+from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
+from app.scene import CANONICAL
 from training.batches import SceneTensors
+from training.calibrate_objects import ALARMS, calibrate_objects
+from training.cases import (
+    Triple,
+    altered_case,
+    known_relations,
+    logistic,
+    scene_of,
+    taken_away,
+    told_pairs,
+)
 from training.datasets import EncodedScene
-from training.evaluation.alarms import alarm_threshold, judged_scenes
-from training.evaluation.missing import ObjectScore, machine_score, removed_objects
-from training.evaluation.outliers import IntruderScores, intruder_scores
 from training.trainer import subset
 
-Triple: TypeAlias = tuple[int, int, int]
-
-_SCENES = 1500
+_SCENES = 2500
 # An answer lists the best 20 relations by default.
 _LISTED = 20
 _OF_THE_REST = 0.02
 _ROUNDS = 3
 # Columns of an example, the scene first.
-_RELATION, _LOGIT, _TRUTH = 1, 2, 5
-# Cases a scene: with one of some 300 scenes, the weight moved by a third from draw to draw.
-_PLACED_CASES = 2
+_RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 5, 6
+# Cases a scene: of one, chance alone would decide.
 _PLACEMENT_CASES = 4
-_MISPLACED_SCENES = 300
+_MISPLACED_SCENES = 600
 
 
-def calibrate(artifact: Artifact, scenes: SceneTensors, seed: int = 0) -> Calibration:
+def calibrate(
+    artifact: Artifact, scenes: SceneTensors, train: SceneTensors, seed: int = 0
+) -> Calibration:
     """Fit every entry of the calibration.
 
     Args:
         artifact: with the neutral calibration.
         scenes: validation scenes.
+        train: what popularity is counted in.
     """
+    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
+    calibration = calibrate_objects(artifact, scenes, train, structure, seed)
+    artifact = replace(artifact, calibration=calibration)
     generator = torch.Generator().manual_seed(seed)
     pick = torch.randperm(len(scenes), generator=generator)
-    sample = judged_scenes(scenes, seed)
     annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
-    related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64))
-    structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    score = machine_score(artifact.machine)
-    outlier, threshold = fit_outlier(
-        intruder_scores(sample, structure, score, seed=seed), sample, seed
-    )
-    calibration = Calibration.neutral(artifact.machine.spec.A).model_copy(
-        update={
-            "missing_temperature": fit_missing(sample, structure, score),
-            "outlier": outlier,
-            "outlier_threshold": threshold,
-        }
-    )
+    related = subset(scenes, torch.tensor(annotated[:_SCENES], dtype=torch.int64)).scenes
     if not len(related):
         return calibration
-    temperature, weight = fit_placed(artifact, related.scenes, seed)
-    return calibration.model_copy(
+    calibration = calibration.model_copy(
         update={
-            "placed_temperature": temperature,
-            "placed_relation_weight": weight,
-            "relation": fit_relations(artifact, related.scenes),
-            "placement": fit_placements(artifact, related.scenes, seed),
-            "relation_given": fit_relations(artifact, related.scenes, np.random.default_rng(seed)),
-            "misplaced": fit_misplaced(artifact, related.scenes[:_MISPLACED_SCENES], seed),
+            "relation": fit_relations(artifact, related),
+            "placement": fit_placements(artifact, related, seed),
+            "relation_given": fit_relations(artifact, related, np.random.default_rng(seed)),
         }
     )
-
-
-def fit_missing(scenes: SceneTensors, structure: torch.Tensor, score: ObjectScore) -> float:
-    """The temperature of least negative log-likelihood of the removed class."""
-
-    found_rows = list(removed_objects(scenes, structure, score))
-    target = torch.cat([block[1] for block in found_rows]).unsqueeze(1)
-    values = torch.cat([block[2] for block in found_rows])
-
-    def nll(log_temperature: float) -> float:
-        log_p = (values / float(np.exp(log_temperature))).log_softmax(1)
-        return -float(log_p.gather(1, target).mean())
-
-    found = minimize_scalar(nll, bounds=(-1.0, 1.5), method="bounded", options={"xatol": 0.02})
-    return float(np.exp(found.x))
-
-
-def fit_outlier(
-    scores: IntruderScores, scenes: SceneTensors, seed: int = 0
-) -> tuple[CountSlope, float]:
-    """Logistic regression of "is the intruder", half of the scenes clean, and the alarm threshold.
-
-    Args:
-        scenes: those that were scored.
-    """
-    rng = np.random.default_rng(seed)
-    clean_scene = rng.random(int(scores.scene.max()) + 1) < 0.5
-    used = scores.clean == clean_scene[scores.scene]
-    features = np.stack([scores.log_odds, np.log(scores.size)], 1)
-    slope, size, intercept = _logistic(features[used], scores.intruder[used])
-    entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
-    logits = intercept + features @ np.array([slope, size])
-    return entry, _sigmoid(alarm_threshold(logits, scores, scenes, rng))
+    entry, limits = fit_misplaced(artifact, related[:_MISPLACED_SCENES], seed)
+    return calibration.model_copy(update={"misplaced": entry, "misplaced_thresholds": limits})
 
 
 def fit_relations(
@@ -137,6 +95,7 @@ def fit_relations(
             nothing is given, and all are asked.
     """
     blocks: list[NDArray[np.float64]] = []
+    sources = sorted({encoded.source for encoded in scenes})
     for number, encoded in enumerate(scenes):
         asked = np.ones((len(encoded.instance_classes),) * 2, dtype=np.bool_)
         told: list[Triple] = []
@@ -147,7 +106,8 @@ def fit_relations(
         scene = replace(scene_of(encoded, range(len(asked)), told), room_type=None)
         values = posterior(artifact, scene).relation_log_odds()
         structure = artifact.vocabulary.structure
-        blocks.append(_instance_pairs(number, encoded, values, structure, asked))
+        source = sources.index(encoded.source)
+        blocks.append(_instance_pairs(number, source, encoded, values, structure, asked))
     return _fit_listed(blocks, artifact.machine.spec.A, _LISTED)
 
 
@@ -157,6 +117,7 @@ def fit_placements(
     """The same for the relations of an object that was taken away to those that stayed."""
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
+    sources = sorted({encoded.source for encoded in scenes})
     blocks: list[NDArray[np.float64]] = []
     for number, encoded in enumerate([*scenes] * _PLACEMENT_CASES):
         taken = taken_away(encoded, structure, rng)
@@ -169,27 +130,16 @@ def fit_placements(
         anchors = np.flatnonzero(~structure[present.classes])
         both = given.placement_log_odds(np.array([target]), anchors)
         other = np.array(kept)[present.first[anchors]]
-        holds = encoded.instance_holds
-        truths = (holds[:, gone, other], holds[:, other, gone])
-        for values, truth in zip(both, truths, strict=True):
-            a, place = (part.ravel() for part in np.indices(truth.shape))
+        holds, known = encoded.instance_holds, known_relations(encoded)
+        for values, ends in zip(both, ((gone, other), (other, gone)), strict=True):
+            truth, usable = holds[:, *ends], known[:, *ends]
+            a, place = (part[usable.ravel()] for part in map(np.ravel, np.indices(truth.shape)))
             size = np.full(len(a), np.log(len(present.classes) + 1))
             count = np.log(present.counts[anchors])[place]
-            columns = (np.full(len(a), number), a, values[0].ravel(), count, size, truth.ravel())
-            blocks.append(np.stack(columns, 1).astype(np.float64))
+            which = np.full(len(a), number), a, values[0][usable], count, size, truth[usable]
+            source = np.full(len(a), sources.index(encoded.source))
+            blocks.append(np.stack([*which, source], 1).astype(np.float64))
     return _fit_listed(blocks, artifact.machine.spec.A, PLACES)
-
-
-def taken_away(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[int, list[int]] | None:
-    """(a class drawn from those that may be missing, the instances of all others)."""
-    classes = encoded.evidence.classes
-    removable = classes[~structure[classes]]
-    if len(removable) < 2:
-        return None
-    target = int(rng.choice(removable))
-    return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
 
 
 def _fit_listed(
@@ -200,14 +150,25 @@ def _fit_listed(
     These decide: what is chosen for its high log-odds is listed by annotators less often than
     log-odds alike among all pairs. The others count a little.
     """
-    examples = np.concatenate(blocks or [np.zeros((0, _TRUTH + 1))])
+    examples = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     # A relation that has no unit in the machine tells nothing of how log-odds are to be read.
     examples = examples[examples[:, _LOGIT] > NO_UNIT]
     slopes = _fit_each(examples, relations, np.ones(len(examples)))
     for _ in range(_ROUNDS):
-        weight = np.where(_among_best(examples, slopes, listed), 1.0, _OF_THE_REST)
+        best = _among_best(examples, slopes, listed)
+        weight = _source_weights(examples, best) * np.where(best, 1.0, _OF_THE_REST)
         slopes = _fit_each(examples, relations, weight)
     return slopes
+
+
+def _source_weights(examples: NDArray[np.float64], best: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """One over the root of how many listed examples of a relation a source has, (N,)."""
+    relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
+    key = relation * (source.max(initial=0) + 1) + source
+    counts = np.bincount(key[best], minlength=int(key.max(initial=-1)) + 1)
+    weights = 1 / np.sqrt(np.maximum(counts, 1.0))
+    found: NDArray[np.float64] = weights[key]
+    return found
 
 
 def _among_best(
@@ -235,46 +196,32 @@ def _fit_each(
     return tuple(fitted)
 
 
-def told_pairs(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[NDArray[np.bool_], list[Triple]]:
-    """Half of the pairs of a scene are told about: those left to ask (N, N), and what is told.
-
-    Which ones is decided without looking at what holds between them: had half of the relations been
-    given, a pair of which nothing is said would be likelier to have none.
-    """
-    size = len(encoded.instance_classes)
-    half = np.triu(rng.random((size, size)) < 0.5, 1)
-    told = half | half.T
-    plain = ~structure[encoded.instance_classes]
-    triples = np.argwhere(encoded.instance_holds & told & plain[:, None] & plain).tolist()
-    return ~told, [(int(a), int(x), int(y)) for a, x, y in triples]
-
-
 def _instance_pairs(
     number: int,
+    source: int,
     scene: EncodedScene,
     values: NDArray[np.floating[Any]],
     structure: NDArray[np.bool_],
     asked: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """(examples, 6): scene, relation, class log-odds, log n_i + log n_j, log of all classes,
-    and whether it was listed.
+    """(examples, 7): scene, relation, class log-odds, log n_i + log n_j, log of all classes,
+    whether it holds, and the source; of what is known.
     """
     evidence = scene.evidence
     place = np.searchsorted(evidence.classes, scene.instance_classes)
     logs = np.log(evidence.counts[place])
     usable = ~structure[scene.instance_classes]
     pair = asked & usable[:, None] & usable[None, :] & ~np.eye(len(place), dtype=np.bool_)
-    both = (logs[:, None] + logs[None, :])[pair]
+    both, known = logs[:, None] + logs[None, :], known_relations(scene)
     columns = []
     for a in range(len(values)):
-        logit = values[a][place[:, None], place[None, :]][pair]
+        of = pair & known[a]
+        logit = values[a][place[:, None], place[None, :]][of]
         size = np.full(len(logit), np.log(len(evidence.classes)))
-        # What is not listed is off, left open by geometry or not: a listing is what is promised.
-        truth = scene.instance_holds[a][pair]
+        truth = scene.instance_holds[a][of]
         which = (np.full(len(logit), number), np.full(len(logit), a))
-        columns.append(np.stack([*which, logit, both, size, truth], 1))
+        from_source = np.full(len(logit), source)
+        columns.append(np.stack([*which, logit, both[of], size, truth, from_source], 1))
     return np.concatenate(columns)
 
 
@@ -282,140 +229,41 @@ def _fit_relation(examples: NDArray[np.float64], weight: NDArray[np.float64]) ->
     truth = examples[:, _TRUTH] > 0
     if len(np.unique(truth)) < 2:
         return PairSlope()
-    slope, count, classes, intercept = _logistic(examples[:, _LOGIT:_TRUTH], truth, weight)
+    slope, count, classes, intercept = logistic(examples[:, _LOGIT:_TRUTH], truth, weight)
     return PairSlope(intercept=intercept, slope=slope, log_count=count, log_classes=classes)
 
 
-@torch.no_grad()
-def fit_placed(
+def fit_misplaced(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
-) -> tuple[float, float]:
-    """Temperature and relation weight for the missing object with a known place."""
-    rng = np.random.default_rng(seed)
-    structure = artifact.vocabulary.structure
-    cases: list[tuple[torch.Tensor, torch.Tensor, int]] = []
-    for encoded in [*scenes] * _PLACED_CASES:
-        case = placed_case(encoded, structure, rng)
-        if case is None:
-            continue
-        scene, relation, anchor, target = case
-        given = posterior(artifact, scene)
-        absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
-        row = int(given.present.row[anchor])
-        odds = given.absent_log_odds(absent).astype(np.float64)
-        log_p = given.placed_log_p(absent, relation, row, outgoing=True).astype(np.float64)
-        where = int(np.flatnonzero(absent == target)[0])
-        cases.append((torch.from_numpy(odds), torch.from_numpy(log_p), where))
-    if len(cases) < 10:
-        return 1.0, 1.0
+) -> tuple[Slope, Thresholds]:
+    """Logistic regression of "this relation is false" on its log-odds given the rest.
 
-    def nll(x: NDArray[np.float64]) -> float:
-        losses = [
-            -(odds / float(np.exp(x[0])) + float(x[1]) * log_p).log_softmax(0)[target]
-            for odds, log_p, target in cases
-        ]
-        return float(torch.stack(losses).mean())
-
-    found = minimize(nll, np.array([0.0, 1.0]), method="Nelder-Mead", options={"maxiter": 80})
-    return float(np.exp(found.x[0])), float(found.x[1])
-
-
-def placed_case(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[Scene, int, int, int] | None:
-    """A scene with one class taken out that stood in a relation to something that stayed.
-
-    Returns:
-        The scene, the canonical relation, the position of its object, and the class taken out.
+    And the probabilities that the least likely relation of an unaltered scene exceeds in as many
+    scenes as objects raise alarms.
     """
-    evidence = encoded.evidence
-    usable = ~structure[evidence.classes]
-    pairs = evidence.holds & usable[:, None] & usable[None, :]
-    pairs &= ~np.eye(len(usable), dtype=np.bool_)
-    found = np.argwhere(pairs)
-    if usable.sum() < 3 or not len(found):
-        return None
-    a, x, y = found[rng.integers(len(found))]
-    kept = [k for k, c in enumerate(encoded.instance_classes) if c != evidence.classes[x]]
-    scene = scene_of(encoded, kept, triples=())
-    anchor = next(
-        p for p, k in enumerate(kept) if encoded.instance_classes[k] == evidence.classes[y]
-    )
-    return scene, int(a), anchor, int(evidence.classes[x])
-
-
-def fit_misplaced(artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0) -> Slope:
-    """Logistic regression of "this relation is false" on its log-odds given the rest."""
     rng = np.random.default_rng(seed)
     rows: list[tuple[float, bool]] = []
+    worst: list[float] = []
     for encoded in scenes:
         case = altered_case(encoded, artifact.vocabulary.structure, rng)
         if case is None:
             continue
         scene, false = case
+        logits = []
         for answer in misplaced(artifact, scene):
             p = np.clip(answer.probability, 1e-9, 1 - 1e-9)
             triple = (CANONICAL.index(answer.relation), answer.subject, answer.object)
-            rows.append((float(np.log(p / (1 - p))), triple == false))
+            logits.append(float(np.log(p / (1 - p))))
+            rows.append((logits[-1], triple == false))
+        if false is None:
+            worst.append(max(logits))
     examples = np.array(rows)
-    if len(examples) < 20 or len(np.unique(examples[:, 1])) < 2:
-        return Slope()
-    slope, intercept = _logistic(examples[:, :1], examples[:, 1] > 0)
-    return Slope(intercept=intercept, slope=slope)
-
-
-def altered_case(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[Scene, tuple[int, int, int] | None] | None:
-    """A scene with its triples; in half of them one was replaced by one that is not true there."""
-    usable = ~structure[encoded.instance_classes]
-    holds = encoded.instance_holds & usable[:, None] & usable[None, :]
-    triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(holds)]
-    if len(triples) < 2:
-        return None
-    if len(triples) > 40:
-        chosen = sorted(rng.choice(len(triples), 40, replace=False).tolist())
-        triples = [triples[k] for k in chosen]
-    everything = range(len(encoded.instance_classes))
-    if rng.random() < 0.5:
-        return scene_of(encoded, everything, triples), None
-    place = int(rng.integers(len(triples)))
-    for _ in range(50):
-        a, i, j = triples[place]
-        if rng.random() < 0.5:
-            a = int(rng.integers(len(CANONICAL)))
-        else:
-            j = int(rng.integers(len(usable)))
-        if i == j or not usable[j] or holds[a, i, j] or holds[a, j, i]:
-            continue
-        altered = [*triples[:place], (a, i, j), *triples[place + 1 :]]
-        return scene_of(encoded, everything, altered), (a, i, j)
-    return None
-
-
-def scene_of(
-    encoded: EncodedScene,
-    kept: Sequence[int],
-    triples: Sequence[tuple[int, int, int]],
-) -> Scene:
-    """The instances at the given positions as a request would give them."""
-    objects = tuple(
-        SceneObject(id=str(k), label=str(c), class_index=int(c))
-        for k, c in enumerate(encoded.instance_classes[list(kept)])
-    )
-    room = encoded.room_type
-    return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
-
-
-def _logistic(
-    features: NDArray[np.float64],
-    truth: NDArray[np.bool_],
-    weight: NDArray[np.float64] | None = None,
-) -> list[float]:
-    """Coefficients and intercept of an (almost) unpenalised logistic regression."""
-    fit = LogisticRegression(C=1e6, max_iter=1000).fit(features, truth, weight)
-    return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]
-
-
-def _sigmoid(x: float) -> float:
-    return float(1 / (1 + np.exp(-x)))
+    if len(examples) < 20 or len(np.unique(examples[:, 1])) < 2 or not worst:
+        return Slope(), Thresholds()
+    slope, intercept = logistic(examples[:, :1], examples[:, 1] > 0)
+    found = intercept + slope * np.array(worst)
+    limits = {
+        name: float(1 / (1 + np.exp(-np.quantile(found, 1 - share))))
+        for name, share in ALARMS.items()
+    }
+    return Slope(intercept=intercept, slope=slope), Thresholds(**limits)

@@ -18,7 +18,6 @@ from app.registry import (
     VocabularyEntry,
 )
 from app.scene import Vocabulary
-from training.batches import SceneTensors
 from training.calibrate import calibrate
 from training.draft import as_stored, draft_artifact
 from training.evaluation.everyday import EVERYDAY
@@ -27,6 +26,7 @@ from training.offsets import fit_offsets
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
 from training.terms import TERMS, terms_of
+from training.trainer import TrainingData
 
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
 
@@ -58,7 +58,7 @@ def publish_run(
     progress("calibrating")
     relations = machine.spec.A
     offsets = fit_offsets(scenes.parts["train"], len(scenes.vocabulary))
-    calibrated = calibrated_draft(run, scenes.vocabulary, data.validation, offsets)
+    calibrated = calibrated_draft(run, scenes.vocabulary, data, offsets)
     calibration = calibrated.calibration
     if judge is not None:
         judge(calibrated)
@@ -92,13 +92,16 @@ def publish_run(
 def calibrated_draft(
     run: FinishedRun,
     vocabulary: Vocabulary,
-    validation: SceneTensors,
+    data: TrainingData,
     offsets: Offsets | None = None,
 ) -> Artifact:
     """A run as it would be published, its weights rounded as they are stored."""
     machine = as_stored(run.machine)
     calibration = calibrate(
-        draft_artifact(machine, vocabulary), validation, run.config.training.seed
+        draft_artifact(machine, vocabulary),
+        data.validation,
+        data.train,
+        run.config.training.seed,
     )
     return draft_artifact(machine, vocabulary, calibration, offsets)
 

@@ -256,7 +256,7 @@ def _calibrated(config: Config, material: Material, folder: Path, say: Progress)
         calibration = Calibration.model_validate_json(place.read_text(encoding="utf-8"))
     else:
         say("calibrating")
-        calibration = calibrate(draft, material.data.validation, seed)
+        calibration = calibrate(draft, material.data.validation, material.data.train, seed)
         partial_file = place.with_suffix(".part")
         partial_file.write_text(calibration.model_dump_json(indent=1), encoding="utf-8")
         partial_file.replace(place)

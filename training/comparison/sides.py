@@ -81,7 +81,7 @@ def run_side(folder: Path, data: Path | None, say: Say) -> tuple[Side, SplitScen
     scenes = prepare(run.config, root)
     run.require(scenes.digest)
     say(f"calibrating {folder}")
-    artifact = calibrated_draft(run, scenes.vocabulary, scenes.training_data().validation)
+    artifact = calibrated_draft(run, scenes.vocabulary, scenes.training_data())
     return Side(str(folder), run.config, scenes.digests, artifact, root), scenes
 
 

@@ -1,6 +1,6 @@
 """When a scene is called wrong: one rule for machines and baselines.
 
-An alarm in at most 5 % of untouched scenes is promised. Alarms of one place come together, places
+An alarm in a given share of untouched scenes is promised. Alarms of one place come together, places
 differ, and a source of one kind may be far more varied than another. So the threshold is kept for
 each source by itself, on the safe side of what resampled groups leave open.
 """
@@ -23,9 +23,12 @@ from training.trainer import subset
 
 Floats = NDArray[np.float64]
 
-# The margin to the 5 % that are promised is for places unlike any here.
-_SHARE = 0.035
+MEDIUM = 0.1
+"""Share of untouched scenes that raise an alarm at the default sensitivity."""
+
 _RESAMPLES = 200
+# New places differ: the threshold is on the safe side in so many of the resampled sets of groups.
+_CONFIDENCE = 0.9
 # Scenes of a source whose share of alarms is kept by itself.
 _SOURCE_SCENES = 200
 _SCENES = 1500
@@ -47,13 +50,16 @@ class Alarm:
 def calibrated_alarm(calibration: Calibration) -> Alarm:
     """The service's own: its probability of an intruder, and its default threshold."""
     entry = calibration.outlier
+    popularity = np.array(calibration.popularity)
 
     def suspicion(scores: IntruderScores) -> Floats:
+        if len(popularity):
+            scores = scores.with_prior(calibration.popularity_weight * popularity)
         size = entry.log_count * np.log(scores.size)
         logits = entry.intercept + entry.slope * scores.log_odds + size
         return np.asarray(1 / (1 + np.exp(-logits)))
 
-    return Alarm(suspicion, calibration.outlier_threshold)
+    return Alarm(suspicion, calibration.outlier_thresholds.medium)
 
 
 def fitted_alarm(
@@ -82,6 +88,7 @@ def alarm_threshold(
     scores: IntruderScores,
     scenes: SceneTensors,
     rng: np.random.Generator,
+    share: float = MEDIUM,
 ) -> float:
     """The suspicion from which an object raises the alarm.
 
@@ -91,6 +98,7 @@ def alarm_threshold(
     Args:
         suspicion: (N,) of each scored object; higher = more an intruder.
         scores: of `scenes`, with untouched ones among them.
+        share: of untouched scenes of the hardest large source that raise an alarm.
 
     Raises:
         ValueError: no untouched scene was scored.
@@ -109,16 +117,16 @@ def alarm_threshold(
     # A quantile of a few scenes says nothing: a small source is left to what large ones ask for,
     # and where none is large, all are judged together.
     large = [judged & (source == kind) for kind in kinds[sizes >= _SOURCE_SCENES]]
-    bounds = [_bound(worst[some], group[some], rng) for some in large or [judged]]
+    bounds = [_bound(worst[some], group[some], rng, share) for some in large or [judged]]
     # What reaches the threshold raises the alarm, and many scenes may have one and the same worst
     # suspicion (a class's popularity): these stay below.
     return float(np.nextafter(max(bounds), np.inf))
 
 
-def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator) -> float:
-    """The threshold that a `_SHARE` of scenes exceeds, on the safe side.
+def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator, share: float) -> float:
+    """The threshold that a share of scenes exceeds, on the safe side.
 
-    Scenes of one place raise alarms together, so the share in new places is uncertain: the 95 %
+    Scenes of one place raise alarms together, so the share in new places is uncertain: a high
     quantile of the threshold over resampled groups.
     """
     members = [worst[group == name] for name in np.unique(group)]
@@ -126,5 +134,5 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator) -> 
     for _ in range(_RESAMPLES):
         drawn = rng.integers(len(members), size=len(members))
         scenes = np.concatenate([members[k] for k in drawn])
-        found.append(np.quantile(scenes, 1 - _SHARE))
-    return float(np.quantile(found, 0.95))
+        found.append(np.quantile(scenes, 1 - share))
+    return float(np.quantile(found, _CONFIDENCE))

@@ -19,7 +19,7 @@ from app.reasoning import misplaced, missing, outliers, relations
 from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, SceneObject, canonicalise
 from training.batches import SceneTensors
-from training.calibrate import (
+from training.cases import (
     altered_case,
     placed_case,
     scene_of,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from app import reasoning
 from app.registry import Artifact
 from app.scene import CANONICAL, Scene, SceneObject
-from training.calibrate import scene_of
+from training.cases import scene_of
 from training.datasets import EncodedScene
 from training.evaluation.missing import LeakError
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from app.registry import Artifact
 from app.scene import PoseRelations, Scene
 from training.batches import SceneTensors
-from training.calibrate import scene_of
+from training.cases import scene_of
 from training.datasets import EncodedScene
 from training.evaluation.asking import (
     Floats,

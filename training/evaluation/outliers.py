@@ -8,7 +8,7 @@ uniformly from the classes that training saw in the same room type.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ class IntruderScores:
     Attributes:
         scene: (N,) position of the scene; log_odds: (N,); intruder: (N,) bool; size: (N,) number of
             distinct classes in the scene as scored; clean: (N,) bool, scored without an intruder.
+        thing: (N,) its class.
         scenes: how many were given; skipped: too small, or without a class to add.
     """
 
@@ -36,8 +37,13 @@ class IntruderScores:
     intruder: NDArray[np.bool_]
     size: NDArray[np.int64]
     clean: NDArray[np.bool_]
+    thing: NDArray[np.int64]
     scenes: int
     skipped: int
+
+    def with_prior(self, prior: NDArray[np.float64]) -> IntruderScores:
+        """With the log-odds of being an intruder taken from each class, (V,)."""
+        return replace(self, log_odds=self.log_odds - prior[self.thing])
 
     def hit_at_1(self) -> Ratio:
         """Share of scenes whose intruder has the lowest log-odds (ties in expectation)."""
@@ -135,12 +141,12 @@ def intruder_scores(
     added = draw_intruders(scenes, structure, weights, seed)
     kept = (added >= 0).nonzero().squeeze(1)
     nothing = torch.zeros(0, dtype=torch.int64)
-    parts = [(nothing, nothing.double(), nothing.bool(), nothing, nothing.bool())]
+    parts = [(nothing, nothing.double(), nothing.bool(), nothing, nothing.bool(), nothing)]
     for index in kept.split(block):
         if not len(index):
             continue
         parts += _scored_blocks(scenes.v[index], index, added[index], structure, score)
-    placed, log_odds, intruder, sizes, untouched = (
+    placed, log_odds, intruder, sizes, untouched, thing = (
         torch.cat(column).numpy() for column in zip(*parts, strict=True)
     )
     return IntruderScores(
@@ -149,6 +155,7 @@ def intruder_scores(
         intruder,
         sizes,
         untouched,
+        thing,
         scenes=len(scenes),
         skipped=len(scenes) - len(kept),
     )
@@ -156,7 +163,7 @@ def intruder_scores(
 
 def _scored_blocks(
     clean: Tensor, index: Tensor, added: Tensor, structure: Tensor, score: ObjectScore
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]]:
     if not len(index):
         return
     dirty = clean.scatter(1, added.unsqueeze(1), 1.0)
@@ -166,4 +173,4 @@ def _scored_blocks(
         odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
         bad = (thing == added[row]) & (not is_clean)
         size = (v > 0).sum(1)[row]
-        yield index[row], odds.double(), bad, size, torch.full_like(bad, is_clean)
+        yield index[row], odds.double(), bad, size, torch.full_like(bad, is_clean), thing

@@ -11,7 +11,7 @@ from app.reasoning import missing, relations
 from tests.reasoning.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import random_scenes, tensors
 from tests.training.evaluation.test_completion import larger_machine
-from training.calibrate import scene_of
+from training.cases import scene_of
 from training.evaluation.answers import QUESTIONS, collect, uncalibrated
 
 ARTIFACT = artifact_of(larger_machine("triway-local"))

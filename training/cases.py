@@ -1,0 +1,136 @@
+"""Scenes as questions: what is told, what is taken away, what is altered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.linear_model import LogisticRegression
+
+from app.scene import CANONICAL, Scene, SceneObject
+from training.datasets import EncodedScene
+from training.datasets.meanings import meaning_of
+
+Triple: TypeAlias = tuple[int, int, int]
+
+
+def scene_of(
+    encoded: EncodedScene,
+    kept: Sequence[int],
+    triples: Sequence[tuple[int, int, int]],
+) -> Scene:
+    """The instances at the given positions as a request would give them."""
+    objects = tuple(
+        SceneObject(id=str(k), label=str(c), class_index=int(c))
+        for k, c in enumerate(encoded.instance_classes[list(kept)])
+    )
+    room = encoded.room_type
+    return Scene(objects, tuple(triples) or None, room_type=room if room >= 0 else None)
+
+
+def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
+    """(A, N, N) which relations of instances are known, on or off, without choice.
+
+    A source that lists left and front here and there, and never says that they do not hold, tells
+    nothing of how often they do: these are left out.
+    """
+    unlisted = meaning_of(encoded.source).unlisted
+    known = encoded.instance_observed.copy()
+    for a in range(min(len(known), len(unlisted))):
+        off = known[a] & ~encoded.instance_holds[a]
+        if unlisted[a] == "unobserved" and not off.any():
+            known[a] = False
+    return known
+
+
+def taken_away(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[int, list[int]] | None:
+    """(a class drawn from those that may be missing, the instances of all others)."""
+    classes = encoded.evidence.classes
+    removable = classes[~structure[classes]]
+    if len(removable) < 2:
+        return None
+    target = int(rng.choice(removable))
+    return target, [k for k, c in enumerate(encoded.instance_classes) if c != target]
+
+
+def told_pairs(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], list[Triple]]:
+    """Half of the pairs of a scene are told about: those left to ask (N, N), and what is told.
+
+    Which ones is decided without looking at what holds between them: had half of the relations been
+    given, a pair of which nothing is said would be likelier to have none.
+    """
+    size = len(encoded.instance_classes)
+    half = np.triu(rng.random((size, size)) < 0.5, 1)
+    told = half | half.T
+    plain = ~structure[encoded.instance_classes]
+    triples = np.argwhere(encoded.instance_holds & told & plain[:, None] & plain).tolist()
+    return ~told, [(int(a), int(x), int(y)) for a, x, y in triples]
+
+
+def placed_case(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[Scene, int, int, int] | None:
+    """A scene with one class taken out that stood in a relation to something that stayed.
+
+    Returns:
+        The scene, the canonical relation, the position of its object, and the class taken out.
+    """
+    evidence = encoded.evidence
+    usable = ~structure[evidence.classes]
+    pairs = evidence.holds & usable[:, None] & usable[None, :]
+    pairs &= ~np.eye(len(usable), dtype=np.bool_)
+    found = np.argwhere(pairs)
+    if usable.sum() < 3 or not len(found):
+        return None
+    a, x, y = found[rng.integers(len(found))]
+    kept = [k for k, c in enumerate(encoded.instance_classes) if c != evidence.classes[x]]
+    scene = scene_of(encoded, kept, triples=())
+    anchor = next(
+        p for p, k in enumerate(kept) if encoded.instance_classes[k] == evidence.classes[y]
+    )
+    return scene, int(a), anchor, int(evidence.classes[x])
+
+
+def altered_case(
+    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[Scene, tuple[int, int, int] | None] | None:
+    """A scene with its triples; in half of them one was replaced by one that is not true there."""
+    usable = ~structure[encoded.instance_classes]
+    holds = encoded.instance_holds & usable[:, None] & usable[None, :]
+    triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(holds)]
+    if len(triples) < 2:
+        return None
+    if len(triples) > 40:
+        chosen = sorted(rng.choice(len(triples), 40, replace=False).tolist())
+        triples = [triples[k] for k in chosen]
+    everything = range(len(encoded.instance_classes))
+    if rng.random() < 0.5:
+        return scene_of(encoded, everything, triples), None
+    place = int(rng.integers(len(triples)))
+    for _ in range(50):
+        a, i, j = triples[place]
+        if rng.random() < 0.5:
+            a = int(rng.integers(len(CANONICAL)))
+        else:
+            j = int(rng.integers(len(usable)))
+        if i == j or not usable[j] or holds[a, i, j] or holds[a, j, i]:
+            continue
+        altered = [*triples[:place], (a, i, j), *triples[place + 1 :]]
+        return scene_of(encoded, everything, altered), (a, i, j)
+    return None
+
+
+def logistic(
+    features: NDArray[np.float64],
+    truth: NDArray[np.bool_],
+    weight: NDArray[np.float64] | None = None,
+) -> list[float]:
+    """Coefficients and intercept of an (almost) unpenalised logistic regression."""
+    fit = LogisticRegression(C=1e6, max_iter=1000).fit(features, truth, weight)
+    return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]
