@@ -37,7 +37,6 @@ from app.registry import Calibration
 from app.registry.description import CountSlope, PlacedSlope
 from tests.conftest import REPOSITORY
 from tests.enumeration.implied import features_by_hand
-from tests.enumeration.test_completions import exactly, machine_of
 from tests.enumeration.small_machines import (
     ONE_LAYER,
     SEED_FORM,
@@ -47,6 +46,7 @@ from tests.enumeration.small_machines import (
     same,
     small_machine,
 )
+from tests.enumeration.test_completions import exactly, machine_of
 from tests.training.test_objectives import toy_batch, toy_machine
 from training.config import ObjectiveConfig
 from training.objectives import OBJECTIVES
