@@ -111,24 +111,24 @@ def mean_field(
         h2 = machine.c2.sigmoid().expand(len(base), -1)
         x = torch.addmm(base, h2, machine.J.T)
     # What relations add to x; linear in r, whatever h1 is, where all of a seed form are observed.
-    pull = gate = base.new_zeros(())
+    added = gate = base.new_zeros(())
     slopes = None
     if relations is not None:
         edges, r, observed = relations
         gate = machine.gate(edges, evidence.v)
         if machine.spec.form == "seed" and bool((observed | (gate == 0)).all()):
-            pull, relations = machine.hidden_input(edges, r * gate), None
+            added, relations = machine.hidden_input(edges, r * gate), None
     for _ in range(iterations if two_layers or relations is not None else 0):
         if relations is not None:
             edges, r, observed = relations
-            logits = machine.relation_logits(edges, evidence.v, (x + pull).sigmoid())
+            logits = machine.relation_logits(edges, evidence.v, (x + added).sigmoid())
             slope = machine.relation_slope(logits, gate, r, observed)
             slopes = slope if slopes is None else damping * slopes + (1 - damping) * slope
-            pull = machine.hidden_input(edges, slopes)
+            added = machine.hidden_input(edges, slopes)
         if two_layers:
-            h2 = machine.second_layer_logits((x + pull).sigmoid()).sigmoid()
+            h2 = machine.second_layer_logits((x + added).sigmoid()).sigmoid()
             x = torch.addmm(base, h2, machine.J.T)
-    return MeanField(x + pull, x, h2)
+    return MeanField(x + added, x, h2)
 
 
 def unobserved(evidence: Evidence) -> Evidence:

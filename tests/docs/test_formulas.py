@@ -27,12 +27,14 @@ from app.reasoning.calibration import (
     exclusive,
     false_log_odds,
     intruder_line,
-    placed_scores,
+    missing_logits,
+    placed_logits,
     relation_probability,
 )
 from app.reasoning.listing import likeliest_classes
 from app.reasoning.log_score import log_score
 from app.registry import Calibration
+from app.registry.description import CountSlope, PlacedSlope
 from tests.conftest import REPOSITORY
 from tests.enumeration.implied import features_by_hand
 from tests.enumeration.small_machines import (
@@ -44,6 +46,7 @@ from tests.enumeration.small_machines import (
     same,
     small_machine,
 )
+from tests.enumeration.test_completions import exactly, machine_of
 from tests.training.test_objectives import toy_batch, toy_machine
 from training.config import ObjectiveConfig
 from training.objectives import OBJECTIVES
@@ -490,7 +493,10 @@ def implications() -> None:
 
 
 def calibration() -> Calibration:
-    return Calibration.neutral(2)
+    entry = {"intercept": -0.4, "slope": 0.7, "log_count": 0.3}
+    placed = PlacedSlope(**entry, log_relation=0.6)
+    entries = {"missing": CountSlope(**entry), "placed": placed}
+    return Calibration.neutral(2).model_copy(update=entries)
 
 
 @formula(
@@ -517,24 +523,37 @@ def exclusion() -> None:
         assert scaled == near(p / max(1, p + q))
 
 
-@formula(r"p_i = \frac{e^{\lambda_i / T}}{\sum_j e^{\lambda_j / T}}")
+@formula(r"p(v_i = 1 \mid L) \propto \sum_{v \supseteq L, h} p(v, h) (1 - c)^{|v \setminus L|}")
+def unlisted_objects() -> None:
+    """The machine with the biases of unlisted classes lowered, whose posterior is estimated."""
+    machine, c, listed = machine_of(1), 0.6, [2, 5]
+    truth = exactly(machine, listed, c)
+    lowered = np.delete(np.arange(len(truth)), listed)
+    machine.b[lowered] += math.log(1 - c)
+    assert exactly(machine, listed, 0.0) == pytest.approx(truth, abs=1e-6)
+
+
+@formula(r"p_i = \sigma(\alpha + \beta \lambda_i + \gamma \log n)")
 def missing_objects() -> None:
-    odds, T = np.array([0.3, -1.2, 2.0, 0.1]), 1.7
-    where, p = likeliest_classes(odds / T, np.ones(4, dtype=np.bool_), 4)
-    total = sum(math.exp(x / T) for x in odds)
-    assert p == near([math.exp(odds[i] / T) / total for i in where])
+    found, odds = calibration(), np.array([0.3, -1.2, 2.0, 0.1])
+    entry = found.missing
+    logits = missing_logits(found, odds, 7)
+    where, p = likeliest_classes(logits, np.ones(4, dtype=np.bool_), 4)
+    constant = entry.intercept + entry.log_count * math.log(7)
+    assert p == near([sigma(constant + entry.slope * odds[i]) for i in where])
 
 
 @formula(
-    r"\log p_i = \frac{\lambda_i}{T'} + \omega \log p(r_e = 1 \mid v_i = 1, \text{rest})"
-    r" + \text{const}"
+    r"p_i = \sigma(\alpha' + \beta' \lambda_i + \gamma' \log n"
+    r" + \omega \log p(r_e = 1 \mid v_i = 1, \text{rest}))"
 )
 def missing_at_a_place() -> None:
     found = calibration()
     odds, log_p = np.array([0.3, -1.2]), np.array([-0.5, -2.0])
-    scores = placed_scores(found, odds, log_p)
-    omega, T = found.placed_relation_weight, found.placed_temperature
-    assert scores == near([x / T + omega * y for x, y in zip(odds, log_p, strict=True)])
+    logits, entry = placed_logits(found, odds, log_p, 7), found.placed
+    constant = entry.intercept + entry.log_count * math.log(7)
+    expected = constant + entry.slope * odds + entry.log_relation * log_p
+    assert logits == near(expected.tolist())
 
 
 @formula(
