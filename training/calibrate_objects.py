@@ -50,7 +50,9 @@ _PLACED_SCENES = 600
 _EVIDENCE_SCENES = 150
 # How far uniform intruders may fall, and what all but one may lose, for the sake of the others.
 _UNIFORM_LOSS = 0.03
-_COMPLETE_LOSS = 0.003
+_COMPLETE_LOSS = 0.006
+# Pulls within so much of the best are as good: the least of them is taken.
+_AS_GOOD = 0.003
 # An answer lists ten classes by default; what is listed decides.
 _LISTED = 20
 
@@ -176,9 +178,10 @@ def _labels(classes: NDArray[np.int64]) -> Scene:
 
 
 def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
+    closed = case.closed + np.log1p(-coverage)
     if not weight:
-        return case.closed
-    mixed: Floats = (1 - weight) * case.closed + weight * case.partial[coverage]
+        return closed
+    mixed: Floats = (1 - weight) * closed + weight * case.partial[coverage]
     return mixed
 
 
@@ -323,10 +326,14 @@ def fit_evidence(
             )
             ranks = [_rank(asked, case.scenes[1], case.target, plain) for case in cases]
             scores[pull] = float(np.mean([1 / rank for rank in ranks]))
-        # The least pull among equals: what brings nothing may do harm elsewhere.
-        best = max(PULLS, key=lambda pull: (round(scores[pull], 3), -pull))
-        found = found.model_copy(update={name: best})
+        found = found.model_copy(update={name: least_of_the_best(scores)})
     return found
+
+
+def least_of_the_best(scores: dict[float, float]) -> float:
+    """The least pull that is as good as the best: what brings nothing may do harm elsewhere."""
+    enough = max(scores.values()) - _AS_GOOD
+    return min(pull for pull, score in scores.items() if score >= enough)
 
 
 def _rank(artifact: Artifact, scene: Scene, target: int, structure: NDArray[np.bool_]) -> int:

@@ -30,7 +30,6 @@ def missing(
     at: tuple[str, int] | None = None,
     coverage: float | None = None,
     axes: Axes | None = _VIEWER,
-    coverage: float | None = None,  # noqa: ARG001
     details: bool = True,
 ) -> tuple[MissingAnswer, ...]:
     """Unlisted classes by the probability that they are there all the same, likeliest first.
@@ -48,7 +47,6 @@ def missing(
         coverage: from 0 to 1; by default the model's. At 1 unlisted classes count as absent.
         axes: the viewer's, in the frame that offsets are answered in (`viewer_axes`); None where
             nobody knows where the viewer looks.
-        coverage: probability that a class which is present is listed; by default the model's.
         details: also say where each would stand, and what speaks for it.
 
     Raises:

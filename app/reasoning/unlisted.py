@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from app.registry.artifact import Artifact
 
 Floats = NDArray[np.floating[Any]]
 Places = NDArray[np.int64]
+
+FULL: Final = 0.999
+"""Coverage from which on every class that is there counts as listed."""
 
 
 def with_unlisted(
@@ -26,9 +30,10 @@ def with_unlisted(
 ) -> Floats:
     """Mix the log-odds of absent classes with those of the partial posterior, (N,).
 
-    (1 - λ) closed + λ partial, with λ the calibration's `coverage_weight`. The closed form counts
-    unlisted classes as absent and has no sampling error. It is the answer at coverage 1, and for
-    machines without stored samples.
+    (1 - λ) (closed + log(1 - c)) + λ partial, with λ the calibration's `coverage_weight`. The closed
+    form counts all other unlisted classes as absent and has no sampling error. It stands alone for
+    machines without stored samples, and from a coverage of `FULL` on, which counts as `FULL`: at 1
+    no class could be there unlisted.
 
     Args:
         log_odds: (N,) of the absent classes, unlisted ones absent.
@@ -38,9 +43,11 @@ def with_unlisted(
             partial posterior changes is added to these.
     """
     completions, weight = artifact.completions, artifact.calibration.coverage_weight
-    if completions is None or coverage >= 1 or weight == 0:
-        return log_odds
+    unlisted = np.float32(math.log1p(-min(coverage, FULL)))
+    found: Floats = log_odds + unlisted
+    if completions is None or coverage >= FULL or weight == 0:
+        return found
     partial = completions.log_odds(y, present.classes, present.presence, coverage, room)[absent]
-    base = log_odds if closed is None else closed
-    found: Floats = log_odds + np.float32(weight) * (partial - base)
+    base = (log_odds if closed is None else closed) + unlisted
+    found += np.float32(weight) * (partial - base)
     return found

@@ -243,9 +243,9 @@ class _Service:
                     if not structure[index]:
                         bad = index == intruder
                         facts = (entry["log_odds"], bad, len(classes), intruder < 0)
-                        columns.append((k, *facts, entry["is_outlier"]))
-        place, log_odds, bad, sizes, untouched, loud = (
-            zip(*columns, strict=True) if columns else [()] * 6
+                        columns.append((k, *facts, index, entry["is_outlier"]))
+        place, log_odds, bad, sizes, untouched, things, loud = (
+            zip(*columns, strict=True) if columns else [()] * 7
         )
         scores = IntruderScores(
             np.array(place, dtype=np.int64),
@@ -253,6 +253,7 @@ class _Service:
             np.array(bad, dtype=np.bool_),
             np.array(sizes, dtype=np.int64),
             np.array(untouched, dtype=np.bool_),
+            np.array(things, dtype=np.int64),
             scenes=len(scenes),
             skipped=len(scenes) - len(set(place)),
         )

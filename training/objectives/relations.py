@@ -1,10 +1,10 @@
-"""The relation part by conditional likelihood, given the objects and what each source leaves unsaid.
+"""The relation part by conditional likelihood: what sources say holds, or does not.
 
     - sum over scenes and known units of log p(r_e | v, E[h1 | v]),   logit_e = ℓ_e + δ[source, a]
 
-A unit is known where it holds or is known not to (`training.datasets.meanings`); all others drop out.
-People mention what is worth mentioning, and a procedural room lists all there is: so each source
-has an offset δ of its own for each relation. Offsets are learned and left out when serving.
+A unit is known where it holds or is known not to (`training.datasets.meanings`); all others drop
+out. People mention what is worth mentioning, and a procedural room lists all there is: so each
+source has an offset δ of its own for each relation. Offsets are learned and left out when serving.
 
 Weights have a normal prior (`weight_prior`, its precision), offsets too (`offset_prior`). With word
 vectors X, the factors and end weights of a class are a learned map of its vector plus a deviation
