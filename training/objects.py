@@ -21,7 +21,7 @@ Salakhutdinov and Hinton, "Deep Boltzmann machines" (2009), for two layers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -201,7 +201,7 @@ def _begin(machine: BoltzmannMachine, v: Tensor, room: Tensor) -> _Chains:
 
 def _update(
     machine: BoltzmannMachine,
-    weights: dict[str, Tensor],
+    weights: Mapping[str, Tensor],
     v: Tensor,
     room: Tensor,
     chains: _Chains,
@@ -228,7 +228,7 @@ def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generato
     return mean
 
 
-def _add(weights: dict[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate: float) -> None:
+def _add(weights: Mapping[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate: float) -> None:
     """Add the gradient of -E, summed over rows, times the rate."""
     weights["b"].add_(v.sum(0), alpha=rate)
     weights["c1"].add_(h1.sum(0), alpha=rate)
