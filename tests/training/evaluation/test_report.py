@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from app.registry import Thresholds
 from tests.reasoning.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import flat, knowing, random_scenes, scene, tensors
 from tests.training.evaluation.test_completion import larger_machine
@@ -216,10 +217,12 @@ def test_publishing_measures_the_published_tasks_on_every_source():
 
 
 def test_what_is_published_is_the_calibrated_artifact_s():
-    """Another threshold, other alarms; and no more scenes than the limit allows."""
+    """Another default threshold, other alarms; and no more scenes than the limit allows."""
 
     def alarms(threshold, limit=None):
-        calibration = ARTIFACT.calibration.model_copy(update={"outlier_threshold": threshold})
+        calibration = ARTIFACT.calibration.model_copy(
+            update={"outlier_thresholds": Thresholds(medium=threshold)}
+        )
         rows = evaluate(
             replace(ARTIFACT, calibration=calibration), DATA, NO_STRUCTURE, TRAIN, limit=limit
         )
