@@ -111,6 +111,41 @@ def test_scenes_that_hold_no_question_have_no_outcome(name):
     assert set(report.outcomes.values()) == {None}
 
 
+OBJECT_TASKS = {task for task in TASKS if task.startswith(("T2", "T3 ", "T4")) or task == "Density"}
+
+
+def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
+    """Elsewhere an unlisted object may be there. Relations are asked of all annotated scenes."""
+    cut = [replace(one, complete=False, source="captions") for one in random_scenes(9, V, seed=2)]
+    mixed = Setting(tensors([*DATA.scenes, *cut], V), NO_STRUCTURE, TRAIN, SEEN)
+    reports = []
+    for setting in (SETTING, mixed):
+        reports.append(SourceReport("toy", digest(setting)))
+        list(run(CONTENDER, setting, reports[-1], tasks=sorted(OBJECT_TASKS | {"T1b completion"})))
+    whole, more = ({t: o.scenes for t, o in r.outcomes.items() if o} for r in reports)
+    assert whole == {task: more[task] - 9 * (task == "T1b completion") for task in whole}
+    of_objects = [
+        {key: value for key, value in values_of(report).items() if key[0] in OBJECT_TASKS}
+        for report in reports
+    ]
+    assert of_objects[1] == pytest.approx(of_objects[0])
+
+
+def test_a_source_of_incomplete_object_lists_is_asked_for_relations_alone():
+    cut = [replace(one, complete=False) for one in random_scenes(20, V, seed=2)]
+    setting = Setting(tensors(cut, V), NO_STRUCTURE, tensors(cut, V), SEEN)
+    report = SourceReport("captions", digest(setting))
+    asked = [task for task in TASKS if task != "Everyday"]
+    list(run(CONTENDER, setting, report, tasks=asked))
+    silent = {task for task, outcome in report.outcomes.items() if outcome is None}
+    assert silent == OBJECT_TASKS
+    names = report.outcomes["Calibration"].metrics
+    assert "ECE, relations" in names
+    assert not {f"ECE, {kind}" for kind in ("missing", "outliers", "missing at a place")} & set(
+        names
+    )
+
+
 def test_who_takes_no_part_is_none():
     report = SourceReport("toy", digest(SETTING))
     for _ in run(Contender(), SETTING, report):
