@@ -49,7 +49,7 @@ _PARTIAL_SCENES = 400
 _PLACED_SCENES = 600
 _EVIDENCE_SCENES = 150
 # How far uniform intruders may fall, and what all but one may lose, for the sake of the others.
-_UNIFORM_LOSS = 0.03
+_UNIFORM_LOSS = 0.04
 _COMPLETE_LOSS = 0.006
 # Pulls within so much of the best are as good: the least of them is taken.
 _AS_GOOD = 0.003
