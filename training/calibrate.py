@@ -130,8 +130,9 @@ def fit_placements(
         anchors = np.flatnonzero(~structure[present.classes])
         both = given.placement_log_odds(np.array([target]), anchors)
         other = np.array(kept)[present.first[anchors]]
+        own = np.full_like(other, gone)
         holds, known = encoded.instance_holds, known_relations(encoded)
-        for values, ends in zip(both, ((gone, other), (other, gone)), strict=True):
+        for values, ends in zip(both, ((own, other), (other, own)), strict=True):
             truth, usable = holds[:, *ends], known[:, *ends]
             a, place = (part[usable.ravel()] for part in map(np.ravel, np.indices(truth.shape)))
             size = np.full(len(a), np.log(len(present.classes) + 1))

@@ -192,7 +192,7 @@ def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
         z = _mixed(case, coverage, weight)
         others = np.sort(z[~case.hidden])
         above = len(others) - np.searchsorted(others, z[case.hidden], side="right")
-        found.append(1.0 / (1.0 + above))
+        found.append(1.0 / (1.0 + above.astype(np.float64)))
     return float(np.concatenate(found).mean())
 
 
@@ -221,7 +221,7 @@ def fit_placed(artifact: Artifact, validation: SceneTensors, seed: int = 0) -> P
         row = int(given.present.row[anchor])
         log_p = given.placed_log_p(absent, relation, row, outgoing=True).astype(np.float64)
         first = np.argsort(-(z + log_p), kind="stable")[:_LISTED]
-        size = np.log(max(1, np.count_nonzero(~structure[given.present.classes])))
+        size = np.log(max(1, int(np.count_nonzero(~structure[given.present.classes]))))
         truth = absent[first] == target
         rows.append(np.stack([z[first], np.full(len(first), size), log_p[first], truth], 1))
     examples = np.concatenate(rows or [np.zeros((0, 4))])

@@ -21,7 +21,7 @@ Salakhutdinov and Hinton, "Deep Boltzmann machines" (2009), for two layers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -112,18 +112,17 @@ def _withheld(v: Tensor, room: Tensor) -> tuple[Tensor, Tensor]:
 
 def _fit_rooms(machine: BoltzmannMachine, scenes: _Scenes, generator: torch.Generator) -> None:
     """Train Q by log p(v | t), every room type of the scenes for itself."""
-    counts = torch.bincount(scenes.room[scenes.room >= 0], minlength=len(machine.Q))
+    known = scenes.room >= 0
+    counts = torch.zeros(len(machine.Q)).index_add_(0, scenes.room[known], scenes.weight[known])
     rooms = counts.nonzero().squeeze(1)
     if not len(rooms):
         return
-    of = [(scenes.room == t).nonzero().squeeze(1) for t in rooms.tolist()]
+    chance = torch.stack([scenes.weight * (scenes.room == t) for t in rooms.tolist()])
     room = rooms.repeat_interleave(_PER_ROOM)
 
     def draw() -> Tensor:
-        picks = [
-            index[torch.randint(len(index), (_PER_ROOM,), generator=generator)] for index in of
-        ]
-        return scenes.v[torch.cat(picks)]
+        picks = torch.multinomial(chance, _PER_ROOM, replacement=True, generator=generator)
+        return scenes.v[picks.flatten()]
 
     chains = _begin(machine, draw(), room)
     decay = (_ROOM_PRIOR / counts[rooms]).unsqueeze(1)
@@ -201,7 +200,7 @@ def _begin(machine: BoltzmannMachine, v: Tensor, room: Tensor) -> _Chains:
 
 def _update(
     machine: BoltzmannMachine,
-    weights: dict[str, Tensor],
+    weights: Mapping[str, Tensor],
     v: Tensor,
     room: Tensor,
     chains: _Chains,
@@ -228,7 +227,7 @@ def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generato
     return mean
 
 
-def _add(weights: dict[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate: float) -> None:
+def _add(weights: Mapping[str, Tensor], v: Tensor, h1: Tensor, h2: Tensor, rate: float) -> None:
     """Add the gradient of -E, summed over rows, times the rate."""
     weights["b"].add_(v.sum(0), alpha=rate)
     weights["c1"].add_(h1.sum(0), alpha=rate)

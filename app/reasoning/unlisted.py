@@ -30,10 +30,10 @@ def with_unlisted(
 ) -> Floats:
     """Mix the log-odds of absent classes with those of the partial posterior, (N,).
 
-    (1 - λ) (closed + log(1 - c)) + λ partial, with λ the calibration's `coverage_weight`. The closed
-    form counts all other unlisted classes as absent and has no sampling error. It stands alone for
-    machines without stored samples, and from a coverage of `FULL` on, which counts as `FULL`: at 1
-    no class could be there unlisted.
+    (1 - λ) (closed + log(1 - c)) + λ partial, with λ the calibration's `coverage_weight`. The
+    closed form counts all other unlisted classes as absent and has no sampling error. It stands
+    alone for machines without stored samples, and from a coverage of `FULL` on, which counts as
+    `FULL`: at 1 no class could be there unlisted.
 
     Args:
         log_odds: (N,) of the absent classes, unlisted ones absent.

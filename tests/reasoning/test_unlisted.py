@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from app.boltzmann import MachineSpec, build
 from app.boltzmann.fantasies import pack_scenes
 from app.reasoning import missing
 from app.reasoning.posterior import posterior
+from app.reasoning.unlisted import FULL
 from tests.reasoning.artifacts import LABELS, artifact_of, larger_artifact, scene_of
 
 SPECS = {
@@ -47,14 +50,19 @@ def name(request):
 SCENES = [scene_of([]), scene_of([0, 3, 3, 8]), scene_of([0, 1, 2], [(2, 1, 0), (0, 0, 2)])]
 
 
+UNLISTED = math.log(1 - FULL)
+
+
+@pytest.mark.parametrize("coverage", [FULL, 1.0])
 @pytest.mark.parametrize("scene", SCENES)
-def test_unlisted_classes_are_absent_at_coverage_one(name, scene):
+def test_unlisted_classes_are_absent_at_full_coverage(name, scene, coverage):
+    """The closed form, lowered by what an unlisted class has against it."""
     artifact = sampled_artifact(name)
     given_scene = posterior(artifact, scene)
     absent = np.setdiff1d(np.arange(8), given_scene.present.classes)
-    closed = given_scene.absent_log_odds(absent)
-    np.testing.assert_array_equal(given_scene.absent_posterior(absent, 1.0), closed)
-    assert log_odds(artifact, scene, coverage=1.0) == {
+    closed = given_scene.absent_log_odds(absent) + np.float32(UNLISTED)
+    np.testing.assert_array_equal(given_scene.absent_posterior(absent, coverage), closed)
+    assert log_odds(artifact, scene, coverage=coverage) == {
         LABELS[i]: pytest.approx(z) for i, z in zip(absent, closed, strict=True)
     }
 
@@ -65,10 +73,13 @@ def test_the_weight_mixes_both_posteriors(name, scene):
         log_odds(sampled_artifact(name, coverage_weight=weight), scene, coverage=0.6)
         for weight in (0.0, 0.5, 1.0)
     )
-    assert closed == log_odds(sampled_artifact(name), scene, coverage=1.0)
+    full = log_odds(sampled_artifact(name), scene, coverage=1.0)
+    for label, z in closed.items():
+        assert z == pytest.approx(full[label] - UNLISTED + math.log(0.4), abs=1e-4)
     for label, z in half.items():
         assert z == pytest.approx((closed[label] + partial[label]) / 2, abs=1e-4)
-    assert max(abs(closed[label] - partial[label]) for label in closed) > 0.1
+    # The constant log(1 - c) is in both: what differs is what other unlisted classes do.
+    assert max(abs(closed[label] - partial[label]) for label in closed) > 0.02
 
 
 def test_the_coverage_is_the_model_s_unless_a_request_says(name):
@@ -78,10 +89,23 @@ def test_the_coverage_is_the_model_s_unless_a_request_says(name):
     assert log_odds(artifact, scene, coverage=0.0) != log_odds(artifact, scene, coverage=0.5)
 
 
-def test_machines_without_samples_count_unlisted_classes_as_absent():
+@pytest.mark.parametrize("coverage", [0.0, 0.5, 0.9])
+def test_machines_without_samples_count_other_unlisted_classes_as_absent(coverage):
     artifact, scene = larger_artifact("triway-wide"), scene_of([0, 1])
     assert artifact.completions is None
-    assert log_odds(artifact, scene, coverage=0.0) == log_odds(artifact, scene, coverage=1.0)
+    full = log_odds(artifact, scene, coverage=1.0)
+    for label, z in log_odds(artifact, scene, coverage=coverage).items():
+        assert z == pytest.approx(full[label] - UNLISTED + math.log1p(-coverage), abs=1e-4)
+
+
+def test_the_lower_the_coverage_the_likelier_an_unlisted_class(name):
+    """Of all together: the expected number of unlisted classes."""
+    artifact, scene = ARTIFACTS[name], scene_of([0])
+    sums = [
+        sum(a.probability for a in missing(artifact, scene, coverage=c, top_k=9))
+        for c in (0.0, 0.5, 0.9, 0.99, 1.0)
+    ]
+    assert sums == sorted(sums, reverse=True)
 
 
 ARTIFACTS = {name: sampled_artifact(name) for name in SPECS}

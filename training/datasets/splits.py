@@ -5,9 +5,9 @@ that occurs in several sources (a frame and the 3D boxes of the same frame) goes
 all of them. ``stable`` has the same shares and is not stratified: a group's part follows from the
 seed and its name alone. A data set can grow without any group moving, so that no later version of a
 model learns from what an earlier one was tested on.
-``final``, 90 / 0 / 10, splits as ``group`` does and keeps a tenth for calibration: weights that ship
-learn from all the rest. ``random``, 60 / 30 / 10, is the protocol of the seed paper: every scene on
-its own.
+``final``, 90 / 0 / 10, splits as ``group`` does and keeps a tenth for calibration: weights that
+ship learn from all the rest. ``random``, 60 / 30 / 10, is the protocol of the seed paper: every
+scene on its own.
 
 The parts of the others depend on the seed and on what is split, not on its order. Sources that
 share no group do not influence each other, so a source split alone splits as it does among others;

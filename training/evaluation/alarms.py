@@ -11,12 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from app.registry import Calibration
 from training.batches import SceneTensors
+from training.evaluation.cases import some_scenes
 from training.evaluation.missing import ObjectScore
 from training.evaluation.outliers import IntruderScores, intruder_scores
 from training.trainer import subset
@@ -68,19 +68,14 @@ def fitted_alarm(
     """The alarm of a score that has no calibration, by log-odds alone.
 
     Args:
-        validation: of which the same are judged as in calibrating a machine.
+        validation: those with complete object lists are judged, at most 1,500.
         structure: (V,) bool.
     """
-    scenes = judged_scenes(validation, seed)
+    complete = subset(validation, validation.complete.nonzero().squeeze(1))
+    scenes = some_scenes(complete, _SCENES, seed)
     scores = intruder_scores(scenes, structure, score, seed=seed)
     threshold = alarm_threshold(-scores.log_odds, scores, scenes, np.random.default_rng(seed))
     return Alarm(lambda asked: -asked.log_odds, threshold)
-
-
-def judged_scenes(validation: SceneTensors, seed: int) -> SceneTensors:
-    """The scenes, at most 1,500, that thresholds and the outliers' calibration are fitted on."""
-    generator = torch.Generator().manual_seed(seed)
-    return subset(validation, torch.randperm(len(validation), generator=generator)[:_SCENES])
 
 
 def alarm_threshold(

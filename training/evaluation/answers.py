@@ -1,40 +1,56 @@
 """Calibration: what the service answers with a probability, and whether it was so.
 
-Each answer means what the contract says of it: an annotator would list the relation for this pair
-(of objects that are there, whatever is known of others, or of one that is not with one that is);
-the class was taken away, given that exactly one was (and where it stood); the object is an
-intruder, where half of the scenes are clean; the relation is false, where one was altered in half
-of the scenes. Requests name no room type and take every default, so only answers returned count.
+Each answer is compared with its meaning in the contract:
+
+    relations    the relation holds between the two; also where half of the pairs are told, and for
+                 an object that was taken away. Answers about unknown relations are left out (see
+                 `training.cases.known_relations`)
+    missing      the class is there, and was hidden: 25, 50 or 75 % of the classes are shown, or all
+                 but one, drawn for each scene
+    at a place   the class is there and stands so: one that stood so to another was taken away
+    outliers     the object is an intruder: half of the scenes have one
+    misplaced    the relation is false: one was altered in half of the scenes
+
+Hidden classes and intruders need scenes with complete object lists. Requests name no room type and
+take every default, so only answers returned count.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from app.reasoning import misplaced, missing, outliers, relations
 from app.registry import Artifact, Calibration, CountSlope, Slope
-from app.scene import CANONICAL, Scene, SceneObject, canonicalise
+from app.scene import CANONICAL, Scene, canonicalise
 from training.batches import SceneTensors
 from training.cases import (
     altered_case,
+    known_relations,
     placed_case,
     scene_of,
     taken_away,
     told_pairs,
 )
 from training.datasets import EncodedScene
+from training.evaluation.asking import labels_alone
 from training.evaluation.cases import scene_rng
 from training.evaluation.metrics import Scored
+from training.evaluation.outliers import by_popularity, draw_intruders
+from training.evaluation.partial import SHARES, shown_classes
+from training.evaluation.signature import by_signature, with_intruder
 
 # An object has three places, where a scene has twenty relations: of one object a scene there are so
 # few answers that chance alone makes an ECE of .02 to .03.
 _REMOVALS = 4
 # (probability, whether it was so) of the answers to one scene.
 Answered = list[tuple[float, bool]]
+Ask = Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +88,7 @@ def uncalibrated(artifact: Artifact) -> Artifact:
 def collect(
     artifact: Artifact,
     scenes: SceneTensors,
-    ask: Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None],
+    ask: Ask,
     seed: int = 0,
 ) -> Answers:
     """Ask one question (see `QUESTIONS`) of every scene."""
@@ -103,15 +119,11 @@ def ask_relations(
     encoded: EncodedScene,
     rng: np.random.Generator,  # noqa: ARG001
 ) -> Answered | None:
-    """Relations of a scene's objects, if it is annotated; what is not listed does not hold."""
-    if not encoded.instance_observed.any():
+    """Relations of a scene's objects."""
+    known = known_relations(encoded)
+    if not known.any():
         return None
-    found: Answered = []
-    answers, _ = relations(artifact, _bare(encoded, range(len(encoded.instance_classes))))
-    for answer in answers:
-        triple = CANONICAL.index(answer.relation), answer.subject, answer.object
-        found.append((answer.probability, bool(encoded.instance_holds[triple])))
-    return found
+    return _judged(artifact, encoded, labels_alone(encoded), known) or None
 
 
 def ask_given(
@@ -122,20 +134,27 @@ def ask_given(
     if not given:
         return None
     scene = replace(scene_of(encoded, range(len(asked)), given), room_type=None)
+    return _judged(artifact, encoded, scene, known_relations(encoded) & asked) or None
+
+
+def _judged(
+    artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: NDArray[np.bool_]
+) -> Answered:
+    """Answers about the relations (A, N, N) that are to be judged."""
     found: Answered = []
     for answer in relations(artifact, scene)[0]:
         triple = CANONICAL.index(answer.relation), answer.subject, answer.object
-        if asked[triple[1:]]:
+        if judged[triple]:
             found.append((answer.probability, bool(encoded.instance_holds[triple])))
-    return found or None
+    return found
 
 
 def ask_placements(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Where an object that was taken away stood, one instance of it; several times over."""
+    """The place of an object that was taken away, one instance of it; several times over."""
     found: Answered = []
-    if encoded.instance_observed.any():
+    if known_relations(encoded).any():
         for _ in range(_REMOVALS):
             found += _places_of_one(artifact, encoded, rng)
     return found or None
@@ -147,32 +166,39 @@ def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: np.random.Gen
         return []
     target, kept = taken
     gone = int(rng.choice(np.flatnonzero(encoded.instance_classes == target)))
+    known = known_relations(encoded)
     found: Answered = []
-    for answer in missing(artifact, _bare(encoded, kept), candidates=[target]):
+    for answer in missing(artifact, labels_alone(encoded, kept), candidates=[target]):
         for place in answer.placements:
-            a, subject, _ = canonicalise(gone, place.relation, kept[place.object])
-            pair = (gone, kept[place.object]) if subject == gone else (kept[place.object], gone)
-            found.append((place.probability, bool(encoded.instance_holds[(a, *pair)])))
+            triple = canonicalise(gone, place.relation, kept[place.object])
+            if known[triple]:
+                found.append((place.probability, bool(encoded.instance_holds[triple])))
     return found
 
 
 def ask_missing(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """The class that was taken away."""
-    taken = taken_away(encoded, artifact.vocabulary.structure, rng)
-    if taken is None:
+    """The classes that were hidden, a share of the scene or one."""
+    structure = artifact.vocabulary.structure
+    classes = encoded.evidence.classes
+    classes = classes[~structure[classes]]
+    if not encoded.complete or len(classes) < 2:
         return None
-    target, kept = taken
-    label = artifact.vocabulary.labels[target]
-    found = missing(artifact, _bare(encoded, kept), details=False)
-    return [(answer.probability, answer.label == label) for answer in found]
+    share = list(SHARES.values())[rng.integers(len(SHARES))]
+    hidden = rng.permutation(classes)[shown_classes(len(classes), share) :]
+    labels = {artifact.vocabulary.labels[index] for index in hidden}
+    kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden)).tolist()
+    found = missing(artifact, labels_alone(encoded, kept), details=False)
+    return [(answer.probability, answer.label in labels) for answer in found]
 
 
 def ask_placed(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """The class that was taken away, given where it stood."""
+    """The class that was taken away, given one relation of it."""
+    if not encoded.complete:
+        return None
     case = placed_case(encoded, artifact.vocabulary.structure, rng)
     if case is None:
         return None
@@ -184,24 +210,49 @@ def ask_placed(
 
 
 def ask_outliers(
-    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
+    artifact: Artifact,
+    encoded: EncodedScene,
+    rng: np.random.Generator,
+    intruders: Mapping[tuple[str, str], NDArray[np.int64]] | None = None,
 ) -> Answered | None:
-    """Which object is the intruder, if there is one."""
+    """The intruder, if there is one.
+
+    Args:
+        intruders: by scene, see `kinds_of_intruders`; uniform ones where it is None.
+    """
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
-    if (~structure[classes]).sum() < 3:
+    if not encoded.complete or (~structure[classes]).sum() < 3:
         return None
-    scene = _bare(encoded, range(len(encoded.instance_classes)))
-    intruder = -1
+    choice = np.setdiff1d(np.flatnonzero(~structure), classes)
+    if intruders is not None:
+        choice = intruders[encoded.source, encoded.scene_id]
+    if not len(choice):
+        return None
+    scene, intruder = labels_alone(encoded), -1
     if rng.random() < 0.5:
-        absent = np.setdiff1d(np.flatnonzero(~structure), classes)
-        c = int(rng.choice(absent))
         intruder = len(scene.objects)
-        thing = SceneObject(id="intruder", label=artifact.vocabulary.labels[c], class_index=c)
-        scene = replace(scene, objects=(*scene.objects, thing))
+        scene = with_intruder(artifact, scene, int(rng.choice(choice)))
     found = outliers(artifact, scene, details=False).outliers
     usable = [not structure[thing.class_index] for thing in scene.objects]
     return [(a.probability, a.object == intruder) for a in found if usable[a.object]]
+
+
+def kinds_of_intruders(
+    scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
+) -> dict[tuple[str, str], NDArray[np.int64]]:
+    """One intruder of each kind for every scene, by its source and id.
+
+    The kinds are those of calibration: uniform, by popularity, and typical of another room type.
+    """
+    laws: list[Tensor | None] = [None]
+    if train is not None:
+        laws += [by_popularity(scenes, train), by_signature(scenes, train)]
+    # `ask_outliers` draws from the scene's numbers of the same seed.
+    drawn = [draw_intruders(scenes, structure, weights, seed + 1) for weights in laws]
+    each = torch.stack(drawn, 1).numpy()
+    names = [(scene.source, scene.scene_id) for scene in scenes.scenes]
+    return {name: own[own >= 0] for name, own in zip(names, each, strict=True)}
 
 
 def ask_misplaced(
@@ -218,7 +269,7 @@ def ask_misplaced(
     ]
 
 
-QUESTIONS: dict[str, Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]] = {
+QUESTIONS: dict[str, Ask] = {
     "relations": ask_relations,
     "relations, others given": ask_given,
     "placements": ask_placements,
@@ -227,7 +278,3 @@ QUESTIONS: dict[str, Callable[[Artifact, EncodedScene, np.random.Generator], Ans
     "outliers": ask_outliers,
     "misplaced": ask_misplaced,
 }
-
-
-def _bare(encoded: EncodedScene, kept: range | list[int]) -> Scene:
-    return replace(scene_of(encoded, list(kept), triples=()), room_type=None)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from inspect import signature
-from typing import Any, TypeVar
+from typing import TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app import reasoning
+from app.reasoning import Sensitivity
 from app.registry import Artifact
 from app.scene import CANONICAL, Scene, SceneObject
 from training.cases import scene_of
@@ -25,10 +25,8 @@ Floats = NDArray[np.float64]
 Case = TypeVar("Case")
 
 _PROBED = 32
-_COVERAGE = "coverage" in signature(reasoning.missing).parameters
-_SENSITIVITY = "sensitivity" in signature(reasoning.outliers).parameters
 
-SENSITIVITIES: tuple[str, ...] = ("low", "medium", "high") if _SENSITIVITY else ("medium",)
+SENSITIVITIES: tuple[Sensitivity, ...] = get_args(Sensitivity)
 """Presets of the alarm; "medium" is the default."""
 
 
@@ -76,11 +74,10 @@ def missing_probabilities(
         coverage: as the question has it; the model's default for None.
     """
     vocabulary = artifact.vocabulary
-    options: dict[str, Any] = {"top_k": len(vocabulary), "details": False}
-    if coverage is not None and _COVERAGE:
-        options["coverage"] = coverage
     found = np.full(len(vocabulary), -np.inf)
-    for answer in reasoning.missing(artifact, scene, **options):
+    for answer in reasoning.missing(
+        artifact, scene, top_k=len(vocabulary), coverage=coverage, details=False
+    ):
         found[vocabulary.index(answer.label)] = answer.probability
     return found
 
@@ -98,12 +95,9 @@ class Verdict:
     is_outlier: NDArray[np.bool_]
 
 
-def judge(artifact: Artifact, scene: Scene, sensitivity: str = "medium") -> Verdict:
+def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Verdict:
     """Every object of a scene at one of `SENSITIVITIES`."""
-    options: dict[str, Any] = {"details": False}
-    if _SENSITIVITY:
-        options["sensitivity"] = sensitivity
-    found = outlier_answers(reasoning.outliers(artifact, scene, **options))
+    found = reasoning.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
     n = len(scene.objects)
     probability, log_odds, flagged = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.bool_)
     for answer in found:
@@ -111,14 +105,6 @@ def judge(artifact: Artifact, scene: Scene, sensitivity: str = "medium") -> Verd
         log_odds[answer.object] = answer.log_odds
         flagged[answer.object] = answer.is_outlier
     return Verdict(probability, log_odds, flagged)
-
-
-def outlier_answers(found: Any) -> tuple[reasoning.OutlierAnswer, ...]:
-    """The outliers of an answer, least fitting first."""
-    answers: tuple[reasoning.OutlierAnswer, ...] = (
-        found.outliers if hasattr(found, "outliers") else found[0]
-    )
-    return answers
 
 
 def relation_probabilities(

@@ -17,7 +17,7 @@ from training.evaluation.missing import ObjectScore, RoomScore
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
 from training.evaluation.sampling import machine_sampler
-from training.evaluation.scores import machine_scores
+from training.evaluation.scores import machine_scores, served_placed_score
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +89,9 @@ def artifact_contender(
     seed: int = 0,
 ) -> Contender:
     """A published model, with its calibration."""
-    machine, calibration = artifact.machine, artifact.calibration
-    weight = calibration.placed_relation_weight * calibration.placed_temperature
-    bare = machine_contender(machine, train, settings, seed)
     return replace(
-        bare,
-        placed=machine_scores(machine, relation_weight=weight).placed,
-        alarm=calibrated_alarm(calibration),
+        machine_contender(artifact.machine, train, settings, seed),
+        placed=served_placed_score(artifact),
+        alarm=calibrated_alarm(artifact.calibration),
         artifact=artifact,
     )

@@ -20,7 +20,6 @@ from app import reasoning
 from app.registry import Artifact
 from app.scene import Scene, SceneObject, opposite
 from training.config import DATA
-from training.evaluation.asking import outlier_answers
 from training.evaluation.contenders import Contender
 from training.evaluation.intervals import Metric
 from training.evaluation.metrics import Ratio
@@ -199,7 +198,7 @@ def _outliers(
 
 def _judged(artifact: Artifact, labels: Sequence[str]) -> tuple[reasoning.OutlierAnswer, ...]:
     scene = _scene(artifact, labels)
-    return outlier_answers(reasoning.outliers(artifact, scene)) if scene.objects else ()
+    return reasoning.outliers(artifact, scene).outliers
 
 
 def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:

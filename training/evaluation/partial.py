@@ -90,14 +90,15 @@ def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int
         if len(classes) < 2:
             continue
         order = scene_rng(scene, seed).permutation(classes)
-        hidden[k, torch.from_numpy(order[_shown(len(order), share) :])] = True
+        hidden[k, torch.from_numpy(order[shown_classes(len(order), share) :])] = True
         places.append(k)
     index = torch.tensor(places, dtype=torch.int64)
     v = scenes.v.masked_fill(hidden, 0.0)
     return Partial(index, v[index], hidden[index], len(scenes))
 
 
-def _shown(classes: int, share: float | None) -> int:
+def shown_classes(classes: int, share: float | None) -> int:
+    """How many of so many classes are shown; at least one is, and one is hidden."""
     if share is None:
         return classes - 1
     return min(max(int(share * classes + 0.5), 1), classes - 1)

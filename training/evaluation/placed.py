@@ -129,15 +129,8 @@ def leave_one_out_at(
     return PlacedRanking(rank_blocks(blocks(), len(scenes), skipped), places.relation.numpy())
 
 
-def machine_score(
-    machine: BoltzmannMachine, *, relation_weight: float = 1.0, draws: int = 64
-) -> PlacedScore:
-    """Log-odds of i, plus log p(the relation | i present): the service's answer, in batches.
-
-    Args:
-        relation_weight: of the second term, in units of the first. The service's is
-            `placed_relation_weight` times `placed_temperature` of its calibration.
-    """
+def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> PlacedScore:
+    """Log-odds of i, unlisted classes absent, plus log p(the relation | i present), in batches."""
 
     def score(places: Places) -> Tensor:
         every = torch.arange(machine.spec.V).unsqueeze(0)
@@ -153,7 +146,7 @@ def machine_score(
             gain = gain + machine.attraction(places.v, context.h1, edges, every)
         weight = torch.softmax(context.log_weight.unsqueeze(-1) + gain, dim=0)
         on, _ = mean_log_p(weight, _logits(machine, places, context.h1))
-        return log_odds + relation_weight * on.clamp(min=NO_UNIT)
+        return log_odds + on.clamp(min=NO_UNIT)
 
     return score
 

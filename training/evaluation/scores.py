@@ -1,7 +1,8 @@
 """A machine's scores of relations and of classes at a place, by the estimate the service uses.
 
 Machines that have a closed form (see `app.boltzmann.closed_form`) are scored by it, the others by
-draws of the context, in the module of each task.
+draws of the context, in the module of each task. A published model is asked for classes at a place
+as the service asks it: by its coverage and its calibration.
 """
 
 from __future__ import annotations
@@ -16,8 +17,12 @@ from torch import Tensor
 from app.boltzmann import BoltzmannMachine
 from app.boltzmann.closed_form import ClosedForm, Given
 from app.boltzmann.scoring import ContextScorer
+from app.reasoning.calibration import placed_logits
+from app.reasoning.posterior import posterior
+from app.registry import Artifact
 from training.batches import Batch
 from training.evaluation import placed, relations
+from training.evaluation.asking import of_classes
 from training.evaluation.completion import given_score
 from training.evaluation.placed import PlacedScore, Places
 from training.evaluation.relations import RelationScore
@@ -38,23 +43,19 @@ class MachineScores:
     placed: PlacedScore
 
 
-def machine_scores(machine: BoltzmannMachine, *, relation_weight: float = 1.0) -> MachineScores:
-    """In closed form where there is one.
-
-    Args:
-        relation_weight: see `placed.machine_score`.
-    """
+def machine_scores(machine: BoltzmannMachine) -> MachineScores:
+    """In closed form where there is one."""
     if not ClosedForm.fits(machine):
         return MachineScores(
             relations.machine_score(machine),
             given_score(machine),
-            placed.machine_score(machine, relation_weight=relation_weight),
+            placed.machine_score(machine),
         )
     closed = ClosedForm(machine)
     return MachineScores(
         _relation_score(closed, given=False),
         _relation_score(closed, given=True),
-        _placed_score(closed, ContextScorer(machine), relation_weight),
+        _placed_score(closed, ContextScorer(machine)),
     )
 
 
@@ -79,7 +80,7 @@ def _given(batch: Batch, row: int, n: int) -> Given:
     return Given(a, i, j, holds, np.ones_like(holds))
 
 
-def _placed_score(closed: ClosedForm, scorer: ContextScorer, relation_weight: float) -> PlacedScore:
+def _placed_score(closed: ClosedForm, scorer: ContextScorer) -> PlacedScore:
     def score(places: Places) -> Tensor:
         found = torch.full(places.v.shape, -torch.inf)
         for row, v in enumerate(places.v):
@@ -93,8 +94,38 @@ def _placed_score(closed: ClosedForm, scorer: ContextScorer, relation_weight: fl
                 bool(places.outgoing[row]),
             )
             values = (closed.b + scorer.row_gain(context.y))[absent]
-            values -= np.float32(relation_weight) * np.logaddexp(np.float32(0.0), -log_odds)
+            values -= np.logaddexp(np.float32(0.0), -log_odds)
             found[row, absent] = torch.from_numpy(values)
+        return found
+
+    return score
+
+
+def served_placed_score(artifact: Artifact) -> PlacedScore:
+    """Calibrated logits of a published model: slope·z + log_relation·log p and what all share.
+
+    z are the log-odds at the model's coverage, p is the probability of the relation.
+    """
+    calibration, structure = artifact.calibration, artifact.vocabulary.structure
+
+    def score(places: Places) -> Tensor:
+        found = torch.full(places.v.shape, -torch.inf, dtype=torch.float64)
+        for row, v in enumerate(places.v.numpy()):
+            classes = np.flatnonzero(v)
+            counts = places.counts[row, classes].clamp(min=1).long().numpy()
+            given = posterior(artifact, of_classes(np.repeat(classes, counts).tolist()))
+            absent = np.flatnonzero((v == 0) & ~structure)
+            z = given.absent_posterior(absent, calibration.coverage)
+            log_p = given.placed_log_p(
+                absent,
+                int(places.relation[row]),
+                int(np.searchsorted(classes, int(places.anchor[row]))),
+                outgoing=bool(places.outgoing[row]),
+            )
+            listed = max(1, int(np.count_nonzero(~structure[classes])))
+            found[row, absent] = torch.from_numpy(
+                placed_logits(calibration, z, log_p, listed)
+            ).double()
         return found
 
     return score

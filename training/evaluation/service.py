@@ -7,7 +7,7 @@ that are published: the two may differ by rounding alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,7 +37,7 @@ from training.evaluation.outliers import IntruderScores, draw_intruders, intrude
 from training.evaluation.placed import PlacedScore, Places, leave_one_out_at
 from training.evaluation.placement import placement_scores
 from training.evaluation.relations import RelationScore, candidates, rank, score_scenes
-from training.evaluation.scores import machine_scores
+from training.evaluation.scores import machine_scores, served_placed_score
 from training.trainer import subset
 
 # The most relations that one request returns, and its most pairs.
@@ -120,8 +120,8 @@ def directly(artifact: Artifact) -> Asked:
     machine, calibration = artifact.machine, artifact.calibration
     if machine.spec.form != "local":
         raise ServiceError("in the seed form the service draws contexts, the scores do not")
-    weight = calibration.placed_relation_weight * calibration.placed_temperature
-    objects, scores = machine_score(machine), machine_scores(machine, relation_weight=weight)
+    objects, scores = machine_score(machine), machine_scores(machine)
+    at_place = served_placed_score(artifact)
 
     def log_odds(batch: Batch) -> Tensor:
         values = scores.completion(replace(batch, counts=(batch.classes >= 0).long()))
@@ -147,7 +147,7 @@ def directly(artifact: Artifact) -> Asked:
         return -torch.from_numpy(sigmoid(false_log_odds(calibration, log_odds(batch).numpy())))
 
     def placed(places: Places) -> Tensor:
-        return scores.placed(replace(places, counts=places.v))
+        return at_place(replace(places, counts=places.v)).sigmoid()
 
     def intruders(
         scenes: SceneTensors, structure: Tensor, seed: int
@@ -182,7 +182,8 @@ class _Service:
     artifact: Artifact
 
     def objects(self, v: Tensor) -> Tensor:
-        rows = [self._missing(row, "log_odds") for row in v]
+        # Full coverage: the harness counts unlisted classes as absent.
+        rows = [self._missing(row, "log_odds", coverage=1.0) for row in v]
         return torch.stack(rows)
 
     def placed(self, places: Places) -> Tensor:
@@ -192,7 +193,7 @@ class _Service:
             anchor = self.artifact.vocabulary.labels[int(places.anchor[row])]
             # The place is told from the missing thing's side.
             name = name if places.outgoing[row] else OPPOSITES[name]
-            rows.append(self._missing(v, "probability", {"relation": name, "object": anchor}))
+            rows.append(self._missing(v, "probability", at={"relation": name, "object": anchor}))
         return torch.stack(rows)
 
     def relations(self, batch: Batch) -> Tensor:
@@ -230,7 +231,7 @@ class _Service:
         self, scenes: SceneTensors, structure: Tensor, seed: int
     ) -> tuple[IntruderScores, NDArray[np.bool_]]:
         added = draw_intruders(scenes, structure, seed=seed)
-        columns: list[tuple[int, float, bool, int, bool, bool]] = []
+        columns: list[tuple[int, float, bool, int, bool, int, bool]] = []
         for k in (added >= 0).nonzero().squeeze(1).tolist():
             clean = scenes.v[k]
             for intruder in (-1, int(added[k])):
@@ -259,10 +260,8 @@ class _Service:
         )
         return scores, np.array(loud, dtype=np.bool_)
 
-    def _missing(self, v: Tensor, value: str, at: Mapping[str, str] | None = None) -> Tensor:
-        body: dict[str, Any] = {"objects": self._labels(v.nonzero().squeeze(1)), "top_k": len(v)}
-        if at is not None:
-            body["at"] = dict(at)
+    def _missing(self, v: Tensor, value: str, **options: object) -> Tensor:
+        body = {"objects": self._labels(v.nonzero().squeeze(1)), "top_k": len(v), **options}
         found = torch.full(v.shape, -torch.inf, dtype=torch.float64)
         for entry in self._ask("/missing", body)["missing"]:
             found[self.artifact.vocabulary.index(entry["label"])] = entry[value]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property, wraps
 from pathlib import Path
 
 import torch
@@ -50,6 +51,16 @@ class Setting:
         most = None if self.limit is None else max(1, self.limit // share)
         return some_scenes(scenes, most, self.seed)
 
+    @cached_property
+    def complete(self) -> Setting:
+        """The scenes with complete object lists: in others, unlisted objects may be there."""
+        train = None if self.train is None else _complete(self.train)
+        return replace(
+            self,
+            scenes=_complete(self.scenes),
+            train=train if train is not None and len(train) else None,
+        )
+
     def halves(self) -> tuple[SceneTensors, SceneTensors]:
         """Scenes to compare drawn ones with, and a second half, each within the limit."""
         first, second = halves(self.scenes)
@@ -76,3 +87,20 @@ class Outcome:
 
 
 Task = Callable[[Contender, Setting], Outcome | None]
+
+
+def about_objects(task: Task) -> Task:
+    """A task about the objects of a scene: it sees scenes with complete object lists alone."""
+
+    @wraps(task)
+    def asked(contender: Contender, setting: Setting) -> Outcome | None:
+        setting = setting.complete
+        return task(contender, setting) if len(setting.scenes) else None
+
+    return asked
+
+
+def _complete(scenes: SceneTensors) -> SceneTensors:
+    if bool(scenes.complete.all()):
+        return scenes
+    return subset(scenes, scenes.complete.nonzero().squeeze(1))

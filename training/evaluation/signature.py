@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from app.reasoning import Sensitivity
 from app.registry import Artifact
 from app.scene import Scene, SceneObject
 from training.batches import SceneTensors
@@ -138,7 +139,9 @@ def judge_intruders(
         with_intruder(artifact, labels_alone(scenes.scenes[k]), int(intruders[k])) for k in places
     ]
     scored: list[NDArray[np.float64]] = []
-    flagged = {name: np.zeros(len(asked), dtype=np.bool_) for name in SENSITIVITIES}
+    flagged: dict[str, NDArray[np.bool_]] = {
+        name: np.zeros(len(asked), dtype=np.bool_) for name in SENSITIVITIES
+    }
     plain = [things(case, structure.numpy()) for case in cases]
     for name in SENSITIVITIES:
         found = ask_every(partial(verdict, artifact, name), cases)
@@ -152,7 +155,7 @@ def judge_intruders(
     return Judged(asked, scored, flagged)
 
 
-def verdict(artifact: Artifact, sensitivity: str, scene: Scene) -> NDArray[np.float64]:
+def verdict(artifact: Artifact, sensitivity: Sensitivity, scene: Scene) -> NDArray[np.float64]:
     """(n, 3) of its objects: probability, log-odds, called an outlier."""
     found = judge(artifact, scene, sensitivity)
     return np.column_stack([found.probability, found.log_odds, found.is_outlier])
@@ -165,7 +168,7 @@ def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
 
 
 def alarms(
-    artifact: Artifact, scenes: SceneTensors, structure: Tensor, sensitivity: str
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor, sensitivity: Sensitivity
 ) -> NDArray[np.bool_]:
     """(N,) some object of the untouched scene is called an outlier."""
     plain = ~structure.numpy()

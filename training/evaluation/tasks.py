@@ -14,7 +14,14 @@ from torch import Tensor
 
 from app.scene import CANONICAL
 from training.batches import SceneTensors
-from training.evaluation.answers import QUESTIONS, collect, uncalibrated
+from training.evaluation.answers import (
+    QUESTIONS,
+    Ask,
+    ask_outliers,
+    collect,
+    kinds_of_intruders,
+    uncalibrated,
+)
 from training.evaluation.completion import complete_scenes
 from training.evaluation.contenders import Contender
 from training.evaluation.density import independent_density
@@ -50,7 +57,7 @@ from training.evaluation.relations import (
     score_scenes,
     unseen,
 )
-from training.evaluation.setting import Outcome, Setting, Task
+from training.evaluation.setting import Outcome, Setting, Task, about_objects
 from training.evaluation.signature import sensitivity_task, signature_task
 from training.trainer import subset
 
@@ -268,13 +275,13 @@ def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 def floor_contender(setting: Setting) -> Contender:
     """A second half of the held-out scenes as if it had been drawn: the floor of T4."""
-    _, second = setting.halves()
+    _, second = setting.complete.halves()
     return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
 
 
 def independent_contender(setting: Setting) -> Contender:
     """Classes drawn independently, each as often as in training."""
-    train = setting.train
+    train = setting.complete.train
     if train is None:
         return Contender()
     return Contender(
@@ -308,13 +315,15 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Every probability of the service, as published and with log-odds as they are."""
     if contender.artifact is None:
         return None
-    scenes = setting.some(share=_COSTLY)
     related = setting.some(related=True, share=_COSTLY)
+    complete = setting.complete.some(share=_COSTLY)
+    at_place = setting.complete.some(related=True, share=_COSTLY)
+    of_objects = {"missing": complete, "outliers": complete, "missing at a place": at_place}
     metrics: dict[str, Metric] = {}
     skipped = 0
     published, plain = contender.artifact, uncalibrated(contender.artifact)
-    for name, ask in QUESTIONS.items():
-        asked = scenes if name in ("missing", "outliers") else related
+    for name, ask in _questions(complete, setting).items():
+        asked = of_objects.get(name, related)
         found = collect(published, asked, ask, setting.seed)
         skipped += found.skipped
         if len(found.scene):
@@ -325,7 +334,15 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
             metrics[f"Brier skill, {name}, uncalibrated"] = before.brier_skill()
     # Skill is undefined where no answer was true, or every one.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
-    return Outcome(metrics, len(scenes), skipped) if metrics else None
+    return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None
+
+
+def _questions(complete: SceneTensors, setting: Setting) -> dict[str, Ask]:
+    """`QUESTIONS`, with intruders of every kind among these scenes."""
+    intruders = kinds_of_intruders(
+        complete, setting.structure, setting.complete.train, setting.seed
+    )
+    return QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}
 
 
 ONCE = ("Everyday",)
@@ -342,20 +359,20 @@ TASKS: dict[str, Task] = {
     "T1 pairs": pairs_task,
     "T1 with evidence": relations_evidence_task,
     "T1b completion": completion_task,
-    "T2 missing": missing_task,
-    "T2 missing, room type given": missing_in_room_task,
-    "T2 partial": partial_task,
-    "T2 with evidence": missing_evidence_task,
-    "T2-at missing at a place": placed_task,
-    "T3 outliers, uniform": outliers_task,
-    "T3 outliers, by popularity": partial(outliers_task, law=by_popularity),
-    "T3 outliers, same room type": partial(outliers_task, law=by_room),
-    "T3 signature": signature_task,
-    "T3 sensitivity": sensitivity_task,
-    "T3 with evidence": outliers_evidence_task,
+    "T2 missing": about_objects(missing_task),
+    "T2 missing, room type given": about_objects(missing_in_room_task),
+    "T2 partial": about_objects(partial_task),
+    "T2 with evidence": about_objects(missing_evidence_task),
+    "T2-at missing at a place": about_objects(placed_task),
+    "T3 outliers, uniform": about_objects(outliers_task),
+    "T3 outliers, by popularity": about_objects(partial(outliers_task, law=by_popularity)),
+    "T3 outliers, same room type": about_objects(partial(outliers_task, law=by_room)),
+    "T3 signature": about_objects(signature_task),
+    "T3 sensitivity": about_objects(sensitivity_task),
+    "T3 with evidence": about_objects(outliers_evidence_task),
     "T3b placement": placement_task,
-    "T4 generate": generation_task,
-    "Density": density_task,
+    "T4 generate": about_objects(generation_task),
+    "Density": about_objects(density_task),
     "Calibration": calibration_task,
     "Everyday": everyday_task,
 }
