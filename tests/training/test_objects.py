@@ -94,7 +94,7 @@ def test_an_update_is_the_likelihood_s_gradient():
     with torch.no_grad():
         room = torch.full((count,), -1)
         v = EVERY[torch.multinomial(log_p(machine).exp(), count, True, generator=generator)]
-        h1 = (torch.rand(count, 3, generator=generator) < (machine.c1 + v @ machine.W).sigmoid())
+        h1 = torch.rand(count, 3, generator=generator) < (machine.c1 + v @ machine.W).sigmoid()
         chains = objects._Chains(v, h1.float(), torch.zeros(count, 0), room)
         data = EVERY.repeat_interleave((TARGET * count).round().long(), dim=0)
         step = {name: torch.zeros_like(machine.get_parameter(name)) for name in ("b", "c1", "W")}
