@@ -230,8 +230,8 @@ def _fit_relation(examples: NDArray[np.float64], weight: NDArray[np.float64]) ->
     truth = examples[:, _TRUTH] > 0
     if len(np.unique(truth)) < 2:
         return PairSlope()
-    slope, count, classes, intercept = logistic(examples[:, _LOGIT:_TRUTH], truth, weight)
-    return PairSlope(intercept=intercept, slope=slope, log_count=count, log_classes=classes)
+    slope, count, intercept = logistic(examples[:, _LOGIT : _LOGIT + 2], truth, weight)
+    return PairSlope(intercept=intercept, slope=slope, log_count=count)
 
 
 def fit_misplaced(

@@ -45,16 +45,17 @@ PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
 ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Shares of untouched scenes of the hardest large source that raise an alarm."""
 
-_PARTIAL_SCENES = 400
+# Scenes of a source.
+_PARTIAL_SCENES = 120
 _PLACED_SCENES = 600
 _EVIDENCE_SCENES = 150
 # How far uniform intruders may fall, and what all but one may lose, for the sake of the others.
-_UNIFORM_LOSS = 0.03
+_UNIFORM_LOSS = 0.04
 _COMPLETE_LOSS = 0.006
 # Pulls within so much of the best are as good: the least of them is taken.
 _AS_GOOD = 0.003
 # An answer lists ten classes by default; what is listed decides.
-_LISTED = 20
+_LISTED = 10
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
@@ -81,11 +82,12 @@ def calibrate_objects(
     scenes = complete_scenes(validation, seed)
     if not len(scenes):
         return artifact.calibration
+    every = subset(validation, validation.complete.nonzero().squeeze(1))
     learnt = complete_scenes(train, seed)
     calibration = artifact.calibration.model_copy(
         update={"popularity": tuple(np.round(popularity(train), 4).tolist())}
     )
-    calibration = calibration.model_copy(update=fit_coverage(artifact, scenes, structure, seed))
+    calibration = calibration.model_copy(update=fit_coverage(artifact, every, structure, seed))
     artifact = replace(artifact, calibration=calibration)
     weights = fit_evidence(artifact, validation, structure, seed)
     calibration = calibration.model_copy(update={"evidence": weights})
@@ -151,8 +153,12 @@ def fit_coverage(
 def _shown(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, seed: int
 ) -> Iterable[_Shown]:
-    pick = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
-    some = subset(scenes, pick[:_PARTIAL_SCENES])
+    order = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(seed))
+    source = scenes.source[order]
+    place = torch.zeros(len(order), dtype=torch.int64)
+    for one in source.unique():
+        place[source == one] = torch.arange(int((source == one).sum()))
+    some = subset(scenes, order[place < _PARTIAL_SCENES])
     whole = replace(
         artifact, calibration=artifact.calibration.model_copy(update={"coverage_weight": 1.0})
     )

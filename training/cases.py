@@ -40,7 +40,9 @@ def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
     known = encoded.instance_observed.copy()
     for a in range(min(len(known), len(unlisted))):
         off = known[a] & ~encoded.instance_holds[a]
-        if unlisted[a] == "unobserved" and not off.any():
+        # Where there are no poses, neighbours are the pairs that an annotator chose to relate.
+        chosen = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
+        if chosen or (unlisted[a] == "unobserved" and not off.any()):
             known[a] = False
     return known
 

@@ -35,6 +35,7 @@ from training.config import (
     load_config,
     shipped_configs,
     source_name,
+    with_settings,
 )
 from training.datasets import DatasetError
 from training.domain.command import init
@@ -81,6 +82,14 @@ def train(
     runs: Runs = _RUNS,
     seed: Annotated[int | None, typer.Option(help="in place of the configuration's")] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="ignore a checkpoint")] = False,
+    final: Annotated[
+        bool,
+        typer.Option(
+            "--final",
+            help="learn from all scenes but a tenth, which calibrates; with --publish the figures "
+            "are those of the run without --final, which must be finished",
+        ),
+    ] = False,
     tensorboard: Annotated[
         Path | None, typer.Option("--tensorboard", help="write the curves there as well")
     ] = None,
@@ -94,10 +103,20 @@ def train(
         root = data_folder(configuration, config, data)
         scenes = _prepare(config, root)
         folder = runs / config.name / f"seed-{config.training.seed}"
+        measured = None
+        if final:
+            if publish is not None:
+                measured = load_run(folder), scenes
+            config = with_settings(config, {"data.split": "final"})
+            scenes = _prepare(config, root)
+            folder = folder.with_name(f"final-{folder.name}")
         _train(config, scenes, folder, root, fresh, tensorboard)
         if publish is not None:
-            _publish(load_run(folder), scenes, store, publish, alias)
-    except (ConfigError, DatasetError, CheckpointError, RegistryError, FloatingPointError) as error:
+            _publish(load_run(folder), scenes, store, publish, alias, measured)
+    except (
+        *(ConfigError, DatasetError, CheckpointError, RegistryError, RunError),
+        FloatingPointError,
+    ) as error:
         _fail(error)
 
 
@@ -182,6 +201,8 @@ def evaluate_command(
             if part not in some:
                 raise ConfigError(f"part must be one of {', '.join(some)}, not {part!r}")
             index = [k for k, scene in enumerate(some[part].scenes) if scene.source in wanted]
+            if not index:
+                raise ConfigError(f"{reference} kept no {part} scenes back")
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
                 if url is not None:
@@ -246,7 +267,7 @@ def _train(
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
     try:
         with Display(trainer, console, tensorboard) as display:
-            result = trainer.run(display.progress, display.ended)
+            result = trainer.run(display.progress, display.ended, display.objects)
     except KeyboardInterrupt:
         # As the next run will find it: the last epoch may have ended and not been kept.
         kept = len(trainer.epochs) if trainer.resume() else 0
@@ -257,11 +278,19 @@ def _train(
 
 
 def _publish(
-    run: FinishedRun, scenes: SplitScenes, store: Path, version: str, alias: str | None
+    run: FinishedRun,
+    scenes: SplitScenes,
+    store: Path,
+    version: str,
+    alias: str | None,
+    measured: tuple[FinishedRun, SplitScenes] | None = None,
 ) -> None:
     with console.status("publishing") as status:
         artifact = publish_run(
-            run, scenes, Store(store), version, alias=alias, progress=status.update
+            *(run, scenes, Store(store), version),
+            alias=alias,
+            measured=measured,
+            progress=status.update,
         )
     _published(artifact)
 

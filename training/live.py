@@ -75,6 +75,10 @@ class Display:
             note += f", {scores(trainer.epochs[-1])}"
         self._bar.update(self._task, completed=epoch + done, note=note)
 
+    def objects(self, done: float) -> None:
+        """While the objects are trained, before the first epoch."""
+        self._bar.update(self._task, completed=0, note=f"objects, {done:.0%}")
+
     def ended(self, epoch: Epoch) -> None:
         """After an epoch."""
         if self._log is not None:

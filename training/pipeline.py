@@ -20,6 +20,7 @@ from training.datasets import (
     encode,
     generate_rooms,
     indoor_vocabulary,
+    priors,
     read_scenes,
     read_vocabulary,
     rooms_vocabulary,
@@ -115,6 +116,8 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
         name = source_name(source)
         if source == "rooms":
             found = generate_rooms(data.rooms, seed=data.split_seed)
+        elif source == priors.SOURCE:
+            found = priors.read_prior_scenes(root / "extra" / f"{source}.tsv.gz")
         else:
             path = root / (source if is_file(source) else f"{source}.jsonl.gz")
             extra = root / "extra" / path.name

@@ -38,6 +38,7 @@ def publish_run(
     version: str,
     *,
     alias: str | None = None,
+    measured: tuple[FinishedRun, SplitScenes] | None = None,
     judge: Callable[[Artifact], None] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Artifact:
@@ -46,6 +47,8 @@ def publish_run(
     Weights are stored in half precision; they are calibrated and evaluated as they are stored.
 
     Args:
+        measured: a run of the same configuration that kept test scenes back, and its scenes: its
+            figures are published, since `run` has learnt from all scenes.
         judge: sees the model as it would be published; whatever it raises keeps it from being so.
 
     Raises:
@@ -62,14 +65,13 @@ def publish_run(
     calibration = calibrated.calibration
     if judge is not None:
         judge(calibrated)
-    rows = evaluate(
-        calibrated,
-        data.test,
-        data.structure,
-        data.train,
-        everyday=EVERYDAY,
-        progress=progress,
-    )
+    if measured is None:
+        rows = _measure(calibrated, data, progress)
+    else:
+        other, kept_back = measured
+        other.require(kept_back.digest)
+        test = kept_back.training_data()
+        rows = _measure(calibrated_draft(other, kept_back.vocabulary, test), test, progress)
     progress("publishing")
     description = Description(
         name=run.config.name,
@@ -78,7 +80,7 @@ def publish_run(
         spec=machine.spec.to_dict(),
         vocabulary=VocabularyEntry.of(scenes.vocabulary, relations),
         calibration=calibration,
-        training=_training(run),
+        training=_training(run, measured),
         data=data_sources(scenes),
         metrics=metrics(rows),
         terms=terms(scenes),
@@ -106,8 +108,18 @@ def calibrated_draft(
     return draft_artifact(machine, vocabulary, calibration, offsets)
 
 
-def _training(run: FinishedRun) -> dict[str, Any]:
-    return {
+def _measure(artifact: Artifact, data: TrainingData, progress: Callable[[str], None]) -> list[Row]:
+    """Figures on the test part; none where there is none."""
+    if not len(data.test):
+        return []
+    return evaluate(
+        artifact, data.test, data.structure, data.train, everyday=EVERYDAY, progress=progress
+    )
+
+
+def _training(run: FinishedRun, measured: tuple[FinishedRun, SplitScenes] | None) -> dict[str, Any]:
+    kept = {} if measured is None else {"measured_split": measured[0].config.data.split}
+    return kept | {
         "config": json.loads(run.config.model_dump_json()),
         "best_epoch": run.best_epoch,
         "epochs": run.epochs,

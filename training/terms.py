@@ -69,6 +69,11 @@ TERMS: dict[str, Terms] = {
         "photographs; Apache-2.0",
         research_only=False,
     ),
+    "placing_priors": Terms(
+        "VirtualHome (Puig et al., CVPR 2018), AI2-THOR (Kolve et al., 2017) and TidyBot (Wu et "
+        "al., 2023): where things are placed; MIT and Apache-2.0",
+        research_only=False,
+    ),
     "rooms": Terms(
         "Rooms made by this project's own generator; no restriction", research_only=False
     ),

@@ -76,6 +76,7 @@ MEANINGS: Final[dict[str, Meaning]] = {
     "reverie_text": _MENTIONS,
     "vsr": _MENTIONS,
     "bddl_goal": _MENTIONS,
+    "placing_priors": _MENTIONS,
     # Thousands of episodes in about a hundred rooms: a room counts as a few scenes.
     "alfred": Meaning(
         on_top="unobserved", above="unobserved", lateral="unobserved", scenes_per_group=3.0

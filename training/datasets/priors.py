@@ -17,7 +17,7 @@ from typing import Final
 from app.scene import RELATIONS, Vocabulary, canonicalise, label_key
 from training.datasets.lines import read_lines
 from training.datasets.names import curated_names
-from training.datasets.records import DatasetError
+from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 
 COLUMNS: Final = ("source", "subject", "relation", "object", "count", "room")
 
@@ -65,6 +65,10 @@ PRIOR_SOURCES: Final[dict[str, PriorSource]] = {
         "TidyBot (Wu et al., Autonomous Robots 2023): where things are put away; MIT", "MIT"
     ),
 }
+SOURCE: Final = "placing_priors"
+"""Name of the rows as scenes."""
+
+PLACES: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
 PERMISSIVE: Final = frozenset({"MIT", "Apache-2.0", "CC BY 4.0"})
 
 
@@ -122,6 +126,40 @@ def read_priors(
         index, first, second = canonicalise(ends[0], relation, ends[1])
         found.append(Prior(source, index, first, second, times, _room(vocabulary, room)))
     return found
+
+
+def read_prior_scenes(path: Path, *, sources: Collection[str] = PLACES) -> list[AnnotatedScene]:
+    """Each row of a table as a scene of two things and their relation, under one source name.
+
+    Rows about one pair of things share a group.
+
+    Args:
+        path: the table.
+        sources: the sources to read; by default lists of where things are placed.
+
+    Raises:
+        DatasetError: the file is missing, no such table, or too large.
+    """
+    scenes = []
+    for where, (source, subject, relation, anchor, _, _) in _rows(path):
+        if source not in PRIOR_SOURCES:
+            raise DatasetError(path, where, f"unknown source {source!r}")
+        names = [_plain(subject), _plain(anchor)]
+        if source not in sources or relation not in RELATIONS:
+            continue
+        if not all(map(label_key, names)) or label_key(names[0]) == label_key(names[1]):
+            continue
+        things = tuple(AnnotatedObject(str(place), name) for place, name in enumerate(names))
+        group = " ".join(names)
+        listed = ((0, relation, 1),)
+        scenes.append(AnnotatedScene(where, SOURCE, group, None, things, listed))
+    return scenes
+
+
+def _plain(label: str) -> str:
+    for kind in _KINDS:
+        label = label.removeprefix(kind)
+    return label.strip()
 
 
 def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:

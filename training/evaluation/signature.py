@@ -2,11 +2,11 @@
 
 The lift of a class in a room type is p(class | room type) / p(class), by shares of training scenes
 whose room type is known. A room type's signature are the ten classes of highest lift there, of
-those in at least 20 such scenes and with a lift of at least 2. The intruder of a scene of room type
-r is drawn in two steps: uniformly one of the other room types that have a suitable class, then
-uniformly one of its suitable ones: signature classes that are absent from the scene, no structure,
-and in less than 1 % of the training scenes of type r. Room types of under 20 training scenes are
-left out, and so are scenes under three classes.
+those in at least a fifth of its scenes and with a lift of at least 5: often there, seldom
+elsewhere. The intruder of a scene of room type r is drawn in two steps: uniformly one of the other
+room types that have a suitable class, then uniformly one of its suitable ones: signature classes
+that are absent from the scene, no structure, and in less than 1 % of the training scenes of type r.
+Room types of under 20 training scenes are left out, and so are scenes under three classes.
 
 A published model is asked as a robot asks: all instances of the scene as labels, nothing else.
 hit@1 then follows the service's ranking, the probability of being an intruder; hit@1 by log-odds
@@ -40,7 +40,8 @@ SIGNATURE = 10
 """Classes that a room type is known by, at most."""
 
 _SCENES = 20
-_LIFT = 2.0
+_LIFT = 5.0
+_OFTEN = 0.2
 _FOREIGN = 0.01
 
 Law = Callable[[SceneTensors, SceneTensors], Tensor]
@@ -67,13 +68,13 @@ def signatures(train: SceneTensors) -> Signatures:
     share = np.full((rooms, v.shape[1]), np.nan)
     typical = np.zeros(share.shape, dtype=np.bool_)
     popularity = v.mean(0) if len(v) else np.zeros(v.shape[1])
-    frequent = v.sum(0) >= _SCENES
     for r in range(rooms):
         own = v[room == r]
         if len(own) < _SCENES:
             continue
         share[r] = own.mean(0)
-        lift = np.divide(share[r], popularity, where=frequent, out=np.zeros(v.shape[1]))
+        often = share[r] >= _OFTEN
+        lift = np.divide(share[r], popularity, where=often, out=np.zeros(v.shape[1]))
         best = np.argsort(-lift, kind="stable")[:SIGNATURE]
         typical[r, best[lift[best] >= _LIFT]] = True
     return Signatures(typical, share)
