@@ -16,8 +16,11 @@ from app.registry import (
     Calibration,
     CountSlope,
     Description,
+    EvidenceWeights,
     Manifest,
     PairSlope,
+    PlacedSlope,
+    Thresholds,
 )
 from app.registry.description import VocabularyEntry
 from app.scene.relations import CANONICAL
@@ -48,6 +51,8 @@ json_values = st.recursive(
 pair_slopes = st.builds(
     PairSlope, intercept=number, slope=number, log_count=number, log_classes=number
 )
+share = st.floats(0, 1)
+thresholds = st.builds(Thresholds, low=share, medium=share, high=share)
 count_slopes = st.builds(CountSlope, intercept=number, slope=number, log_count=number)
 metrics = st.tuples(number, number, number).map(
     lambda v: {"value": v[0], "low": min(v[1:]), "high": max(v[1:])}
@@ -64,9 +69,20 @@ changes = st.fixed_dictionaries(
         "libraries": st.dictionaries(text, text, max_size=3),
         "calibration": st.builds(
             Calibration,
-            missing_temperature=st.floats(0.01, 100),
+            coverage=share,
+            coverage_weight=share,
+            missing=count_slopes,
+            placed=st.builds(
+                PlacedSlope, intercept=number, slope=number, log_count=number, log_relation=number
+            ),
+            evidence=st.builds(
+                EvidenceWeights, **dict.fromkeys(EvidenceWeights.model_fields, share)
+            ),
+            popularity=st.just(()) | st.tuples(number, number, number),
+            popularity_weight=share,
             outlier=count_slopes,
-            outlier_threshold=st.floats(0, 1),
+            outlier_thresholds=thresholds,
+            misplaced_thresholds=thresholds,
             relation=st.tuples(*[pair_slopes] * 4),
             placement=st.just(()) | st.tuples(*[pair_slopes] * 4),
             relation_given=st.just(()) | st.tuples(*[pair_slopes] * 4),
@@ -195,8 +211,13 @@ def change_nested(members: dict[str, Any], path: str, value: object) -> None:
         ("vocabulary.objects.0.size", [1.0, 2.0]),
         ("vocabulary.objects.0.size", [1.0, 2.0, -3.0]),
         ("calibration.relation", []),
-        ("calibration.missing_temperature", 0),
-        ("calibration.outlier_threshold", 1.5),
+        ("calibration.coverage", 1.5),
+        ("calibration.coverage_weight", -0.1),
+        ("calibration.popularity_weight", 2),
+        ("calibration.popularity", [math.inf]),
+        ("calibration.evidence.poses_on_objects", 1.1),
+        ("calibration.outlier_thresholds.low", 1.5),
+        ("calibration.misplaced_thresholds.high", -0.5),
         ("calibration.outlier.slope", math.nan),
         ("calibration.outlier.slope", math.inf),
         ("training.rate", math.nan),
@@ -256,8 +277,11 @@ def test_is_frozen() -> None:
 def test_neutral_calibration_changes_nothing() -> None:
     neutral = Calibration.neutral(4)
     assert neutral.relation == (PairSlope(intercept=0, slope=1, log_count=0, log_classes=0),) * 4
-    assert (neutral.missing_temperature, neutral.placed_temperature) == (1, 1)
-    assert (neutral.placed_relation_weight, neutral.misplaced.slope) == (1, 1)
+    assert neutral.missing == CountSlope(intercept=0, slope=1, log_count=0)
+    assert neutral.placed == PlacedSlope(intercept=0, slope=1, log_count=0, log_relation=1)
+    assert set(neutral.evidence.model_dump().values()) == {1.0}
+    assert (neutral.popularity, neutral.popularity_weight) == ((), 0)
+    assert neutral.misplaced.slope == 1
     assert neutral.outlier == CountSlope(intercept=0, slope=1, log_count=0)
 
 

@@ -6,7 +6,9 @@ import pytest
 
 from training.config import (
     DATA,
+    Config,
     ConfigError,
+    config_toml,
     data_folder,
     load_config,
     shipped_configs,
@@ -31,6 +33,58 @@ def test_the_variants_of_a_domain_learn_from_the_same_scenes(domain: str) -> Non
     variants = [load_config(f"{domain}-{variant}") for variant in ("triway", "gbm", "rbm")]
     assert [config.machine.variant for config in variants] == ["triway", "gbm", "rbm"]
     assert len({config.data.model_dump_json() for config in variants}) == 1
+
+
+def phases(objective="relations", form="local", epochs=3):
+    return {
+        "name": "phases",
+        "data": {"sources": ["rooms"], "rooms": 10},
+        "machine": {"variant": "triway", "form": form},
+        "objective": {"name": objective},
+        "objects": {"epochs": epochs},
+    }
+
+
+def test_the_object_phase_needs_the_local_form() -> None:
+    """In the seed form relations act on the objects."""
+    assert Config.model_validate(phases()).objects.epochs == 3
+    with pytest.raises(ValueError, match=r"objects\.epochs is defined for the local form only"):
+        Config.model_validate(phases("composite", form="seed"))
+
+
+def test_the_relation_objective_needs_the_object_phase() -> None:
+    assert Config.model_validate(phases("composite", epochs=0)).objects.epochs == 0
+    with pytest.raises(ValueError, match="it trains no objects"):
+        Config.model_validate(phases(epochs=0))
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"objects.epochs": 4},
+        {"objects.learning_rate": 0.1},
+        {"objects.chains": 8},
+        {"objective.offset_prior": 1.0},
+        {"objective.word_weight": 0.5},
+        {"objective.source_weights": {"vrd": 0.5}},
+        {"data.split": "final"},
+        {"data.words": "vectors.npz"},
+    ],
+)
+def test_a_digest_knows_every_knob_of_the_phases(setting) -> None:
+    config = Config.model_validate(phases())
+    changed = with_settings(config, setting)
+    assert changed.digest != config.digest
+    (name,) = setting
+    section, _, entry = name.partition(".")
+    assert getattr(getattr(changed, section), entry) == setting[name]
+
+
+def test_the_phases_are_written_and_read_back(tmp_path) -> None:
+    path = tmp_path / "phases.toml"
+    config = with_settings(Config.model_validate(phases()), {"objective.word_weight": 0.5})
+    path.write_text(config_toml(config))
+    assert load_config(str(path)) == config
 
 
 FILES = """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 
 import pytest
 import torch
@@ -67,6 +68,91 @@ def test_an_interrupted_run_resumes_to_the_same_bits(data, tmp_path, objective):
     assert again.resume()
     assert len(again.epochs) == 1
     assert same(weights(whole.machine), weights(again.run().machine))
+
+
+def phased(**training) -> Config:
+    """Objects, room types and samples first; then relations, with a prior of words."""
+    settings = {
+        "objects.epochs": 2,
+        "objects.chains": 16,
+        "objective.name": "relations",
+        "objective.word_weight": 0.5,
+        "machine.N": 32,
+        "machine.G": 2,
+    }
+    return with_settings(small_config(**training), settings)
+
+
+@pytest.fixture(scope="module")
+def worded(data):
+    """The same scenes, with vectors of their classes."""
+    generator = torch.Generator().manual_seed(9)
+    vectors = torch.randn(data.train.v.shape[1], 5, generator=generator)
+    return replace(data, words=torch.nn.functional.normalize(vectors, dim=1))
+
+
+def state(machine):
+    return {name: value.clone() for name, value in machine.state_dict().items()}
+
+
+def test_phases_resume_to_the_same_bits_wherever_they_were_interrupted(worded, tmp_path):
+    """Among the objects nothing is kept; after them, the objects are."""
+    config = phased()
+    whole = state(Trainer(config, worded).run().machine)
+    assert same(whole, state(Trainer(config, worded).run().machine))
+
+    def stop(_):
+        raise KeyboardInterrupt
+
+    early = Trainer(config, worded, tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        early.run(objects=stop)
+    again = Trainer(config, worded, tmp_path)
+    assert not again.resume()
+    with pytest.raises(KeyboardInterrupt):
+        again.run(Interrupt())
+    last = Trainer(config, worded, tmp_path)
+    assert last.resume()
+    assert last.objects_trained
+    assert len(last.epochs) == 1
+    assert same(whole, state(last.run(objects=stop).machine))
+
+
+def test_relations_leave_the_objects_and_the_samples_as_they_are(worded):
+    """And the words are part of plain weights in the end."""
+    machine = Trainer(phased(), worded).run().machine
+    alone = Trainer(phased(epochs=1), worded).run().machine
+    for name in ("b", "c1", "c2", "W", "J", "Q", "fantasies", "fantasy_rooms"):
+        assert torch.equal(machine.state_dict()[name], alone.state_dict()[name]), name
+    assert not torch.equal(machine.S, alone.S)
+    assert bool(machine.fantasies.any())
+    assert set(machine.state_dict()) == set(new_machine_of(worded).state_dict())
+
+
+def new_machine_of(data):
+    return Trainer(with_settings(phased(), {"objective.word_weight": 0.0}), data).machine
+
+
+def test_the_last_average_of_the_relation_likelihood_is_kept(worded):
+    """Under a prior nothing overfits early; validation stops nothing."""
+    result = Trainer(phased(epochs=4, learning_rate=0.05), worded).run()
+    assert result.best_epoch == 3
+    losses = [epoch.loss for epoch in result.epochs]
+    assert losses[-1] < losses[0]
+
+
+def test_objects_alone_may_have_a_phase_before_any_objective(data):
+    config = with_settings(small_config(), {"objects.epochs": 1, "objects.chains": 8})
+    result = Trainer(config, data).run()
+    first = Trainer(with_settings(config, {"training.epochs": 1}), data).run()
+    assert torch.equal(result.machine.W, first.machine.W)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_an_object_phase_that_diverges_says_so(data):
+    config = with_settings(phased(), {"objects.learning_rate": 1e39})
+    with pytest.raises(FloatingPointError, match=r"objects\.learning_rate"):
+        Trainer(config, data).run()
 
 
 def test_a_checkpoint_of_another_configuration_is_refused(data, tmp_path):

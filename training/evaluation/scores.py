@@ -109,7 +109,7 @@ def served_placed_score(artifact: Artifact) -> PlacedScore:
     calibration, structure = artifact.calibration, artifact.vocabulary.structure
 
     def score(places: Places) -> Tensor:
-        found = torch.full(places.v.shape, -torch.inf, dtype=torch.float64)
+        found = torch.full(places.v.shape, -torch.inf)
         for row, v in enumerate(places.v.numpy()):
             classes = np.flatnonzero(v)
             counts = places.counts[row, classes].clamp(min=1).long().numpy()
@@ -123,9 +123,8 @@ def served_placed_score(artifact: Artifact) -> PlacedScore:
                 outgoing=bool(places.outgoing[row]),
             )
             listed = max(1, int(np.count_nonzero(~structure[classes])))
-            found[row, absent] = torch.from_numpy(
-                placed_logits(calibration, z, log_p, listed)
-            ).double()
+            logits = placed_logits(calibration, z, log_p, listed)
+            found[row, absent] = torch.from_numpy(logits).float()
         return found
 
     return score

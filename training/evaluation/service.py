@@ -147,7 +147,7 @@ def directly(artifact: Artifact) -> Asked:
         return -torch.from_numpy(sigmoid(false_log_odds(calibration, log_odds(batch).numpy())))
 
     def placed(places: Places) -> Tensor:
-        return at_place(replace(places, counts=places.v)).sigmoid()
+        return at_place(replace(places, counts=places.v)).double().sigmoid()
 
     def intruders(
         scenes: SceneTensors, structure: Tensor, seed: int

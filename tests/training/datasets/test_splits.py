@@ -34,7 +34,7 @@ def parts_of(scenes: list[AnnotatedScene], **options: object) -> dict[str, str]:
     }
 
 
-@given(st.integers(0, 40), st.integers(0, 5), st.sampled_from(["group", "stable", "random"]))
+@given(st.integers(0, 40), st.integers(0, 5), st.sampled_from(list(FRACTIONS)))
 def test_every_scene_has_one_part_whatever_the_order(
     groups: int, seed: int, protocol: Protocol
 ) -> None:
@@ -46,11 +46,11 @@ def test_every_scene_has_one_part_whatever_the_order(
     assert sum(map(len, split(scenes, seed=seed, protocol=protocol).values())) == len(scenes)
 
 
-@given(st.integers(1, 60), st.integers(0, 5))
-def test_groups_stay_whole_across_sources(groups: int, seed: int) -> None:
+@given(st.integers(1, 60), st.integers(0, 5), st.sampled_from(["group", "stable", "final"]))
+def test_groups_stay_whole_across_sources(groups: int, seed: int, protocol: Protocol) -> None:
     frames = collection("frames", groups, prefix="place")
     boxes = collection("boxes", groups // 2, seed=1, prefix="place")
-    found = parts_of([*frames, *boxes], seed=seed)
+    found = parts_of([*frames, *boxes], seed=seed, protocol=protocol)
     parts = defaultdict(set)
     for scene in (*frames, *boxes):
         parts[scene.group].add(found[scene.scene_id])
@@ -66,7 +66,7 @@ def test_a_source_splits_alone_as_it_does_among_others() -> None:
     assert {key: part for key, part in together.items() if key in alone} == alone
 
 
-@pytest.mark.parametrize("protocol", ["group", "random"])
+@pytest.mark.parametrize("protocol", ["group", "random", "final"])
 def test_shares_hold_over_all_and_within_room_types(protocol: Protocol) -> None:
     scenes = collection("a", 400)
     parts = split(scenes, seed=1, protocol=protocol)
@@ -78,6 +78,14 @@ def test_shares_hold_over_all_and_within_room_types(protocol: Protocol) -> None:
         here = Counter(scene.room_type for scene in parts[part])
         for room, size in room_size.items():
             assert here[room] == pytest.approx(fraction * size, abs=8)
+
+
+@given(st.integers(0, 60), st.integers(0, 5))
+def test_the_final_split_tests_nothing(groups: int, seed: int) -> None:
+    """What ships learns from all scenes but those that calibrate it."""
+    parts = split(collection("a", groups), seed=seed, protocol="final")
+    assert list(parts) == ["train", "test", "validation"]
+    assert parts["test"] == []
 
 
 def test_seeds_draw_different_splits() -> None:

@@ -149,5 +149,5 @@ def test_the_batched_score_is_the_uncalibrated_service_s(name, outgoing):
     places = asked_of(machine, outgoing)
     values, served = machine_scores(machine).placed(places), served_placed_score(artifact)(places)
     things = served[0] > -torch.inf
-    shift = (served - values.double())[:, things]
+    shift = (served - values)[:, things]
     assert shift == pytest.approx(np.full(shift.shape, np.log(0.5)), rel=1e-3, abs=1e-4)
