@@ -48,6 +48,9 @@ ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 # Scenes of a source.
 _PARTIAL_SCENES = 120
 _PLACED_SCENES = 600
+# Real rooms that are smaller than what is drawn, and scenes of a room type that tell.
+_SMALL = 0.05
+_ROOM_SCENES = 20
 _EVIDENCE_SCENES = 150
 # How far uniform intruders may fall, and what all but one may lose, for the sake of the others.
 _UNIFORM_LOSS = 0.04
@@ -93,9 +96,9 @@ def calibrate_objects(
     calibration = calibration.model_copy(update={"evidence": weights})
     artifact = replace(artifact, calibration=calibration)
     update = fit_outliers(artifact, scenes, learnt, structure, seed)
-    return calibration.model_copy(
-        update=update | {"placed": fit_placed(artifact, validation, seed)}
-    )
+    update |= {"placed": fit_placed(artifact, validation, seed)}
+    update |= {"smallest": smallest_scenes(learnt, structure, artifact.machine.spec.C)}
+    return calibration.model_copy(update=update)
 
 
 def popularity(train: SceneTensors) -> Floats:
@@ -105,6 +108,18 @@ def popularity(train: SceneTensors) -> Floats:
     total = float(weight.sum())
     found: Floats = np.log((count + 0.5) / (total - count + 0.5))
     return found
+
+
+def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
+    """Classes that 95 % of the scenes of each room type have at least, and of all scenes, (C + 1,).
+
+    A type of fewer than 20 scenes takes the entry of all.
+    """
+    sizes = ((train.v > 0) & ~structure).sum(1).numpy()
+    every = int(np.quantile(sizes, _SMALL))
+    of = [sizes[train.room.numpy() == t] for t in range(rooms)]
+    found = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else every for n in of]
+    return (*found, every)
 
 
 # ------------------------------------------------------------------------------ unlisted classes

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from app.boltzmann.gibbs import State
 from app.reasoning.answers import GeneratedScene
-from app.reasoning.chains import clamped, held_units, run_block
+from app.reasoning.chains import CHAINS, clamped, held_units, run_block
 from app.reasoning.evidence import observe
 from app.reasoning.exclusion import Triple, staying
 from app.reasoning.log_score import log_score
+from app.reasoning.plausible import ATTEMPTS, Plausible
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
@@ -39,19 +40,32 @@ def block_scenes(
     of = observation.classes[observation.row].tolist()
     given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
     drawn: list[GeneratedScene] = []
-    block = 0
+    block, plausible = 0, Plausible(artifact, scene)
     while len(drawn) < count and not stop():
-        state = run_block(
-            artifact.fantasies, observation, clamp, tempered, steps, _stream(seed, block)
-        )
-        drawn += _scenes(artifact, state, shown, given, clamp.room)
+        found: list[GeneratedScene] = []
+        fitting: list[bool] = []
+        for attempt in range(ATTEMPTS):
+            stream = _stream(seed, block, attempt)
+            state = run_block(artifact.fantasies, observation, clamp, tempered, steps, stream)
+            again = _scenes(artifact, state, shown, given, clamp.room)
+            # What is plausible stays; the rest is replaced by the same chains of the next attempt.
+            found = [
+                old if fits else new
+                for old, new, fits in zip(
+                    found or again, again, fitting or [False] * CHAINS, strict=True
+                )
+            ]
+            fitting = [plausible(one.objects) for one in found]
+            if all(fitting) or stop():
+                break
+        drawn += found
         block += 1
     return tuple(drawn[:count])
 
 
-def _stream(seed: int, block: int) -> int:
-    """A seed for a block, unrelated to those of neighbouring seeds and blocks."""
-    sequence = np.random.SeedSequence(seed, spawn_key=(block,))
+def _stream(seed: int, block: int, attempt: int) -> int:
+    """A seed for an attempt at a block, unrelated to those of neighbouring seeds and blocks."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(block, attempt))
     return int(sequence.generate_state(1, np.uint64)[0])
 
 

@@ -13,6 +13,7 @@ from app.reasoning.answers import GeneratedScene
 from app.reasoning.chains import held_units
 from app.reasoning.exclusion import Triple, staying
 from app.reasoning.given import given_relations
+from app.reasoning.plausible import ATTEMPTS, Plausible
 from app.reasoning.present import Present, present
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL
@@ -47,9 +48,15 @@ def chain_scenes(
     of = classes.classes[classes.row].tolist()
     given = {(a, of[i], of[j]) for a, i, j in scene.relations or ()}
     scenes: list[GeneratedScene] = []
+    plausible = Plausible(artifact, scene)
     while len(scenes) < count and not stop():
-        drawn = conditioned.draw(steps, philox.stream(seed, len(scenes)))
-        scenes.append(_scene(artifact, conditioned, drawn, shown[drawn.classes], given))
+        stream = philox.stream(seed, len(scenes))
+        for _ in range(ATTEMPTS):
+            drawn = conditioned.draw(steps, stream)
+            found = _scene(artifact, conditioned, drawn, shown[drawn.classes], given)
+            if plausible(found.objects) or stop():
+                break
+        scenes.append(found)
     return tuple(scenes)
 
 

@@ -89,14 +89,12 @@ class DrawnPosterior:
     @torch.inference_mode()
     def absent_posterior(self, absent: Places, coverage: float) -> Floats:
         """See `with_unlisted`; with a second layer, h2 stays at its mean field."""
-        log_odds = self.absent_log_odds(absent)
-        if self._artifact.completions is None:
-            return log_odds
-        y = self.object_draws.field.y[0].numpy()
-        closed = self._artifact.machine.b.numpy() + self._artifact.scorer.row_gain(y)
+        log_odds, y = self.absent_log_odds(absent), self.object_draws.field.y[0].numpy()
+        closed = None
+        if self._artifact.completions is not None:
+            closed = (self._artifact.machine.b.numpy() + self._artifact.scorer.row_gain(y))[absent]
         return with_unlisted(
-            *(self._artifact, log_odds, absent, y, self.present, self._room, coverage),
-            closed[absent],
+            *(self._artifact, log_odds, absent, y, self.present, self._room, coverage), closed
         )
 
     @torch.inference_mode()

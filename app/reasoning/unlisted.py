@@ -43,7 +43,7 @@ def with_unlisted(
             partial posterior changes is added to these.
     """
     completions, weight = artifact.completions, artifact.calibration.coverage_weight
-    unlisted = np.float32(math.log1p(-min(coverage, FULL)))
+    unlisted = math.log1p(-min(coverage, FULL))
     found: Floats = log_odds + unlisted
     if completions is None or coverage >= FULL or weight == 0:
         return found

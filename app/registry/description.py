@@ -118,6 +118,8 @@ class Calibration(Frozen):
         popularity_weight: alpha of the prior of an intruder, proportional to popularity^alpha.
         outlier_thresholds: probabilities from which an object is an outlier.
         misplaced_thresholds: probabilities from which a relation is misplaced.
+        smallest: (C + 1,) classes that all but one in twenty real rooms of each type have at least,
+            and last of all rooms together; empty: any number.
         missing_temperature: divides the log-odds before the softmax over absent classes.
         placed_temperature: the same where the question names a place.
         placed_relation_weight: weight of the relation's log-odds in that question.
@@ -138,6 +140,7 @@ class Calibration(Frozen):
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
     outlier_thresholds: Thresholds = Thresholds()
     misplaced_thresholds: Thresholds = Thresholds()
+    smallest: tuple[Count, ...] = ()
     missing_temperature: Annotated[float, Field(gt=0)] = 1.0
     placed_temperature: Annotated[float, Field(gt=0)] = 1.0
     placed_relation_weight: float = 1.0

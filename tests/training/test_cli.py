@@ -142,7 +142,8 @@ def test_from_rooms_to_answers(tmp_path, variant):
     same_through_a_service(tmp_path, *folders[2:])
     calibration = artifact.calibration
     assert calibration.outlier.slope < 0  # the likelier an object, the less an intruder
-    assert 0 < calibration.outlier_threshold < 1
+    limits = calibration.outlier_thresholds
+    assert 1 > limits.low >= limits.medium >= limits.high > 0
     things = ("bed", "nightstand", "lamp")
     scene = Scene(
         tuple(SceneObject(name, name, artifact.vocabulary.index(name)) for name in things)

@@ -86,7 +86,7 @@ def same(first, second):
 def test_an_update_is_the_likelihood_s_gradient():
     """Chains drawn from the machine itself: each entry is the mean of 200,000 products within
     [-1, 1], so six standard errors are below .0135 (missed by chance with p < 1e-7)."""
-    machine, p = machine_of(scale=1.0), TARGET
+    machine = machine_of(scale=1.0)
     loss = -(TARGET * log_p(machine)).sum()
     loss.backward()
     count = 200_000

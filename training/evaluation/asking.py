@@ -54,8 +54,8 @@ def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Sc
 
 
 def of_classes(classes: Sequence[int]) -> Scene:
-    """One object of each class."""
-    return Scene(tuple(SceneObject(str(c), str(c), c) for c in classes))
+    """One object of each entry."""
+    return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
 
 
 def things(scene: Scene, structure: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from app.reasoning import missing, relations
-from tests.reasoning.artifacts import LARGER, artifact_of
-from tests.training.evaluation.scenes import random_scenes, tensors
+from app.registry import CountSlope
+from tests.reasoning.artifacts import LARGER, artifact_of, calibration
+from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
+from tests.training.evaluation.scenes import random_scenes, scene, tensors
 from tests.training.evaluation.test_completion import larger_machine
 from training.cases import scene_of
-from training.evaluation.answers import QUESTIONS, collect, uncalibrated
+from training.evaluation.answers import (
+    QUESTIONS,
+    ask_outliers,
+    collect,
+    kinds_of_intruders,
+    uncalibrated,
+)
 
 ARTIFACT = artifact_of(larger_machine("triway-local"))
 V = LARGER["triway-local"].V
@@ -33,8 +42,8 @@ def test_every_question_is_asked_and_some_answers_are_true(question):
 def test_relations_are_compared_with_what_was_listed():
     found = collect(ARTIFACT, DATA, QUESTIONS["relations"])
     entry = DATA.scenes[4]
-    scene = replace(scene_of(entry, range(len(entry.instance_classes)), ()), room_type=None)
-    answers, _ = relations(ARTIFACT, scene)
+    asked = replace(scene_of(entry, range(len(entry.instance_classes)), ()), room_type=None)
+    answers, _ = relations(ARTIFACT, asked)
     names = ("left", "front", "on-top", "above")
     listed = [
         bool(entry.instance_holds[names.index(a.relation), a.subject, a.object]) for a in answers
@@ -44,14 +53,55 @@ def test_relations_are_compared_with_what_was_listed():
     assert found.truth[ours].tolist() == listed
 
 
-def test_what_was_taken_away_is_true_at_most_once_a_scene():
-    for question in ("missing", "missing at a place"):
-        found = collect(ARTIFACT, DATA, QUESTIONS[question])
-        assert np.bincount(found.scene, weights=found.truth).max() == 1
-    # All absent classes are answered here, so what was taken away is always among them.
+def test_relations_that_nobody_knows_of_are_not_judged():
+    """A source of sentences lists what holds: of no unlisted relation is anything known."""
+    vague = [replace(entry, source="coco_captions", complete=False) for entry in DATA.scenes]
+    vague = [replace(entry, instance_observed=entry.instance_holds) for entry in vague]
+    for question in ("relations", "relations, others given", "placements"):
+        found = collect(ARTIFACT, tensors(vague, V), QUESTIONS[question])
+        assert (len(found.probability), found.skipped) == (0, 30)
+
+
+def test_a_denied_relation_makes_its_kind_known():
+    """Of sentences: left(0, 1) is listed, which alone says nothing of how often left is off."""
+    entry = scene([0, 1], [(0, 0, 1)], source="coco_captions")
+
+    def judged(*denied):
+        observed = entry.instance_holds.copy()
+        for triple in denied:
+            observed[triple] = True
+        told = replace(entry, instance_observed=observed)
+        return collect(ARTIFACT, tensors([told], V), QUESTIONS["relations"]).truth.tolist()
+
+    assert judged() == []
+    assert judged((1, 1, 0)) == [False]
+    assert sorted(judged((0, 1, 0))) == [False, True]
+
+
+def test_what_was_taken_away_from_a_place_is_true_at_most_once_a_scene():
+    found = collect(ARTIFACT, DATA, QUESTIONS["missing at a place"])
+    assert np.bincount(found.scene, weights=found.truth).max() == 1
+
+
+def test_hidden_classes_are_true_and_nothing_else():
+    """All absent classes are answered here; of n classes 1 to n - 1 are hidden."""
     found = collect(ARTIFACT, DATA, QUESTIONS["missing"])
-    assert np.bincount(found.scene, weights=found.truth).tolist() == [1.0] * 30
-    assert np.bincount(found.scene, weights=found.probability) == pytest.approx(np.ones(30))
+    hidden = np.bincount(found.scene, weights=found.truth)
+    sizes = np.array([(entry.evidence.classes < V - 1).sum() for entry in DATA.scenes])
+    assert bool(((hidden >= 1) & (hidden < sizes)).all())
+    assert len(set(hidden.tolist())) > 1
+    answered = np.bincount(found.scene)
+    assert answered.tolist() == (V - 1 - sizes + hidden).tolist()
+    again = collect(ARTIFACT, DATA, QUESTIONS["missing"])
+    assert again.truth.tolist() == found.truth.tolist()
+
+
+@pytest.mark.parametrize("question", ["missing", "missing at a place", "outliers"])
+def test_scenes_with_incomplete_object_lists_are_not_asked_about_objects(question):
+    """An unlisted class may be there all the same."""
+    some = tensors([replace(entry, complete=False) for entry in DATA.scenes], V)
+    found = collect(ARTIFACT, some, QUESTIONS[question])
+    assert (len(found.probability), found.skipped) == (0, 30)
 
 
 def test_half_of_the_scenes_have_an_intruder():
@@ -62,9 +112,27 @@ def test_half_of_the_scenes_have_an_intruder():
     assert 5 <= intruders.sum() <= 25
 
 
+def test_intruders_are_of_every_kind():
+    """Uniform, popular, and typical of another room type; each absent and no structure."""
+    data, train = rooms(40, 1), rooms(400, 2)
+    found = kinds_of_intruders(data, STRUCTURE, train)
+    assert set(found) == {(entry.source, entry.scene_id) for entry in data.scenes}
+    for entry in data.scenes:
+        drawn = found[entry.source, entry.scene_id]
+        assert not np.isin(drawn, entry.evidence.classes).any()
+        assert not STRUCTURE.numpy()[drawn].any()
+    assert max(map(len, found.values())) == 3
+    alone = kinds_of_intruders(data, STRUCTURE, None)
+    assert {len(drawn) for drawn in alone.values()} <= {0, 1}
+    ask = partial(ask_outliers, intruders=found)
+    answers = collect(room_model(), data, ask)
+    assert set(np.bincount(answers.scene, weights=answers.truth).tolist()) == {0.0, 1.0}
+
+
 def test_the_uncalibrated_model_answers_with_its_log_odds():
-    plain = uncalibrated(ARTIFACT)
-    scene = replace(scene_of(DATA.scenes[0], range(2), ()), room_type=None)
-    odds = np.array([answer.log_odds for answer in missing(plain, scene)])
-    p = np.array([answer.probability for answer in missing(plain, scene)])
-    assert p == pytest.approx(np.exp(odds) / np.exp(odds).sum(), rel=1e-4)
+    plain = uncalibrated(
+        replace(ARTIFACT, calibration=calibration(4, missing=CountSlope(slope=3.0)))
+    )
+    asked = replace(scene_of(DATA.scenes[0], range(2), ()), room_type=None)
+    for answer in missing(plain, asked):
+        assert answer.probability == pytest.approx(1 / (1 + np.exp(-answer.log_odds)), rel=1e-4)

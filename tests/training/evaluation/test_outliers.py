@@ -49,6 +49,7 @@ def test_metrics_by_hand():
         intruder=np.array([0, 0, 1, 0, 0, 1, 0, 0, 0, 0], dtype=np.bool_),
         size=np.array([3, 3, 3, 3, 3, 3, 2, 2, 2, 2]),
         clean=np.arange(10) >= 6,
+        thing=np.array([0, 1, 2, 1, 2, 0, 0, 1, 1, 2]),
         scenes=3,
         skipped=1,
     )
@@ -59,6 +60,10 @@ def test_metrics_by_hand():
     assert scores.false_alarms(suspicion, 0.0).value == pytest.approx(1 / 2)
     assert scores.false_alarms(suspicion, 0.5).value == 0.0
     assert scores.caught(suspicion, 0.5).value == pytest.approx(1 / 2)
+    # Class 0 is often an intruder: the second scene's is found, and the first one's still.
+    likely = scores.with_prior(np.array([1.5, 0.0, 0.0]))
+    assert likely.log_odds.tolist() == [-0.5, 2, -1, 0, 3, -0.5, -0.5, 2, 0, 3]
+    assert likely.hit_at_1().value == 1.0
 
 
 def test_intruders_are_absent_and_no_structure():

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from app.reasoning import missing
+from app.registry import PlacedSlope
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.reasoning.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import (
@@ -19,7 +20,7 @@ from tests.training.evaluation.scenes import (
 )
 from tests.training.evaluation.test_completion import larger_machine
 from training.evaluation.placed import Places, leave_one_out_at, removed_places
-from training.evaluation.scores import machine_scores
+from training.evaluation.scores import machine_scores, served_placed_score
 
 DATA = tensors(random_scenes(20), WIDE)
 
@@ -107,29 +108,46 @@ def test_structure_and_equal_classes_are_not_asked():
     assert len(removed_places(tensors([scene([0, 4], [(0, 0, 4)])]), structure)[0]) == 0
 
 
+def asked_of(machine, outgoing):
+    """A place twice: {0, 2, 2, 5}, on-top of 2; and another row, which must not disturb it."""
+    v, counts = torch.zeros(1, machine.spec.V), torch.zeros(1, machine.spec.V)
+    v[0, [0, 2, 5]] = 1.0
+    counts[0, [0, 2, 5]] = torch.tensor([1.0, 2.0, 1.0])
+    rows = [(2, 2, outgoing), (0, 5, not outgoing)]
+    relation, anchor, leads = (torch.tensor(column) for column in zip(*rows, strict=True))
+    return Places(v.repeat(2, 1), counts.repeat(2, 1), relation, anchor, leads)
+
+
+def answers_of(artifact, outgoing):
+    things = tuple(SceneObject(str(k), "x", c) for k, c in enumerate([0, 2, 2, 5]))
+    spoken = CANONICAL[2] if outgoing else OPPOSITES[CANONICAL[2]]
+    return missing(artifact, Scene(things), top_k=artifact.machine.spec.V, at=(spoken, 1))
+
+
+PLACED = PlacedSlope(intercept=-0.3, slope=0.8, log_count=0.4, log_relation=0.6)
+
+
 @pytest.mark.parametrize("outgoing", [True, False])
 @pytest.mark.parametrize("name", LARGER)
-def test_the_score_is_the_service_s(name, outgoing):
-    """Softmax of the score over absent classes is the answer of the service, uncalibrated."""
+def test_the_score_of_a_published_model_is_the_service_s(name, outgoing):
+    artifact = artifact_of(larger_machine(name), placed=PLACED, coverage=0.7)
+    answers = answers_of(artifact, outgoing)
+    values = served_placed_score(artifact)(asked_of(artifact.machine, outgoing))[0]
+    for answer in answers:
+        found = values[artifact.vocabulary.index(answer.label)]
+        assert float(found.sigmoid()) == pytest.approx(answer.probability, rel=1e-5)
+    # Structure and what is there are no candidates.
+    assert int((values > -torch.inf).sum()) == len(answers)
+
+
+@pytest.mark.parametrize("outgoing", [True, False])
+@pytest.mark.parametrize("name", LARGER)
+def test_the_batched_score_is_the_uncalibrated_service_s(name, outgoing):
+    """But for log(1 - coverage), which all classes have alike."""
     machine = larger_machine(name)
     artifact = artifact_of(machine)
-    classes, relation, anchor = [0, 2, 2, 5], 2, 2
-    things = tuple(SceneObject(str(k), "x", c) for k, c in enumerate(classes))
-    spoken = CANONICAL[relation] if outgoing else OPPOSITES[CANONICAL[relation]]
-    answers = missing(artifact, Scene(things), top_k=machine.spec.V, at=(spoken, 1))
-    v, counts = torch.zeros(1, machine.spec.V), torch.zeros(1, machine.spec.V)
-    v[0, classes] = 1.0
-    counts[0, [0, 2, 5]] = torch.tensor([1.0, 2.0, 1.0])
-    places = Places(
-        v, counts, torch.tensor([relation]), torch.tensor([anchor]), torch.tensor([outgoing])
-    )
-    # Rows of a batch do not disturb each other.
-    other = Places(v, counts, torch.tensor([0]), torch.tensor([5]), torch.tensor([not outgoing]))
-    both = Places(
-        *(torch.cat([getattr(x, n) for x in (places, other)]) for n in Places.__dataclass_fields__)
-    )
-    values = machine_scores(machine).placed(both)[0].double()
-    labels = artifact.vocabulary.labels
-    absent = [labels.index(answer.label) for answer in answers]
-    expected = torch.tensor([answer.probability for answer in answers]).double()
-    torch.testing.assert_close(values[absent].softmax(0), expected, rtol=1e-3, atol=1e-5)
+    places = asked_of(machine, outgoing)
+    values, served = machine_scores(machine).placed(places), served_placed_score(artifact)(places)
+    things = served[0] > -torch.inf
+    shift = (served - values.double())[:, things]
+    assert shift == pytest.approx(np.full(shift.shape, np.log(0.5)), rel=1e-3, abs=1e-4)

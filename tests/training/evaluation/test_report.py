@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from app.registry import Thresholds
 from tests.reasoning.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import flat, knowing, random_scenes, scene, tensors
 from tests.training.evaluation.test_completion import larger_machine
@@ -108,6 +109,41 @@ def test_scenes_that_hold_no_question_have_no_outcome(name):
     report = SourceReport("silent", digest(silent))
     assert list(run(contender, silent, report, tasks=asked)) == asked
     assert set(report.outcomes.values()) == {None}
+
+
+OBJECT_TASKS = {task for task in TASKS if task.startswith(("T2", "T3 ", "T4")) or task == "Density"}
+
+
+def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
+    """Elsewhere an unlisted object may be there. Relations are asked of all annotated scenes."""
+    cut = [replace(one, complete=False, source="captions") for one in random_scenes(9, V, seed=2)]
+    mixed = Setting(tensors([*DATA.scenes, *cut], V), NO_STRUCTURE, TRAIN, SEEN)
+    reports = []
+    for setting in (SETTING, mixed):
+        reports.append(SourceReport("toy", digest(setting)))
+        list(run(CONTENDER, setting, reports[-1], tasks=sorted(OBJECT_TASKS | {"T1b completion"})))
+    whole, more = ({t: o.scenes for t, o in r.outcomes.items() if o} for r in reports)
+    assert whole == {task: more[task] - 9 * (task == "T1b completion") for task in whole}
+    of_objects = [
+        {key: value for key, value in values_of(report).items() if key[0] in OBJECT_TASKS}
+        for report in reports
+    ]
+    assert of_objects[1] == pytest.approx(of_objects[0])
+
+
+def test_a_source_of_incomplete_object_lists_is_asked_for_relations_alone():
+    cut = [replace(one, complete=False) for one in random_scenes(20, V, seed=2)]
+    setting = Setting(tensors(cut, V), NO_STRUCTURE, tensors(cut, V), SEEN)
+    report = SourceReport("captions", digest(setting))
+    asked = [task for task in TASKS if task != "Everyday"]
+    list(run(CONTENDER, setting, report, tasks=asked))
+    silent = {task for task, outcome in report.outcomes.items() if outcome is None}
+    assert silent == OBJECT_TASKS
+    names = report.outcomes["Calibration"].metrics
+    assert "ECE, relations" in names
+    assert not {f"ECE, {kind}" for kind in ("missing", "outliers", "missing at a place")} & set(
+        names
+    )
 
 
 def test_who_takes_no_part_is_none():
@@ -216,10 +252,12 @@ def test_publishing_measures_the_published_tasks_on_every_source():
 
 
 def test_what_is_published_is_the_calibrated_artifact_s():
-    """Another threshold, other alarms; and no more scenes than the limit allows."""
+    """Another default threshold, other alarms; and no more scenes than the limit allows."""
 
     def alarms(threshold, limit=None):
-        calibration = ARTIFACT.calibration.model_copy(update={"outlier_threshold": threshold})
+        calibration = ARTIFACT.calibration.model_copy(
+            update={"outlier_thresholds": Thresholds(medium=threshold)}
+        )
         rows = evaluate(
             replace(ARTIFACT, calibration=calibration), DATA, NO_STRUCTURE, TRAIN, limit=limit
         )

@@ -10,7 +10,14 @@ from training.evaluation.service import Asked, metrics
 
 _NONE = np.zeros(0, dtype=np.int64)
 NO_INTRUDERS = IntruderScores(
-    _NONE, _NONE.astype(float), _NONE.astype(bool), _NONE, _NONE.astype(bool), scenes=1, skipped=1
+    scene=_NONE,
+    log_odds=_NONE.astype(float),
+    intruder=_NONE.astype(bool),
+    size=_NONE,
+    clean=_NONE.astype(bool),
+    thing=_NONE,
+    scenes=1,
+    skipped=1,
 )
 
 
