@@ -51,12 +51,12 @@ def chain_scenes(
     plausible = Plausible(artifact, scene)
     while len(scenes) < count and not stop():
         stream = philox.stream(seed, len(scenes))
-        for _ in range(ATTEMPTS):
+        for attempt in range(ATTEMPTS):
             drawn = conditioned.draw(steps, stream)
             found = _scene(artifact, conditioned, drawn, shown[drawn.classes], given)
-            if plausible(found.objects) or stop():
+            if attempt + 1 == ATTEMPTS or plausible(found.objects) or stop():
+                scenes.append(found)
                 break
-        scenes.append(found)
     return tuple(scenes)
 
 
