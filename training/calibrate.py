@@ -30,7 +30,7 @@ from app.reasoning.units import NO_UNIT
 from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
 from app.scene import CANONICAL
 from training.batches import SceneTensors
-from training.calibrate_objects import ALARMS, calibrate_objects
+from training.calibrate_objects import ALARMS, calibrate_objects, fit_placed
 from training.cases import (
     Triple,
     altered_case,
@@ -81,6 +81,8 @@ def calibrate(
             "relation_given": fit_relations(artifact, related, np.random.default_rng(seed)),
         }
     )
+    artifact = replace(artifact, calibration=calibration)
+    calibration = calibration.model_copy(update={"placed": fit_placed(artifact, scenes, seed)})
     entry, limits = fit_misplaced(artifact, related[:_MISPLACED_SCENES], seed)
     return calibration.model_copy(update={"misplaced": entry, "misplaced_thresholds": limits})
 

@@ -23,6 +23,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from app.reasoning.calibration import placement_log_p
+from app.reasoning.plausible import room_fit
 from app.reasoning.posterior import posterior
 from app.registry import Artifact, Calibration, CountSlope, EvidenceWeights, PlacedSlope, Thresholds
 from app.scene import Scene, SceneObject
@@ -38,7 +40,7 @@ from training.trainer import subset
 
 Floats = NDArray[np.float64]
 
-COVERAGES = (0.5, 0.7)
+COVERAGES = (0.3, 0.5, 0.7)
 WEIGHTS = (0.3, 0.5, 0.7, 1.0)
 ALPHAS = (0.0, 0.125, 0.25, 0.375, 0.5)
 PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
@@ -49,7 +51,8 @@ ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 _PARTIAL_SCENES = 120
 _PLACED_SCENES = 600
 # Real rooms that are smaller than what is drawn, and scenes of a room type that tell.
-_SMALL = 0.05
+_SMALL = 0.1
+_UNSUITED = 0.15
 _ROOM_SCENES = 20
 _EVIDENCE_SCENES = 150
 # How far uniform intruders may fall, and what all but one may lose, for the sake of the others.
@@ -96,8 +99,8 @@ def calibrate_objects(
     calibration = calibration.model_copy(update={"evidence": weights})
     artifact = replace(artifact, calibration=calibration)
     update = fit_outliers(artifact, scenes, learnt, structure, seed)
-    update |= {"placed": fit_placed(artifact, validation, seed)}
     update |= {"smallest": smallest_scenes(learnt, structure, artifact.machine.spec.C)}
+    update |= {"room_fit": room_limits(artifact, learnt)}
     return calibration.model_copy(update=update)
 
 
@@ -111,7 +114,7 @@ def popularity(train: SceneTensors) -> Floats:
 
 
 def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
-    """Classes that 95 % of the scenes of each room type have at least, and of all scenes, (C + 1,).
+    """Classes that 90 % of the scenes of each room type have at least, and of all scenes, (C + 1,).
 
     A type of fewer than 20 scenes takes the entry of all.
     """
@@ -120,6 +123,18 @@ def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple
     of = [sizes[train.room.numpy() == t] for t in range(rooms)]
     found = [int(np.quantile(n, _SMALL)) if len(n) >= _ROOM_SCENES else every for n in of]
     return (*found, every)
+
+
+def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
+    """What 85 % of the scenes of each room type exceed of `room_fit`, (C,); -1e9 for few scenes."""
+    found = []
+    for t in range(artifact.machine.spec.C):
+        own = train.v[train.room == t].numpy()
+        limit = -1e9
+        if len(own) >= _ROOM_SCENES:
+            limit = float(np.quantile(room_fit(artifact.machine, own, t), _UNSUITED))
+        found.append(round(limit, 4))
+    return tuple(found)
 
 
 # ------------------------------------------------------------------------------ unlisted classes
@@ -240,7 +255,11 @@ def fit_placed(artifact: Artifact, validation: SceneTensors, seed: int = 0) -> P
         absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
         z = given.absent_posterior(absent, artifact.calibration.coverage).astype(np.float64)
         row = int(given.present.row[anchor])
-        log_p = given.placed_log_p(absent, relation, row, outgoing=True).astype(np.float64)
+        log_p = placement_log_p(
+            artifact.relation_slopes.placement[relation],
+            given.placed_log_p(absent, relation, row, outgoing=True).astype(np.float64),
+            *(float(given.present.log_counts[row]), len(given.present.classes) + 1),
+        )
         first = np.argsort(-(z + log_p), kind="stable")[:_LISTED]
         size = np.log(max(1, int(np.count_nonzero(~structure[given.present.classes]))))
         truth = absent[first] == target

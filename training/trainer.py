@@ -30,6 +30,7 @@ from training.objectives import OBJECTIVES, CompositeLikelihood, Objective, Rela
 from training.objectives.relations import bake_word_prior
 from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples
 from training.polish import polish
+from training.residuals import with_counted_residuals
 
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
@@ -282,6 +283,12 @@ class Trainer:
             for name, value in self.best.items():
                 parameters[name].copy_(value)
         bake_word_prior(self.machine)
+        machine = self.machine
+        if isinstance(self.objective, RelationLikelihood):
+            known = self.objective
+            machine = with_counted_residuals(
+                machine, self.train, known.offsets.detach(), known.source_weights
+            )
         if not self.config.objects.epochs:
             polish(
                 self.machine,
@@ -290,7 +297,7 @@ class Trainer:
                 self.config.objective.room_dropout,
                 self.config.training.seed,
             )
-        return TrainingResult(self.machine, self.epochs, self.best_epoch, self.seconds, True)
+        return TrainingResult(machine, self.epochs, self.best_epoch, self.seconds, True)
 
     @property
     def _digest(self) -> str:

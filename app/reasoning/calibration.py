@@ -63,6 +63,24 @@ def missing_logits(calibration: Calibration, log_odds: Floats, listed: int) -> F
     return entry.intercept + entry.log_count * math.log(listed) + entry.slope * log_odds
 
 
+def placement_log_p(
+    slope: NDArray[np.float64], log_p: Floats, log_count: float, classes: int
+) -> Floats:
+    """log p(relation | both are there), calibrated as placements are, from that of the machine.
+
+    Args:
+        slope: (4,), the relation's row of `RelationSlopes.placement`.
+        log_p: of the class-level unit.
+        log_count: of the anchor's instances.
+        classes: how many distinct ones there are with the candidate.
+    """
+    intercept, gain, weight, size = slope
+    odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
+    logits = intercept + gain * odds + weight * log_count + size * math.log(classes)
+    found: Floats = -np.logaddexp(0.0, -logits)
+    return found
+
+
 def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
     """The same of "and stands there", log_p of the relation that says where."""
     entry = calibration.placed

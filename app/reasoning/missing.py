@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.reasoning.answers import Because, MissingAnswer, Placement, entries
-from app.reasoning.calibration import missing_logits, placed_logits
+from app.reasoning.calibration import missing_logits, placed_logits, placement_log_p
 from app.reasoning.listing import absent_things, likeliest_classes
 from app.reasoning.placements import placements
 from app.reasoning.posterior import Posterior, posterior
@@ -73,7 +73,11 @@ def missing(
     else:
         relation, anchor, outgoing = place
         row = int(given.present.row[anchor])
-        log_p = given.placed_log_p(absent, relation, row, outgoing=outgoing)
+        log_p = placement_log_p(
+            artifact.relation_slopes.placement[relation],
+            given.placed_log_p(absent, relation, row, outgoing=outgoing),
+            *(float(given.present.log_counts[row]), len(given.present.classes) + 1),
+        )
         logits = placed_logits(calibration, log_odds, log_p, listed)
     where, probabilities = likeliest_classes(logits, chosen, top_k)
     found = absent[where]

@@ -3,9 +3,9 @@
 A chain now and then ends between two kinds of rooms: almost empty, or with a thing that belongs to
 neither. A drawn scene is drawn again where
 
-- it has fewer classes than one in twenty real rooms of its type has (`Calibration.smallest`), or
-- one of its classes raises an alarm of `/outliers` at low sensitivity, as one in fifty real scenes
-  of the hardest source does.
+- it has fewer classes than nine in ten real rooms of its type (`Calibration.smallest`),
+- it suits its room type less than 85 % of the real rooms of that type (`Calibration.room_fit`), or
+- one of its classes raises an alarm of `/outliers` at the default sensitivity.
 
 What a request gives is never a reason. The last of `ATTEMPTS` draws stands whatever it is.
 """
@@ -15,6 +15,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from app.boltzmann import BoltzmannMachine
 from app.reasoning.outliers import outliers
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene, SceneObject
@@ -46,9 +50,34 @@ class Plausible:
             return False
         index = self._artifact.vocabulary.index
         objects = tuple([SceneObject(label, label, index(label)) for label in labels])
+        if not self._suits_room([thing.class_index for thing in objects]):
+            return False
         judged = Scene(objects, room_type=self._room)
-        found = outliers(self._artifact, judged, sensitivity="low", details=False).outliers
+        found = outliers(self._artifact, judged, sensitivity="medium", details=False).outliers
         return not any(
             entry.is_outlier and objects[entry.object].class_index not in self._given
             for entry in found
         )
+
+    def _suits_room(self, classes: list[int | None]) -> bool:
+        limits = self._artifact.calibration.room_fit
+        if self._room is None or not limits:
+            return True
+        v = np.zeros((1, self._artifact.machine.spec.V), dtype=np.float32)
+        v[0, classes] = 1.0
+        return bool(room_fit(self._artifact.machine, v, self._room)[0] >= limits[self._room])
+
+
+def room_fit(machine: BoltzmannMachine, v: NDArray[np.float32], room: int) -> NDArray[np.float64]:
+    """log p(v | room type) / p(v), up to a constant of the room type, (B,), for presence (B, V).
+
+    sum_k [softplus(x_k + Q_tk) - softplus(x_k)],   x = c1 + v'W
+
+    A second layer is left out.
+    """
+    W, c1, Q = (getattr(machine, name).detach().numpy() for name in ("W", "c1", "Q"))
+    x = c1 + v @ W
+    found: NDArray[np.float64] = np.sum(
+        np.logaddexp(0.0, x + Q[room]) - np.logaddexp(0.0, x), axis=1, dtype=np.float64
+    )
+    return found

@@ -118,8 +118,10 @@ class Calibration(Frozen):
         popularity_weight: alpha of the prior of an intruder, proportional to popularity^alpha.
         outlier_thresholds: probabilities from which an object is an outlier.
         misplaced_thresholds: probabilities from which a relation is misplaced.
-        smallest: (C + 1,) classes that all but one in twenty real rooms of each type have at least,
+        smallest: (C + 1,) classes that nine in ten real rooms of each type have at least,
             and last of all rooms together; empty: any number.
+        room_fit: (C,) what 85 % of the real rooms of each type have at least of
+            log p(v | room type) / p(v), up to a constant; empty: any value.
         missing_temperature: divides the log-odds before the softmax over absent classes.
         placed_temperature: the same where the question names a place.
         placed_relation_weight: weight of the relation's log-odds in that question.
@@ -141,6 +143,7 @@ class Calibration(Frozen):
     outlier_thresholds: Thresholds = Thresholds()
     misplaced_thresholds: Thresholds = Thresholds()
     smallest: tuple[Count, ...] = ()
+    room_fit: tuple[float, ...] = ()
     missing_temperature: Annotated[float, Field(gt=0)] = 1.0
     placed_temperature: Annotated[float, Field(gt=0)] = 1.0
     placed_relation_weight: float = 1.0

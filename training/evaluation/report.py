@@ -61,7 +61,7 @@ _PUBLISHED: dict[str, tuple[str, ...]] = {
     "Everyday": LINES,
 }
 # As in the benchmark: scenes a source where a task is slow.
-_PUBLISHED_LIMIT = 300
+_PUBLISHED_LIMIT = 200
 
 Progress = Callable[[str], None]
 
