@@ -42,12 +42,12 @@ ROOMS = ("bedroom", "office")
 def calibration(relations: int, **changes: object) -> Calibration:
     """Changes nothing but the signs: unlikely objects are intruders, unlikely relations false.
 
-    At low sensitivity nothing is, so that every drawn scene stands.
+    Nothing raises an alarm, so that every drawn scene stands.
     """
     neutral = {
         "relation": (PairSlope(),) * relations,
         "outlier": CountSlope(slope=-1.0),
-        "outlier_thresholds": Thresholds(low=1.0),
+        "outlier_thresholds": Thresholds(low=1.0, medium=1.0, high=1.0),
         "misplaced": Slope(slope=-1.0),
     }
     return Calibration(**(neutral | changes))
