@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.reasoning.calibration import placement_log_p
+from app.reasoning.placements import place_log_p
 from app.reasoning.plausible import room_fit
 from app.reasoning.posterior import posterior
 from app.registry import Artifact, Calibration, CountSlope, EvidenceWeights, PlacedSlope, Thresholds
@@ -65,9 +65,15 @@ _LISTED = 10
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Scenes with complete object lists; of near-duplicates as many as their weight says."""
+    """Scenes with complete object lists, or all where there are none.
+
+    Of near-duplicates as many as their weight says.
+    """
     rng = np.random.default_rng(seed)
-    kept = scenes.complete.numpy() & (rng.random(len(scenes)) < scenes.weight.numpy())
+    complete = scenes.complete.numpy()
+    # A model of photographs alone has no others to be calibrated on.
+    complete = complete if complete.any() else ~complete
+    kept = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
     return subset(scenes, torch.from_numpy(np.flatnonzero(kept)))
 
 
@@ -88,12 +94,15 @@ def calibrate_objects(
     scenes = complete_scenes(validation, seed)
     if not len(scenes):
         return artifact.calibration
-    every = subset(validation, validation.complete.nonzero().squeeze(1))
+    every = validation.complete if bool(validation.complete.any()) else ~validation.complete
+    every_scene = subset(validation, every.nonzero().squeeze(1))
     learnt = complete_scenes(train, seed)
     calibration = artifact.calibration.model_copy(
         update={"popularity": tuple(np.round(popularity(train), 4).tolist())}
     )
-    calibration = calibration.model_copy(update=fit_coverage(artifact, every, structure, seed))
+    calibration = calibration.model_copy(
+        update=fit_coverage(artifact, every_scene, structure, seed)
+    )
     artifact = replace(artifact, calibration=calibration)
     weights = fit_evidence(artifact, validation, structure, seed)
     calibration = calibration.model_copy(update={"evidence": weights})
@@ -106,7 +115,7 @@ def calibrate_objects(
 
 def popularity(train: SceneTensors) -> Floats:
     """Log-odds of finding each class in a complete training scene, (V,); 1/2 smooths both sides."""
-    weight = train.weight * train.complete
+    weight = train.weight * (train.complete if bool(train.complete.any()) else 1.0)
     count = (train.v * weight.unsqueeze(1)).sum(0).double().numpy()
     total = float(weight.sum())
     found: Floats = np.log((count + 0.5) / (total - count + 0.5))
@@ -255,11 +264,7 @@ def fit_placed(artifact: Artifact, validation: SceneTensors, seed: int = 0) -> P
         absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
         z = given.absent_posterior(absent, artifact.calibration.coverage).astype(np.float64)
         row = int(given.present.row[anchor])
-        log_p = placement_log_p(
-            artifact.relation_slopes.placement[relation],
-            given.placed_log_p(absent, relation, row, outgoing=True).astype(np.float64),
-            *(float(given.present.log_counts[row]), len(given.present.classes) + 1),
-        )
+        log_p = place_log_p(artifact, given, absent, relation, row, outgoing=True)
         first = np.argsort(-(z + log_p), kind="stable")[:_LISTED]
         size = np.log(max(1, int(np.count_nonzero(~structure[given.present.classes]))))
         truth = absent[first] == target

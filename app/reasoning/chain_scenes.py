@@ -54,7 +54,7 @@ def chain_scenes(
         for attempt in range(ATTEMPTS):
             drawn = conditioned.draw(steps, stream)
             found = _scene(artifact, conditioned, drawn, shown[drawn.classes], given)
-            if attempt + 1 == ATTEMPTS or plausible(found.objects) or stop():
+            if plausible(found.objects) or stop() or attempt == ATTEMPTS - 1:
                 scenes.append(found)
                 break
     return tuple(scenes)

@@ -50,7 +50,8 @@ class Plausible:
             return False
         index = self._artifact.vocabulary.index
         objects = tuple([SceneObject(label, label, index(label)) for label in labels])
-        if not self._suits_room([thing.class_index for thing in objects]):
+        classes = [thing.class_index for thing in objects if thing.class_index is not None]
+        if not self._suits_room(classes):
             return False
         judged = Scene(objects, room_type=self._room)
         found = outliers(self._artifact, judged, sensitivity="medium", details=False).outliers
@@ -59,7 +60,7 @@ class Plausible:
             for entry in found
         )
 
-    def _suits_room(self, classes: list[int | None]) -> bool:
+    def _suits_room(self, classes: list[int]) -> bool:
         limits = self._artifact.calibration.room_fit
         if self._room is None or not limits:
             return True
