@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.reasoning.calibration import placement_log_p
+from app.reasoning.placements import place_log_p
 from app.reasoning.plausible import room_fit
 from app.reasoning.posterior import posterior
 from app.registry import Artifact, Calibration, CountSlope, EvidenceWeights, PlacedSlope, Thresholds
@@ -264,11 +264,7 @@ def fit_placed(artifact: Artifact, validation: SceneTensors, seed: int = 0) -> P
         absent = np.setdiff1d(np.flatnonzero(~structure), given.present.classes)
         z = given.absent_posterior(absent, artifact.calibration.coverage).astype(np.float64)
         row = int(given.present.row[anchor])
-        log_p = placement_log_p(
-            artifact.relation_slopes.placement[relation],
-            given.placed_log_p(absent, relation, row, outgoing=True).astype(np.float64),
-            *(float(given.present.log_counts[row]), len(given.present.classes) + 1),
-        )
+        log_p = place_log_p(artifact, given, absent, relation, row, outgoing=True)
         first = np.argsort(-(z + log_p), kind="stable")[:_LISTED]
         size = np.log(max(1, int(np.count_nonzero(~structure[given.present.classes]))))
         truth = absent[first] == target

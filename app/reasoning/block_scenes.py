@@ -10,7 +10,7 @@ from torch import Tensor
 
 from app.boltzmann.gibbs import State
 from app.reasoning.answers import GeneratedScene
-from app.reasoning.chains import CHAINS, clamped, held_units, run_block
+from app.reasoning.chains import clamped, held_units, run_block
 from app.reasoning.evidence import observe
 from app.reasoning.exclusion import Triple, staying
 from app.reasoning.log_score import log_score
@@ -52,7 +52,7 @@ def block_scenes(
             found = [
                 old if fits else new
                 for old, new, fits in zip(
-                    found or again, again, fitting or [False] * CHAINS, strict=True
+                    found or again, again, fitting or [False] * len(again), strict=True
                 )
             ]
             fitting = [plausible(one.objects) for one in found]

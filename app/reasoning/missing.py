@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.reasoning.answers import Because, MissingAnswer, Placement, entries
-from app.reasoning.calibration import missing_logits, placed_logits, placement_log_p
+from app.reasoning.calibration import missing_logits, placed_logits
 from app.reasoning.listing import absent_things, likeliest_classes
-from app.reasoning.placements import placements
+from app.reasoning.placements import place_log_p, placements
 from app.reasoning.posterior import Posterior, posterior
 from app.reasoning.reasons import EXPLAINED, strongest_reasons
 from app.registry.artifact import Artifact
@@ -73,11 +73,7 @@ def missing(
     else:
         relation, anchor, outgoing = place
         row = int(given.present.row[anchor])
-        log_p = placement_log_p(
-            artifact.relation_slopes.placement[relation],
-            given.placed_log_p(absent, relation, row, outgoing=outgoing),
-            *(float(given.present.log_counts[row]), len(given.present.classes) + 1),
-        )
+        log_p = place_log_p(artifact, given, absent, relation, row, outgoing=outgoing)
         logits = placed_logits(calibration, log_odds, log_p, listed)
     where, probabilities = likeliest_classes(logits, chosen, top_k)
     found = absent[where]

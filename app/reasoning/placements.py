@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.reasoning.answers import Offset, Placement, entries
+from app.reasoning.calibration import placement_log_p
 from app.reasoning.listing import likeliest_places
 from app.reasoning.offsets import offsets_of
 from app.reasoning.posterior import Posterior
@@ -19,6 +21,29 @@ PLACES = 3
 """How many placements an answer lists."""
 
 _SEEN_FROM_ANCHORS = tuple(map(opposite, RELATIONS))
+
+
+def place_log_p(
+    artifact: Artifact,
+    given: Posterior,
+    candidates: NDArray[np.int64],
+    relation: int,
+    anchor: int,
+    *,
+    outgoing: bool,
+) -> NDArray[np.floating[Any]]:
+    """Calibrated log p(the candidate stands so to the anchor | it is there), (N,).
+
+    Args:
+        candidates: (N,) absent classes.
+        relation: canonical; from the candidate to the anchor if `outgoing`, else back.
+        anchor: place in the classes that are present.
+    """
+    return placement_log_p(
+        artifact.relation_slopes.placement[relation],
+        given.placed_log_p(candidates, relation, anchor, outgoing=outgoing),
+        *(float(given.present.log_counts[anchor]), len(given.present.classes) + 1),
+    )
 
 
 def placements(

@@ -341,7 +341,7 @@ def test_the_same_scene_gets_the_same_answer(name, scene):
 def test_nothing_but_an_empty_scene(name):
     empty = scene_of([])
     assert relations(ARTIFACTS[name], empty) == ((), ())
-    assert outliers(ARTIFACTS[name], empty) == (0.5, (), ())
+    assert outliers(ARTIFACTS[name], empty) == (1.0, (), ())
     answers = missing(ARTIFACTS[name], empty, top_k=len(LABELS))
     assert len(answers) == len(LABELS) - len(STRUCTURE)
     assert all(answer.placements == () for answer in answers)

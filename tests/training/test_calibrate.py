@@ -178,7 +178,7 @@ def fitted(model):
 
 def test_every_entry_of_objects_is_fitted(fitted):
     neutral = Calibration.neutral(4)
-    for name in ("missing", "placed", "outlier", "outlier_thresholds", "popularity"):
+    for name in ("missing", "outlier", "outlier_thresholds", "popularity"):
         assert getattr(fitted, name) != getattr(neutral, name), name
     assert fitted.popularity_weight in ALPHAS
     assert fitted.coverage in COVERAGES
@@ -187,7 +187,6 @@ def test_every_entry_of_objects_is_fitted(fitted):
     assert fitted.evidence.poses_on_objects in PULLS
     # The likelier a class, the likelier it is missing; the likelier, the less an intruder.
     assert fitted.missing.slope > 0
-    assert fitted.placed.slope > 0
     assert fitted.outlier.slope < 0
     assert fitted.relation == neutral.relation
 
@@ -280,6 +279,8 @@ def test_everything_is_calibrated_at_once(model):
     neutral = Calibration.neutral(4)
     assert len(found.relation) == len(found.relation_given) == len(found.placement) == 4
     assert found.relation != neutral.relation
+    assert found.placed.slope > 0
+    assert found.placed.log_relation > 0
     limits = found.misplaced_thresholds
     assert 1 >= limits.low >= limits.medium >= limits.high >= 0
     # Unlikely relations are false.

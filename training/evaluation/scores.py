@@ -18,6 +18,7 @@ from app.boltzmann import BoltzmannMachine
 from app.boltzmann.closed_form import ClosedForm, Given
 from app.boltzmann.scoring import ContextScorer
 from app.reasoning.calibration import placed_logits
+from app.reasoning.placements import place_log_p
 from app.reasoning.posterior import posterior
 from app.registry import Artifact
 from training.batches import Batch
@@ -116,9 +117,8 @@ def served_placed_score(artifact: Artifact) -> PlacedScore:
             given = posterior(artifact, of_classes(np.repeat(classes, counts).tolist()))
             absent = np.flatnonzero((v == 0) & ~structure)
             z = given.absent_posterior(absent, calibration.coverage)
-            log_p = given.placed_log_p(
-                absent,
-                int(places.relation[row]),
+            log_p = place_log_p(
+                *(artifact, given, absent, int(places.relation[row])),
                 int(np.searchsorted(classes, int(places.anchor[row]))),
                 outgoing=bool(places.outgoing[row]),
             )

@@ -9,6 +9,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.benchmark import (
     BenchmarkError,
     Entry,
@@ -446,10 +447,7 @@ def test_interrupting_keeps_what_is_finished(tmp_path):
 
 
 def _plan(folder, material="these scenes"):
-    class Nothing:
-        scenes = ()
-
-    settings = {"none": Setting(scenes=Nothing(), structure=None)}
+    settings = {"none": Setting(tensors([scene([0], name="one")]), NO_STRUCTURE)}
     return Plan(folder, Material(None, None, material), settings, ["T2 missing"])
 
 

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.benchmark import Entry, Material, Plan
 from training.benchmark.measure import place_of
 from training.benchmark.workers import fill
 from training.evaluation.contenders import Contender
 from training.evaluation.tasks import Setting
-
-
-class Nothing:
-    """No scenes."""
-
-    scenes = ()
 
 
 def answers(*_):
@@ -26,7 +21,7 @@ def diverges(*_):
 
 
 def plan(folder):
-    settings = {"none": Setting(scenes=Nothing(), structure=None)}
+    settings = {"none": Setting(tensors([scene([0], name="one")]), NO_STRUCTURE)}
     return Plan(folder, Material(None, None, "these scenes"), settings, ["T2 missing"])
 
 

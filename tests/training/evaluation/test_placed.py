@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from app.reasoning import missing
-from app.registry import PlacedSlope
+from app.registry import PairSlope, PlacedSlope
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.reasoning.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import (
@@ -130,7 +130,8 @@ PLACED = PlacedSlope(intercept=-0.3, slope=0.8, log_count=0.4, log_relation=0.6)
 @pytest.mark.parametrize("outgoing", [True, False])
 @pytest.mark.parametrize("name", LARGER)
 def test_the_score_of_a_published_model_is_the_service_s(name, outgoing):
-    artifact = artifact_of(larger_machine(name), placed=PLACED, coverage=0.7)
+    slopes = (PairSlope(intercept=0.2, slope=0.7, log_count=0.3, log_classes=-0.4),) * 4
+    artifact = artifact_of(larger_machine(name), placed=PLACED, placement=slopes, coverage=0.7)
     answers = answers_of(artifact, outgoing)
     values = served_placed_score(artifact)(asked_of(artifact.machine, outgoing))[0]
     for answer in answers:
