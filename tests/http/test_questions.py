@@ -192,7 +192,7 @@ async def test_missing_objects_are_absent_ones_and_no_structure(client: httpx.As
     labels = [entry["label"] for entry in found]
     assert set(labels).isdisjoint({"bed", "chair", "lamp", "floor", "object"})
     assert len(set(labels)) == len(labels) == len(VOCABULARY) - 5
-    assert sum(entry["probability"] for entry in found) == pytest.approx(1, abs=1e-6)
+    assert all(0 <= entry["probability"] <= 1 for entry in found)
 
 
 async def test_placements_name_objects_of_the_scene(client: httpx.AsyncClient) -> None:
