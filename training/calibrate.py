@@ -1,14 +1,15 @@
 """From log-odds to the probabilities the service promises, fitted on validation scenes.
 
-    missing, placed, outlier   see `training.calibrate_objects`
+    missing, outlier   see `training.calibrate_objects`
     relation   the relation holds between this pair of instances; fitted apart for scenes of which
                no relation is told, and for those of which half of the pairs are told
     placement  the same for a pair of which one was taken away
     misplaced  the relation is false, where one triple in half of the scenes was altered
 
 All are logistic regressions (Platt scaling) on what each source says holds or does not hold; what
-it leaves unsaid is left out. Sources count by the root of how much they say: one procedural source
-says more than all others together.
+it leaves unsaid is left out. Which relation is likelier is decided with sources weighted by the
+root of how much they say, since one procedural source says more than all others together; how
+likely relations are on the whole, with every example alike.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
@@ -30,7 +31,7 @@ from app.reasoning.units import NO_UNIT
 from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
 from app.scene import CANONICAL
 from training.batches import SceneTensors
-from training.calibrate_objects import ALARMS, calibrate_objects, fit_placed
+from training.calibrate_objects import ALARMS, calibrate_objects
 from training.cases import (
     Triple,
     altered_case,
@@ -41,6 +42,7 @@ from training.cases import (
     told_pairs,
 )
 from training.datasets import EncodedScene
+from training.evaluation.alarms import kept_in_each_source
 from training.trainer import subset
 
 _SCENES = 2500
@@ -52,7 +54,6 @@ _ROUNDS = 3
 _RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 5, 6
 # Cases a scene: of one, chance alone would decide.
 _PLACEMENT_CASES = 4
-_MISPLACED_SCENES = 600
 
 
 def calibrate(
@@ -81,9 +82,7 @@ def calibrate(
             "relation_given": fit_relations(artifact, related, np.random.default_rng(seed)),
         }
     )
-    artifact = replace(artifact, calibration=calibration)
-    calibration = calibration.model_copy(update={"placed": fit_placed(artifact, scenes, seed)})
-    entry, limits = fit_misplaced(artifact, related[:_MISPLACED_SCENES], seed)
+    entry, limits = fit_misplaced(artifact, related, seed)
     return calibration.model_copy(update={"misplaced": entry, "misplaced_thresholds": limits})
 
 
@@ -161,7 +160,37 @@ def _fit_listed(
         best = _among_best(examples, slopes, listed)
         weight = _source_weights(examples, best) * np.where(best, 1.0, _OF_THE_REST)
         slopes = _fit_each(examples, relations, weight)
-    return slopes
+    return _as_often_as_it_holds(examples, slopes, listed)
+
+
+def _as_often_as_it_holds(
+    examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
+) -> tuple[PairSlope, ...]:
+    """One line over the logits of all relations, fitted to what is listed, every example alike.
+
+    It makes probabilities right on average over all sources and leaves the order of relations,
+    which the sources decide alike.
+    """
+    best = _among_best(examples, slopes, listed)
+    truth = examples[best, _TRUTH] > 0
+    if len(np.unique(truth)) < 2:
+        return slopes
+    slope, intercept = logistic(_logits(examples[best], slopes)[:, None], truth)
+    return tuple(
+        PairSlope(
+            intercept=intercept + slope * one.intercept,
+            slope=slope * one.slope,
+            log_count=slope * one.log_count,
+        )
+        for one in slopes
+    )
+
+
+def _logits(examples: NDArray[np.float64], slopes: tuple[PairSlope, ...]) -> NDArray[np.float64]:
+    table = np.array([(s.slope, s.log_count, s.log_classes, s.intercept) for s in slopes])
+    weights = table[examples[:, _RELATION].astype(np.int64)]
+    found: NDArray[np.float64] = (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1)
+    return found + weights[:, 3]
 
 
 def _source_weights(examples: NDArray[np.float64], best: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -178,9 +207,7 @@ def _among_best(
     examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
 ) -> NDArray[np.bool_]:
     """Which of the examples are among the best so many of their scene."""
-    table = np.array([(s.slope, s.log_count, s.log_classes, s.intercept) for s in slopes])
-    weights = table[examples[:, _RELATION].astype(np.int64)]
-    logits = (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1) + weights[:, 3]
+    logits = _logits(examples, slopes)
     order = np.lexsort((-logits, examples[:, 0]))
     scene = examples[order, 0]
     rank = np.arange(len(order)) - np.searchsorted(scene, scene)
@@ -241,12 +268,13 @@ def fit_misplaced(
 ) -> tuple[Slope, Thresholds]:
     """Logistic regression of "this relation is false" on its log-odds given the rest.
 
-    And the probabilities that the least likely relation of an unaltered scene exceeds in as many
-    scenes as objects raise alarms.
+    And the probabilities that the least likely relation of an unaltered scene reaches in as many
+    scenes of the hardest source as objects raise alarms.
     """
     rng = np.random.default_rng(seed)
     rows: list[tuple[float, bool]] = []
     worst: list[float] = []
+    untouched: list[EncodedScene] = []
     for encoded in scenes:
         case = altered_case(encoded, artifact.vocabulary.structure, rng)
         if case is None:
@@ -259,14 +287,16 @@ def fit_misplaced(
             logits.append(float(np.log(p / (1 - p))))
             rows.append((logits[-1], triple == false))
         if false is None:
+            untouched.append(encoded)
             worst.append(max(logits))
     examples = np.array(rows)
     if len(examples) < 20 or len(np.unique(examples[:, 1])) < 2 or not worst:
         return Slope(), Thresholds()
     slope, intercept = logistic(examples[:, :1], examples[:, 1] > 0)
-    found = intercept + slope * np.array(worst)
+    group = np.array([encoded.group for encoded in untouched])
+    _, source = np.unique([encoded.source for encoded in untouched], return_inverse=True)
+    p = 1 / (1 + np.exp(-intercept - slope * np.array(worst)))
     limits = {
-        name: float(1 / (1 + np.exp(-np.quantile(found, 1 - share))))
-        for name, share in ALARMS.items()
+        name: kept_in_each_source(p, group, source, rng, share) for name, share in ALARMS.items()
     }
     return Slope(intercept=intercept, slope=slope), Thresholds(**limits)

@@ -15,6 +15,8 @@ from training.datasets.meanings import meaning_of
 
 Triple: TypeAlias = tuple[int, int, int]
 
+_VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
+
 
 def scene_of(
     encoded: EncodedScene,
@@ -34,16 +36,19 @@ def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
     """(A, N, N) which relations of instances are known, on or off, without choice.
 
     A source that lists left and front here and there, and never says that they do not hold, tells
-    nothing of how often they do: these are left out.
+    nothing of how often they do: of these only pairs that stand one on or above another are kept,
+    since left and front are off there unless listed.
     """
     unlisted = meaning_of(encoded.source).unlisted
-    known = encoded.instance_observed.copy()
+    known, holds = encoded.instance_observed.copy(), encoded.instance_holds
+    stacked = holds[_VERTICAL].any(0)
+    stacked |= stacked.T
     for a in range(min(len(known), len(unlisted))):
-        off = known[a] & ~encoded.instance_holds[a]
+        off = known[a] & ~holds[a]
         # Where there are no poses, neighbours are the pairs that an annotator chose to relate.
         chosen = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
-        if chosen or (unlisted[a] == "unobserved" and not off.any()):
-            known[a] = False
+        if chosen or (unlisted[a] == "unobserved" and not (off & ~stacked).any()):
+            known[a] &= stacked & off.any()
     return known
 
 
@@ -75,28 +80,30 @@ def told_pairs(
     return ~told, [(int(a), int(x), int(y)) for a, x, y in triples]
 
 
-def placed_case(
-    encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[Scene, int, int, int] | None:
-    """A scene with one class taken out that stood in a relation to something that stayed.
+def occupied_place(
+    encoded: EncodedScene,
+    structure: NDArray[np.bool_],
+    shown: NDArray[np.bool_],
+    rng: np.random.Generator,
+) -> tuple[int, int] | None:
+    """A place beside an object that is shown, drawn from those where anything stands.
+
+    Whether that is shown too plays no part in the choice: had only places of hidden objects been
+    drawn, every place would be more likely to miss one.
+
+    Args:
+        shown: (n,) instances.
 
     Returns:
-        The scene, the canonical relation, the position of its object, and the class taken out.
+        The canonical relation, and the instance that is its object.
     """
-    evidence = encoded.evidence
-    usable = ~structure[evidence.classes]
-    pairs = evidence.holds & usable[:, None] & usable[None, :]
-    pairs &= ~np.eye(len(usable), dtype=np.bool_)
-    found = np.argwhere(pairs)
-    if usable.sum() < 3 or not len(found):
+    usable = ~structure[encoded.instance_classes]
+    stands = encoded.instance_holds & known_relations(encoded) & usable[:, None] & (usable & shown)
+    places = np.argwhere(stands.any(1))
+    if not len(places):
         return None
-    a, x, y = found[rng.integers(len(found))]
-    kept = [k for k, c in enumerate(encoded.instance_classes) if c != evidence.classes[x]]
-    scene = scene_of(encoded, kept, triples=())
-    anchor = next(
-        p for p, k in enumerate(kept) if encoded.instance_classes[k] == evidence.classes[y]
-    )
-    return scene, int(a), anchor, int(evidence.classes[x])
+    relation, anchor = places[rng.integers(len(places))]
+    return int(relation), int(anchor)
 
 
 def altered_case(

@@ -6,8 +6,8 @@ scenes speak of gets a weight of its own: the maximum of
 
     sum over scenes of log p(r_e | v, E[h1 | v], w_e' + δ_e) - τ/2 δ_e²
 
-by Newton's method, all other weights as they are. The fewer scenes speak of a triple, the nearer
-its δ stays to 0.
+by Newton's method, all other weights as they are and the context seeing a random share of the
+objects, as in training. The fewer scenes speak of a triple, the nearer its δ stays to 0.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from torch import Tensor
 from app.boltzmann import BoltzmannMachine, Triway, build
 from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import SceneTensors, relation_units
+from training.objectives.relations import partly_shown
 
 # τ: so many scenes at even odds would weigh four times as much.
 _PRECISION = 1.0
@@ -66,10 +67,11 @@ def _known_units(
     """Keys (U,), logits, values and weights of all known units."""
     columns: list[list[Tensor]] = [[], [], [], []]
     V = machine.spec.V
+    generator = torch.Generator().manual_seed(0)
     for index in torch.arange(len(train)).split(_BATCH):
         batch = train.batch(index)
         edges, r, observed = relation_units(machine, batch)
-        h1 = mean_field(machine, Evidence(batch.v)).y.sigmoid()
+        h1 = mean_field(machine, Evidence(partly_shown(batch.v, generator))).y.sigmoid()
         logits = machine.relation_logits(edges, batch.v, h1)
         logits = logits + offsets[batch.source].gather(1, edges.relation)
         known = (observed * machine.gate(edges, batch.v)) > 0

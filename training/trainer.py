@@ -284,7 +284,10 @@ class Trainer:
                 parameters[name].copy_(value)
         bake_word_prior(self.machine)
         machine = self.machine
-        if isinstance(self.objective, RelationLikelihood):
+        if (
+            isinstance(self.objective, RelationLikelihood)
+            and "residual" not in self.config.machine.without
+        ):
             known = self.objective
             machine = with_counted_residuals(
                 machine, self.train, known.offsets.detach(), known.source_weights

@@ -82,10 +82,14 @@ def placement_log_p(
 
 
 def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
-    """The same of "and stands there", log_p of the relation that says where."""
-    entry = calibration.placed
-    constant = entry.intercept + entry.log_count * math.log(listed)
-    return constant + entry.slope * log_odds + entry.log_relation * log_p
+    """Logits of p(there unlisted) · p(stands so | there).
+
+    Args:
+        log_p: log of the second factor, calibrated.
+    """
+    both = log_p - np.logaddexp(0.0, -missing_logits(calibration, log_odds, listed))
+    found: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
+    return found
 
 
 def intruder_line(calibration: Calibration, classes: int) -> tuple[float, float]:

@@ -56,12 +56,6 @@ class CountSlope(Frozen):
     log_count: float = 0.0
 
 
-class PlacedSlope(CountSlope):
-    """The same for a class at a place: + log_relation·log p(relation | both are there)."""
-
-    log_relation: float = 1.0
-
-
 class PairSlope(CountSlope):
     """The same for a relation between two objects, and + log_classes·log of the scene's classes.
 
@@ -77,6 +71,12 @@ class Slope(Frozen):
 
     intercept: float = 0.0
     slope: float = 1.0
+
+
+_RETIRED = frozenset(
+    {"placed", "missing_temperature", "placed_temperature", "placed_relation_weight"}
+    | {"outlier_threshold"}
+)
 
 
 class Thresholds(Frozen):
@@ -112,7 +112,6 @@ class Calibration(Frozen):
             with unlisted classes absent; chosen on validation.
         missing: posterior log-odds of an unlisted class to the calibrated ones; n counts the listed
             classes.
-        placed: the same for an unlisted class that stands at a given place.
         evidence: see `EvidenceWeights`.
         popularity: (V,) log-odds of finding each class in a training scene; empty: all alike.
         popularity_weight: alpha of the prior of an intruder, proportional to popularity^alpha.
@@ -122,11 +121,7 @@ class Calibration(Frozen):
             and last of all rooms together; empty: any number.
         room_fit: (C,) what 85 % of the real rooms of each type have at least of
             log p(v | room type) / p(v), up to a constant; empty: any value.
-        missing_temperature: divides the log-odds before the softmax over absent classes.
-        placed_temperature: the same where the question names a place.
-        placed_relation_weight: weight of the relation's log-odds in that question.
         outlier: presence log-odds to the log-odds of being an intruder.
-        outlier_threshold: probability from which an object is called an outlier.
         relation: one entry a canonical relation.
         relation_given: the same where some relations of the scene are given; `relation` if empty.
         placement: the same for a missing object and one that is there; `relation` if empty.
@@ -136,7 +131,6 @@ class Calibration(Frozen):
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
     coverage_weight: Annotated[float, Field(ge=0, le=1)] = 0.5
     missing: CountSlope = CountSlope()
-    placed: PlacedSlope = PlacedSlope()
     evidence: EvidenceWeights = EvidenceWeights()
     popularity: tuple[float, ...] = ()
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -144,15 +138,19 @@ class Calibration(Frozen):
     misplaced_thresholds: Thresholds = Thresholds()
     smallest: tuple[Count, ...] = ()
     room_fit: tuple[float, ...] = ()
-    missing_temperature: Annotated[float, Field(gt=0)] = 1.0
-    placed_temperature: Annotated[float, Field(gt=0)] = 1.0
-    placed_relation_weight: float = 1.0
     outlier: CountSlope = CountSlope()
-    outlier_threshold: Annotated[float, Field(ge=0, le=1)] = 0.5
     relation: tuple[PairSlope, ...]
     relation_given: tuple[PairSlope, ...] = ()
     placement: tuple[PairSlope, ...] = ()
     misplaced: Slope = Slope()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_retired(cls, values: Any) -> Any:
+        """Pass over what earlier releases wrote."""
+        if not isinstance(values, dict):
+            return values
+        return {name: value for name, value in values.items() if name not in _RETIRED}
 
     @classmethod
     def neutral(cls, relations: int) -> Self:

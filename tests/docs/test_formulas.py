@@ -34,7 +34,7 @@ from app.reasoning.calibration import (
 from app.reasoning.listing import likeliest_classes
 from app.reasoning.log_score import log_score
 from app.registry import Calibration
-from app.registry.description import CountSlope, PlacedSlope
+from app.registry.description import CountSlope
 from tests.conftest import REPOSITORY
 from tests.enumeration.implied import features_by_hand
 from tests.enumeration.small_machines import (
@@ -494,9 +494,7 @@ def implications() -> None:
 
 def calibration() -> Calibration:
     entry = {"intercept": -0.4, "slope": 0.7, "log_count": 0.3}
-    placed = PlacedSlope(**entry, log_relation=0.6)
-    entries = {"missing": CountSlope(**entry), "placed": placed}
-    return Calibration.neutral(2).model_copy(update=entries)
+    return Calibration.neutral(2).model_copy(update={"missing": CountSlope(**entry)})
 
 
 @formula(
@@ -543,17 +541,13 @@ def missing_objects() -> None:
     assert p == near([sigma(constant + entry.slope * odds[i]) for i in where])
 
 
-@formula(
-    r"p_i = \sigma(\alpha' + \beta' \lambda_i + \gamma' \log n"
-    r" + \omega \log p(r_e = 1 \mid v_i = 1, \text{rest}))"
-)
+@formula(r"p'_i = p_i \, p(r_e = 1 \mid v_i = 1, \text{rest})")
 def missing_at_a_place() -> None:
     found = calibration()
     odds, log_p = np.array([0.3, -1.2]), np.array([-0.5, -2.0])
-    logits, entry = placed_logits(found, odds, log_p, 7), found.placed
-    constant = entry.intercept + entry.log_count * math.log(7)
-    expected = constant + entry.slope * odds + entry.log_relation * log_p
-    assert logits == near(expected.tolist())
+    there = [sigma(x) for x in missing_logits(found, odds, 7)]
+    p = [sigma(x) for x in placed_logits(found, odds, log_p, 7)]
+    assert p == near([a * math.exp(b) for a, b in zip(there, log_p, strict=True)])
 
 
 @formula(

@@ -9,7 +9,7 @@ import pytest
 
 from app.reasoning import missing, outliers, relations
 from app.reasoning.calibration import exclusive, relation_probability
-from app.registry.description import Calibration, CountSlope, PairSlope, PlacedSlope, Slope
+from app.registry.description import Calibration, CountSlope, PairSlope, Slope
 from app.registry.slopes import RelationSlopes
 from tests.reasoning.artifacts import larger_artifact, scene_of
 
@@ -118,17 +118,18 @@ def test_missing_by_log_odds_and_listed_things(classes, listed):
 
 
 @pytest.mark.parametrize("relation", ["left", "behind"])
-def test_missing_at_a_place_by_the_relation_too(relation):
-    """To be there and stand so is at most as likely as to be there."""
-    entry = PlacedSlope(intercept=-0.2, slope=0.8, log_count=0.3, log_relation=0.7)
-    artifact, scene = larger_artifact("triway-local", placed=entry), scene_of([0, 1])
-    plain = larger_artifact("triway-local")
-    at = (relation, 1)
-    exact = {a.label: a for a in missing(plain, scene, at=at, top_k=9)}
-    for label, answer in exact.items():
-        assert answer.probability <= sigmoid(answer.log_odds), label
-    for answer in missing(artifact, scene, at=at, top_k=9):
-        p = exact[answer.label].probability
-        log_p = math.log(p / (1 - p)) - answer.log_odds
-        z = -0.2 + 0.8 * answer.log_odds + 0.3 * math.log(2) + 0.7 * log_p
-        assert answer.probability == pytest.approx(sigmoid(z), abs=1e-4)
+def test_missing_at_a_place_is_there_and_stands_so(relation):
+    """The two probabilities that the answer without a place gives, multiplied."""
+    entry = CountSlope(intercept=-0.2, slope=0.8, log_count=0.3)
+    # So low that no relation excludes its opposite.
+    slopes = (PairSlope(intercept=-3.0, slope=0.7, log_count=-0.4),) * 4
+    artifact = larger_artifact("triway-local", missing=entry, placement=slopes)
+    scene = scene_of([0, 1, 1])
+    anywhere = {a.label: a.probability for a in missing(artifact, scene, top_k=9)}
+    answers = missing(artifact, scene, at=(relation, 1), top_k=9)
+    assert {a.label for a in answers} == anywhere.keys()
+    for answer in answers:
+        place = answer.placements[0]
+        assert (place.relation, place.object) == (relation, 1)
+        expected = anywhere[answer.label] * place.probability
+        assert answer.probability == pytest.approx(expected, rel=1e-4)

@@ -19,7 +19,6 @@ from app.registry import (
     EvidenceWeights,
     Manifest,
     PairSlope,
-    PlacedSlope,
     Thresholds,
 )
 from app.registry.description import VocabularyEntry
@@ -72,9 +71,6 @@ changes = st.fixed_dictionaries(
             coverage=share,
             coverage_weight=share,
             missing=count_slopes,
-            placed=st.builds(
-                PlacedSlope, intercept=number, slope=number, log_count=number, log_relation=number
-            ),
             evidence=st.builds(
                 EvidenceWeights, **dict.fromkeys(EvidenceWeights.model_fields, share)
             ),
@@ -278,11 +274,16 @@ def test_neutral_calibration_changes_nothing() -> None:
     neutral = Calibration.neutral(4)
     assert neutral.relation == (PairSlope(intercept=0, slope=1, log_count=0, log_classes=0),) * 4
     assert neutral.missing == CountSlope(intercept=0, slope=1, log_count=0)
-    assert neutral.placed == PlacedSlope(intercept=0, slope=1, log_count=0, log_relation=1)
     assert set(neutral.evidence.model_dump().values()) == {1.0}
     assert (neutral.popularity, neutral.popularity_weight) == ((), 0)
     assert neutral.misplaced.slope == 1
     assert neutral.outlier == CountSlope(intercept=0, slope=1, log_count=0)
+
+
+def test_what_earlier_releases_calibrated_is_passed_over() -> None:
+    neutral = Calibration.neutral(4)
+    old = {"missing_temperature": 1.2, "placed": {"log_relation": 0.7}, "outlier_threshold": 0.3}
+    assert Calibration.model_validate(neutral.model_dump() | old) == neutral
 
 
 def test_a_vocabulary_is_kept_whole() -> None:

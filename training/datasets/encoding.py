@@ -231,7 +231,7 @@ def _from_lists(
     holds &= ~contradicted
     observed = np.stack([masks[kind] for kind in meaning.unlisted]) | holds | denied
     stacked = holds[_VERTICAL].any(0)
-    observed[_VERTICAL] |= stacked | stacked.T
+    observed |= stacked | stacked.T
     return PoseRelations(holds, observed & ~contradicted & ~np.eye(n, dtype=np.bool_))
 
 

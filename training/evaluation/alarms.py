@@ -28,9 +28,10 @@ MEDIUM = 0.1
 
 _RESAMPLES = 200
 # New places differ: the threshold is on the safe side in so many of the resampled sets of groups.
-_CONFIDENCE = 0.9
-# Scenes of a source whose share of alarms is kept by itself.
+_CONFIDENCE = 0.7
+# Scenes of a source whose share of alarms is kept by itself, and of small sources together.
 _SOURCE_SCENES = 200
+_SMALL_SCENES = 30
 _SCENES = 1500
 
 
@@ -106,13 +107,33 @@ def alarm_threshold(
         raise ValueError("no untouched scene was scored: there is nothing to fit an alarm on")
     if not np.isfinite(worst[judged]).all():
         raise FloatingPointError("the suspicion of an untouched scene is not finite")
-    group = np.array([scene.group for scene in scenes.scenes])
-    source = scenes.source.numpy()
-    kinds, sizes = np.unique(source[judged], return_counts=True)
-    # A quantile of a few scenes says nothing: a small source is left to what large ones ask for,
-    # and where none is large, all are judged together.
-    large = [judged & (source == kind) for kind in kinds[sizes >= _SOURCE_SCENES]]
-    bounds = [_bound(worst[some], group[some], rng, share) for some in large or [judged]]
+    group = np.array([scene.group for scene in scenes.scenes])[judged]
+    return kept_in_each_source(worst[judged], group, scenes.source.numpy()[judged], rng, share)
+
+
+def kept_in_each_source(
+    worst: Floats,
+    group: NDArray[np.str_],
+    source: NDArray[np.int64],
+    rng: np.random.Generator,
+    share: float,
+) -> float:
+    """The threshold that the given share of scenes reaches in the hardest source, and less in
+    others.
+
+    Small sources are judged together, and by their quantile as it is: of few places, resampled ones
+    say little more than the strangest scene does.
+
+    Args:
+        worst: (N,) the most suspicious score of each untouched scene.
+        group: (N,) places; source: (N,) numbers.
+    """
+    kinds, sizes = np.unique(source, return_counts=True)
+    large = [source == kind for kind in kinds[sizes >= _SOURCE_SCENES]]
+    small = np.isin(source, kinds[sizes < _SOURCE_SCENES])
+    bounds = [_bound(worst[some], group[some], rng, share) for some in large]
+    if small.sum() >= _SMALL_SCENES or not large:
+        bounds.append(float(np.quantile(worst[small], 1 - share)))
     # What reaches the threshold raises the alarm, and many scenes may have one and the same worst
     # suspicion (a class's popularity): these stay below.
     return float(np.nextafter(max(bounds), np.inf))

@@ -7,7 +7,7 @@ Each answer is compared with its meaning in the contract:
                  `training.cases.known_relations`)
     missing      the class is there, and was hidden: 25, 50 or 75 % of the classes are shown, or all
                  but one, drawn for each scene
-    at a place   the class is there and stands so: one that stood so to another was taken away
+    at a place   the class is there and stands so; of the places where anything stands, one is asked
     outliers     the object is an intruder: half of the scenes have one
     misplaced    the relation is false: one was altered in half of the scenes
 
@@ -32,7 +32,7 @@ from training.batches import SceneTensors
 from training.cases import (
     altered_case,
     known_relations,
-    placed_case,
+    occupied_place,
     scene_of,
     taken_away,
     told_pairs,
@@ -180,13 +180,9 @@ def ask_missing(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
     """The classes that were hidden, a share of the scene or one."""
-    structure = artifact.vocabulary.structure
-    classes = encoded.evidence.classes
-    classes = classes[~structure[classes]]
-    if not encoded.complete or len(classes) < 2:
+    hidden = _hidden(artifact, encoded, rng)
+    if hidden is None:
         return None
-    share = list(SHARES.values())[rng.integers(len(SHARES))]
-    hidden = rng.permutation(classes)[shown_classes(len(classes), share) :]
     labels = {artifact.vocabulary.labels[index] for index in hidden}
     kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden)).tolist()
     found = missing(artifact, labels_alone(encoded, kept), details=False)
@@ -196,17 +192,36 @@ def ask_missing(
 def ask_placed(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """The class that was taken away, given one relation of it."""
-    if not encoded.complete:
+    """The hidden classes that stand at one place. Classes of which that is unknown are left out."""
+    hidden = _hidden(artifact, encoded, rng)
+    if hidden is None:
         return None
-    case = placed_case(encoded, artifact.vocabulary.structure, rng)
-    if case is None:
+    is_hidden = np.isin(encoded.instance_classes, hidden)
+    place = occupied_place(encoded, artifact.vocabulary.structure, ~is_hidden, rng)
+    if place is None:
         return None
-    scene, relation, anchor, target = case
-    scene = replace(scene, room_type=None)
-    label = artifact.vocabulary.labels[target]
-    found = missing(artifact, scene, at=(CANONICAL[relation], anchor), details=False)
-    return [(answer.probability, answer.label == label) for answer in found]
+    relation, anchor = place
+    kept = np.flatnonzero(~is_hidden).tolist()
+    labels = np.array(artifact.vocabulary.labels, dtype=object)[encoded.instance_classes]
+    there = set(labels[encoded.instance_holds[relation, :, anchor] & is_hidden])
+    unknown = set(labels[~known_relations(encoded)[relation, :, anchor] & is_hidden]) - there
+    at = CANONICAL[relation], kept.index(anchor)
+    found = missing(artifact, labels_alone(encoded, kept), at=at, details=False)
+    return [(a.probability, a.label in there) for a in found if a.label not in unknown]
+
+
+def _hidden(
+    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
+) -> NDArray[np.int64] | None:
+    """The classes that are not shown: a share, drawn for each scene, or all but one are."""
+    structure = artifact.vocabulary.structure
+    classes = encoded.evidence.classes
+    classes = classes[~structure[classes]]
+    if not encoded.complete or len(classes) < 2:
+        return None
+    share = list(SHARES.values())[rng.integers(len(SHARES))]
+    hidden: NDArray[np.int64] = rng.permutation(classes)[shown_classes(len(classes), share) :]
+    return hidden
 
 
 def ask_outliers(

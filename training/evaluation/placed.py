@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from app.boltzmann import BoltzmannMachine, Triway
 from app.boltzmann.draws import draw_hidden
@@ -130,7 +131,7 @@ def leave_one_out_at(
 
 
 def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> PlacedScore:
-    """Log-odds of i, unlisted classes absent, plus log p(the relation | i present), in batches."""
+    """log p(i, unlisted classes absent) + log p(the relation | i present), in batches."""
 
     def score(places: Places) -> Tensor:
         every = torch.arange(machine.spec.V).unsqueeze(0)
@@ -146,7 +147,7 @@ def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> PlacedScore:
             gain = gain + machine.attraction(places.v, context.h1, edges, every)
         weight = torch.softmax(context.log_weight.unsqueeze(-1) + gain, dim=0)
         on, _ = mean_log_p(weight, _logits(machine, places, context.h1))
-        return log_odds + on.clamp(min=NO_UNIT)
+        return logsigmoid(log_odds) + on.clamp(min=NO_UNIT)
 
     return score
 

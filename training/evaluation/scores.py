@@ -94,19 +94,16 @@ def _placed_score(closed: ClosedForm, scorer: ContextScorer) -> PlacedScore:
                 int(np.searchsorted(classes, int(places.anchor[row]))),
                 bool(places.outgoing[row]),
             )
-            values = (closed.b + scorer.row_gain(context.y))[absent]
-            values -= np.logaddexp(np.float32(0.0), -log_odds)
-            found[row, absent] = torch.from_numpy(values)
+            values = -np.logaddexp(0.0, -(closed.b + scorer.row_gain(context.y))[absent])
+            values -= np.logaddexp(0.0, -log_odds)
+            found[row, absent] = torch.from_numpy(values).float()
         return found
 
     return score
 
 
 def served_placed_score(artifact: Artifact) -> PlacedScore:
-    """Calibrated logits of a published model: slope·z + log_relation·log p and what all share.
-
-    z are the log-odds at the model's coverage, p is the probability of the relation.
-    """
+    """Calibrated logits of a published model: p(there unlisted) · p(stands so | there)."""
     calibration, structure = artifact.calibration, artifact.vocabulary.structure
 
     def score(places: Places) -> Tensor:

@@ -14,6 +14,10 @@ of its own, which the prior holds small,
 
 so that a class seen rarely behaves like its neighbours.
 
+A robot has seldom seen a whole scene, so the context sees a random share of the objects: of each
+scene a uniform one. What holds of a pair in rich scenes of one source would else be left to the
+context, and said of no other.
+
 A machine with implications learns them from the same scenes with a random share of their relations
 given, by log p(r_e | r_given, v, E[h1 | v]) of the others. The object part stays as it is.
 
@@ -119,7 +123,8 @@ class RelationLikelihood(Objective):
             batch = replace(batch, counts=batch.counts.masked_fill(withheld, 0))
         edges, r, observed = relation_units(machine, batch)
         with torch.no_grad():
-            h1 = mean_field(machine, Evidence(batch.v, room=room)).y.sigmoid()
+            shown = partly_shown(batch.v, generator)
+            h1 = mean_field(machine, Evidence(shown, room=room)).y.sigmoid()
         offsets = self.offsets[batch.source]
         weight = self.source_weights[batch.source].unsqueeze(1)
         logits = machine.relation_logits(edges, batch.v, h1)
@@ -143,6 +148,12 @@ class RelationLikelihood(Objective):
             share = _MAP_PRIOR if name.endswith(".map") or name in ("R", "n") else 1.0
             total = total + share * half * (parameter**2).sum()
         return total
+
+
+def partly_shown(v: Tensor, generator: torch.Generator) -> Tensor:
+    """Scenes (B, V) with each object kept at its scene's own chance, uniform in [0, 1]."""
+    chance = torch.rand(len(v), 1, generator=generator)
+    return v * (torch.rand(v.shape, generator=generator) < chance)
 
 
 def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:

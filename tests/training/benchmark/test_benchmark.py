@@ -334,7 +334,7 @@ def test_machines_of_one_domain_share_their_scenes(tmp_path):
 
 def test_configurations_of_one_data_section_are_a_domain():
     found = read_domains(["indoor-rbm", "open-triway", "indoor-triway"])
-    assert [domain.name for domain in found] == ["indoor", "procthor"]
+    assert [domain.name for domain in found] == ["indoor", "open"]
     assert [config.name for config in found[0].configs] == ["indoor-rbm", "indoor-triway"]
     with pytest.raises(ConfigError, match="two configurations are called indoor-rbm"):
         read_domains(["indoor-rbm", "indoor-rbm"])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from app.reasoning import missing
-from app.registry import PairSlope, PlacedSlope
+from app.registry import CountSlope, PairSlope
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
 from tests.reasoning.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import (
@@ -124,14 +124,14 @@ def answers_of(artifact, outgoing):
     return missing(artifact, Scene(things), top_k=artifact.machine.spec.V, at=(spoken, 1))
 
 
-PLACED = PlacedSlope(intercept=-0.3, slope=0.8, log_count=0.4, log_relation=0.6)
+MISSING = CountSlope(intercept=-0.3, slope=0.8, log_count=0.4)
 
 
 @pytest.mark.parametrize("outgoing", [True, False])
 @pytest.mark.parametrize("name", LARGER)
 def test_the_score_of_a_published_model_is_the_service_s(name, outgoing):
     slopes = (PairSlope(intercept=0.2, slope=0.7, log_count=0.3, log_classes=-0.4),) * 4
-    artifact = artifact_of(larger_machine(name), placed=PLACED, placement=slopes, coverage=0.7)
+    artifact = artifact_of(larger_machine(name), missing=MISSING, placement=slopes, coverage=0.7)
     answers = answers_of(artifact, outgoing)
     values = served_placed_score(artifact)(asked_of(artifact.machine, outgoing))[0]
     for answer in answers:
@@ -144,11 +144,11 @@ def test_the_score_of_a_published_model_is_the_service_s(name, outgoing):
 @pytest.mark.parametrize("outgoing", [True, False])
 @pytest.mark.parametrize("name", LARGER)
 def test_the_batched_score_is_the_uncalibrated_service_s(name, outgoing):
-    """But for log(1 - coverage), which all classes have alike."""
+    """At coverage 0, where unlisted classes weigh nothing against themselves."""
     machine = larger_machine(name)
-    artifact = artifact_of(machine)
+    artifact = artifact_of(machine, coverage=0.0)
     places = asked_of(machine, outgoing)
     values, served = machine_scores(machine).placed(places), served_placed_score(artifact)(places)
     things = served[0] > -torch.inf
-    shift = (served - values)[:, things]
-    assert shift == pytest.approx(np.full(shift.shape, np.log(0.5)), rel=1e-3, abs=1e-4)
+    found = served[:, things].sigmoid()
+    assert found.numpy() == pytest.approx(values[:, things].exp().numpy(), rel=1e-3, abs=1e-5)
