@@ -10,6 +10,7 @@ from typing import Any
 
 from app.registry import (
     Artifact,
+    Calibration,
     DataSource,
     Description,
     Metric,
@@ -48,7 +49,8 @@ def publish_run(
 
     Args:
         measured: a run of the same configuration that kept test scenes back, and its scenes: its
-            figures are published, since `run` has learnt from all scenes.
+            figures are published and what was chosen for it is kept, since `run` has learnt from
+            all scenes.
         judge: sees the model as it would be published; whatever it raises keeps it from being so.
 
     Raises:
@@ -61,17 +63,19 @@ def publish_run(
     progress("calibrating")
     relations = machine.spec.A
     offsets = fit_offsets(scenes.parts["train"], len(scenes.vocabulary))
-    calibrated = calibrated_draft(run, scenes.vocabulary, data, offsets)
-    calibration = calibrated.calibration
-    if judge is not None:
-        judge(calibrated)
     if measured is None:
-        rows = _measure(calibrated, data, progress)
+        calibrated = calibrated_draft(run, scenes.vocabulary, data, offsets)
+        asked, test = calibrated, data
     else:
         other, kept_back = measured
         other.require(kept_back.digest)
         test = kept_back.training_data()
-        rows = _measure(calibrated_draft(other, kept_back.vocabulary, test), test, progress)
+        asked = calibrated_draft(other, kept_back.vocabulary, test)
+        calibrated = calibrated_draft(run, scenes.vocabulary, data, offsets, asked.calibration)
+    calibration = calibrated.calibration
+    if judge is not None:
+        judge(calibrated)
+    rows = _measure(asked, test, progress)
     progress("publishing")
     description = Description(
         name=run.config.name,
@@ -96,14 +100,20 @@ def calibrated_draft(
     vocabulary: Vocabulary,
     data: TrainingData,
     offsets: Offsets | None = None,
+    chosen: Calibration | None = None,
 ) -> Artifact:
-    """A run as it would be published, its weights rounded as they are stored."""
+    """A run as it would be published, its weights rounded as they are stored.
+
+    Args:
+        chosen: see `calibrate_objects`.
+    """
     machine = as_stored(run.machine)
     calibration = calibrate(
         draft_artifact(machine, vocabulary),
         data.validation,
         data.train,
         run.config.training.seed,
+        chosen,
     )
     return draft_artifact(machine, vocabulary, calibration, offsets)
 

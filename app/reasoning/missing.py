@@ -81,7 +81,7 @@ def missing(
     standing: Sequence[tuple[Placement, ...]] = [()] * len(found)
     because: Sequence[tuple[Because, ...]] = [()] * len(found)
     if details:
-        standing = placements(artifact, given, found, axes, place)
+        standing = placements(artifact, given, found, axes, place, scene.relations or ())
         because = _reasons(given, found)
     return tuple(
         entries(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,10 @@ from app.reasoning.calibration import placement_log_p
 from app.reasoning.listing import likeliest_places
 from app.reasoning.offsets import offsets_of
 from app.reasoning.posterior import Posterior
+from app.reasoning.units import NO_UNIT
 from app.registry.artifact import Artifact
 from app.scene.frames import Axes
-from app.scene.relations import RELATIONS, opposite
+from app.scene.relations import ON_TOP, RELATIONS, opposite
 
 PLACES = 3
 """How many placements an answer lists."""
@@ -52,17 +53,19 @@ def placements(
     candidates: NDArray[np.int64],
     axes: Axes | None,
     at: tuple[int, int, bool] | None = None,
+    stated: Collection[tuple[int, int, int]] = (),
 ) -> list[tuple[Placement, ...]]:
     """The likeliest relations of each candidate to what is present, best first.
 
     All relations in both directions, to all but structure; instances of a class are spoken of by
-    the first.
+    the first. A candidate is under nothing that stands on an object of the scene.
 
     Args:
         candidates: (N,) absent classes.
         axes: what offsets are answered in, see `offsets_of`.
         at: canonical relation, object, and whether the missing thing is its subject: the place that
             was asked about comes first, spoken of by that object. Structure is no place of its own.
+        stated: canonical relations between the objects of the scene.
     """
     present = given.present
     anchors = np.flatnonzero(~artifact.vocabulary.structure[present.classes])
@@ -70,6 +73,9 @@ def placements(
         return [()] * len(candidates)
     forward, backward = given.placement_log_odds(candidates, anchors)
     A, first, asked = forward.shape[1], present.first[anchors].tolist(), -1
+    if A > ON_TOP and stated:
+        standing = {subject for relation, subject, _ in stated if relation == ON_TOP}
+        backward[:, ON_TOP, [thing in standing for thing in first]] = NO_UNIT
     if at is not None:
         relation, object_, outgoing = at
         (found,) = np.nonzero(anchors == present.row[object_])

@@ -39,6 +39,8 @@ def nearest(label: str) -> tuple[str, float]:
         ("coffee mugs", "mug"),
         ("office swivel chair", "computer chair"),
         ("roll of toilet paper", "toilet paper"),
+        ("big white mug", "mug"),
+        ("red office chair", "computer chair"),
     ],
 )
 def test_a_name_like_a_known_one_is_taken_for_it(label: str, expected: str) -> None:

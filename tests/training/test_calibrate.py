@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from app.boltzmann import MachineSpec, build
+from app.reasoning import misplaced
 from app.registry import Calibration
 from tests.reasoning.artifacts import artifact_of
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, rooms
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from tests.training.evaluation.test_completion import larger_machine
-from training.calibrate import calibrate, fit_relations
+from training.calibrate import calibrate, fit_misplaced, fit_relations
 from training.calibrate_objects import (
     ALARMS,
     ALPHAS,
@@ -29,6 +30,7 @@ from training.calibrate_objects import (
     least_of_the_best,
     popularity,
 )
+from training.cases import altered_case
 from training.config import ObjectsConfig
 from training.draft import draft_artifact
 from training.evaluation.alarms import alarm_threshold
@@ -269,6 +271,29 @@ def test_relations_are_fitted_to_what_is_known():
     # Sources are numbered in the order of their names, and count by themselves.
     assert fit_relations(artifact, [*known, *vague]) == pytest.approx(fitted)
     assert fit_relations(artifact, vague) == Calibration.neutral(4).relation
+
+
+def test_misplaced_alarms_are_kept_in_untouched_scenes():
+    """On the scenes that they were fitted on, of one source and of places of their own."""
+    artifact = artifact_of(larger_machine("triway-local"))
+    scenes = random_scenes(120, artifact.machine.spec.V - 1)
+    entry, limits = fit_misplaced(artifact, scenes)
+    artifact = replace(
+        artifact,
+        calibration=artifact.calibration.model_copy(
+            update={"misplaced": entry, "misplaced_thresholds": limits}
+        ),
+    )
+    rng = np.random.default_rng(0)
+    cases = [altered_case(one, artifact.vocabulary.structure, rng) for one in scenes]
+    clean = [case[0] for case in cases if case is not None and case[1] is None]
+    for name, share in ALARMS.items():
+        alarms = [
+            any(one.is_misplaced for one in misplaced(artifact, scene, sensitivity=name))
+            for scene in clean
+        ]
+        assert np.mean(alarms) <= share + 0.02
+    assert any(alarms)  # at the highest sensitivity
 
 
 def test_everything_is_calibrated_at_once(model):

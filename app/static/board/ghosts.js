@@ -31,7 +31,7 @@ const GAP = 0.15; // metres between neighbours where no offset was learnt
 
 let last = { keys: [], ghosts: [] };
 
-/** The suggestions that are shown, each at its likeliest place. @returns {Ghost[]} */
+/** The suggestions that are shown, each at the likeliest place that has room for it. @returns {Ghost[]} */
 export function ghostsOf(state) {
   const answer = state.answers[state.shown].missing?.answer;
   const model = state.models[state.shown];
@@ -50,8 +50,10 @@ function suggest(state, answer, sizes) {
     const asked = placements.find(
       (one) => state.at?.relation === one.relation && state.at?.object === one.object,
     );
-    const wanted = asked ?? (state.at ? { ...state.at, probability: null } : placements[0]);
-    const anchor = boxes.find((box) => box.id === wanted?.object);
+    const anchorOf = (one) => boxes.find((box) => box.id === one?.object);
+    const likeliest = placements.find((one) => hasRoom(anchorOf(one), one.relation, size));
+    const wanted = asked ?? (state.at ? { ...state.at, probability: null } : likeliest);
+    const anchor = anchorOf(wanted);
     if (anchor && !state.things.some((thing) => thing.label === label)) {
       const place = stand(anchor, wanted, size, state.viewer, boxes, ghosts);
       ghosts.push({ id: label, label, probability, placement: wanted, size, yaw: 0, ...place });
@@ -59,6 +61,10 @@ function suggest(state, answer, sizes) {
   }
   return ghosts;
 }
+
+/** Under something there must be room for it: what stands on the floor has nothing below. */
+const hasRoom = (anchor, relation, size) =>
+  anchor && (!['under', 'below'].includes(relation) || anchor.z >= size.z);
 
 /** Turns what is ahead and left of a heading into the axes of the board; `within` turns it back. */
 function turned(viewer, ahead, left) {
