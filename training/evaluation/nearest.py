@@ -4,7 +4,7 @@ Two kinds of unknown labels: every alias, removed from the vocabulary, and every
 random edit (a letter left out, doubled, replaced, or exchanged with the next one). A mapping is
 right if it leads to the class that the name belongs to.
 
-    python -m training.evaluation.nearest model_store/indoor-triway/1.5.0
+    python -m training.evaluation.nearest model_store/indoor-triway/2.0.0
 """
 
 from __future__ import annotations
