@@ -13,7 +13,7 @@ from app.boltzmann import MachineSpec, build
 from tests.training.evaluation.scenes import V, tensors, toy
 from training.batches import relation_units
 from training.config import ObjectiveConfig
-from training.objectives.relations import RelationLikelihood, bake_word_prior
+from training.objectives.relations import RelationLikelihood, bake_word_prior, partly_shown
 
 CONFIG = ObjectiveConfig(name="relations", room_dropout=0.0, offset_prior=0.1, weight_prior=0.1)
 SPECS = {
@@ -147,7 +147,20 @@ def test_unknown_units_do_not_change_the_loss(machine):
     assert loss_of(machine, known, scenes) != loss_of(machine, batch, scenes)
 
 
-def test_the_loss_is_the_mean_over_scenes_and_the_prior_of_one():
+def test_the_context_sees_a_share_of_the_objects_uniform_over_scenes():
+    """Of 2,000 scenes of 40 objects; five standard errors of the mean and of the spread."""
+    v = (torch.rand(2000, 50, generator=torch.Generator().manual_seed(1)) < 0.8).float()
+    shown = partly_shown(v, torch.Generator().manual_seed(0))
+    assert bool((shown <= v).all())
+    share = shown.sum(1) / v.sum(1)
+    assert float(share.mean()) == pytest.approx(0.5, abs=5 * 0.3 / 2000**0.5)
+    # Uniform, and binomial within a scene.
+    assert float(share.var()) == pytest.approx(1 / 12 + 1 / 6 / 40, abs=0.01)
+
+
+def test_the_loss_is_the_mean_over_scenes_and_the_prior_of_one(monkeypatch):
+    """With a context that sees all objects."""
+    monkeypatch.setattr("training.objectives.relations.partly_shown", lambda v, _: v)
     scenes, machine = scenes_of({"captions": 0.5}), machine_of("triway")
     batch = whole(scenes)
     nothing = replace(batch, observed=torch.zeros_like(batch.observed))
