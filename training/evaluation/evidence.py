@@ -204,8 +204,8 @@ def relations_evidence_task(contender: Contender, setting: Setting) -> Outcome |
     scenes, structure = setting.some(related=True), setting.structure.numpy()
 
     def hits(scene: Scene, case: Case) -> float:
-        assert case.asked is not None  # noqa: S101  # as `halves` makes them
-        assert case.truth is not None  # noqa: S101
+        if case.asked is None or case.truth is None:
+            return 0.0  # `halves` makes none like this
         p, truth = relation_probabilities(artifact, scene)[case.asked], case.truth[case.asked]
         return expected_hits(p, truth, int(truth.sum()))
 

@@ -13,8 +13,9 @@ import string
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from random import Random
 from typing import NamedTuple
+
+import numpy as np
 
 from app.registry.verified import read_verified
 from app.scene.labels import label_key
@@ -46,7 +47,7 @@ def held_out_aliases(vocabulary: Vocabulary) -> list[Mapped]:
 
 def misspelt(vocabulary: Vocabulary, seed: int = 0) -> list[Mapped]:
     """Every name with one random edit that no class has as its name."""
-    random = Random(seed)  # noqa: S311
+    rng = np.random.default_rng(seed)
     index = NameIndex(
         [
             (name, place)
@@ -57,7 +58,7 @@ def misspelt(vocabulary: Vocabulary, seed: int = 0) -> list[Mapped]:
     found = []
     for place, entry in enumerate(vocabulary.objects):
         for name in (entry.label, *entry.aliases):
-            wrong = _edited(name, random)
+            wrong = _edited(name, rng)
             if vocabulary.index(wrong) is None:
                 found.append(_mapped(index, wrong, place))
     return found
@@ -76,16 +77,16 @@ def _mapped(index: NameIndex, name: str, wanted: int) -> Mapped:
     return Mapped(matches[0].similarity, matches[0].entry == wanted)
 
 
-def _edited(name: str, random: Random) -> str:
-    place = random.randrange(len(name) - 1) if len(name) > 1 else 0
+def _edited(name: str, rng: np.random.Generator) -> str:
+    place = int(rng.integers(len(name) - 1)) if len(name) > 1 else 0
     before, letter, after = name[:place], name[place], name[place + 1 :]
-    match random.randrange(4):
+    match int(rng.integers(4)):
         case 0:
             return before + after
         case 1:
             return before + letter + letter + after
         case 2:
-            return before + random.choice(string.ascii_lowercase) + after
+            return before + str(rng.choice(list(string.ascii_lowercase))) + after
         case _:
             return before + after[:1] + letter + after[1:]
 
