@@ -58,7 +58,7 @@ def placements(
     """The likeliest relations of each candidate to what is present, best first.
 
     All relations in both directions, to all but structure; instances of a class are spoken of by
-    the first. A candidate is under nothing that stands on an object of the scene.
+    the first. No placement puts a candidate under an object that stands on another.
 
     Args:
         candidates: (N,) absent classes.

@@ -26,16 +26,19 @@ _MEASURED = """\
 On test scenes of each source, which neither training nor calibration has seen; 95 % intervals in
 brackets. How many answers each figure is made of is in the manifest."""
 
+_FINAL_FIT = """\
+The figures are those of a first fit, which kept the test scenes back. The weights here are of a
+second fit of the same configuration: to all scenes but a tenth, on which it was calibrated."""
+
 _PROBABILITIES = """\
 Calibrated on validation scenes to this, ECE 0 and Brier skill 1 being perfect (0: no better than
 how often such answers are true):
 
-- relations: an annotator would list this relation for this pair of objects, whatever is known of
-  others; placements: or for a missing object and one that is there
-- missing: this class was taken away, given that exactly one was; at a place: given where it stood
-  as well
-- outliers: the object is an intruder, where half of the scenes are clean; the default threshold is
-  set so that at most 5 % of untouched scenes raise an alarm
+- relations: the relation holds between the two objects; placements: it holds between a missing
+  object and one that is there
+- missing: the class is there although it was not listed; at a place: and stands there
+- outliers: the object is an intruder, where half of the scenes are clean; at the default threshold
+  about 10 % of untouched scenes of the hardest large source raise an alarm
 - misplaced: the relation is false, where one was altered in half of the scenes"""
 
 _OFFSETS = """\
@@ -46,8 +49,8 @@ from the mean, beside what the relation alone would have said."""
 _LIMITS = """\
 - The model speaks of classes, not of instances: it says whether a class belongs here, not how many
   of it. How many chairs a table wants is outside it.
-- Annotators list a few relations of each scene. An unlisted relation counts as wrong in the figures
-  above without being false, and `/relations` answers what an annotator would list.
+- Annotators list a few relations of each scene. An unlisted relation counts as wrong in R-precision
+  without being false.
 - Left and front are meant in the viewer's axes. Where a source has no viewer, one was chosen in
   training, and these two relations carry that choice.
 - Offsets say where such a thing usually stands, not where there is room for it; they know neither
@@ -88,6 +91,7 @@ def render_card(description: Description, tensors: Mapping[str, TensorEntry]) ->
         "## Intended use",
         _INTENDED_USE,
         "## Metrics",
+        *([_FINAL_FIT] if "measured_split" in description.training else []),
         _metrics(description),
         "## Data and terms",
         _table(

@@ -79,3 +79,8 @@ def test_text_stays_in_its_cell() -> None:
     page = card(data=[hostile])
     assert "\n# Heading" not in page
     assert "a\\|b # Heading" in page
+
+
+def test_a_final_fit_says_that_its_figures_are_of_the_first() -> None:
+    assert "second fit" in card(training={"measured_split": "group"})
+    assert "second fit" not in card(training={})
