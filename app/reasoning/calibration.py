@@ -22,13 +22,28 @@ def sigmoid(x: Floats) -> Floats:
 
 
 @compiled
+def bend(entry: NDArray[np.float64], logits: Floats) -> None:
+    """Bend a line of log-odds in place, see `PairSlope`.
+
+    Args:
+        entry: (4 + 2K,) a row of those of `RelationSlopes`.
+        logits: (n,).
+    """
+    for j in range(len(logits) if len(entry) > 4 else 0):
+        x = y = logits[j]
+        for k in range(4, len(entry), 2):
+            y += np.float32(entry[k + 1]) * max(x - np.float32(entry[k]), np.float32(0.0))
+        logits[j] = y
+
+
+@compiled
 def relation_probability(
     slopes: NDArray[np.float64], log_odds: Floats, log_count: Floats, classes: int
 ) -> Floats:
-    """Probability that a relation is listed for one pair of instances, (B, A, n, m).
+    """Probability that a relation holds between one pair of instances, (B, A, n, m).
 
     Args:
-        slopes: (A, 4), one of those of `RelationSlopes`.
+        slopes: (A, 4 + 2K), one of those of `RelationSlopes`.
         log_odds: (B, A, n, m) of the class-level units.
         log_count: (n, m), log of the instance pairs of both classes.
         classes: how many distinct ones the scene has.
@@ -43,6 +58,7 @@ def relation_probability(
                 row, found, counts = log_odds[b, a, i], p[b, a, i], log_count[i]
                 for j in range(len(row)):
                     found[j] = intercept + slope * row[j] + weight * counts[j]
+                bend(slopes[a], found)
     # Of all at once, since a row is short.
     logits = p.reshape(-1)
     for e in range(len(logits)):
@@ -64,19 +80,20 @@ def missing_logits(calibration: Calibration, log_odds: Floats, listed: int) -> F
 
 
 def placement_log_p(
-    slope: NDArray[np.float64], log_p: Floats, log_count: float, classes: int
+    entry: NDArray[np.float64], log_p: Floats, log_count: float, classes: int
 ) -> Floats:
     """log p(relation | both are there), calibrated as placements are, from that of the machine.
 
     Args:
-        slope: (4,), the relation's row of `RelationSlopes.placement`.
+        entry: (4 + 2K,), the relation's row of `RelationSlopes.placement`.
         log_p: of the class-level unit.
         log_count: of the anchor's instances.
         classes: how many distinct ones there are with the candidate.
     """
-    intercept, gain, weight, size = slope
+    intercept, gain, weight, size = entry[:4]
     odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
     logits = intercept + gain * odds + weight * log_count + size * math.log(classes)
+    bend(entry, logits)
     found: Floats = -np.logaddexp(0.0, -logits)
     return found
 

@@ -39,7 +39,7 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
     Place (d A + a) m + j is relation a to anchor j, or back if d = 1.
 
     Args:
-        slopes: (A, 4), see `RelationSlopes`.
+        slopes: (A, 4 + 2K), see `RelationSlopes`.
         forward, backward: (N, A, m) log-odds of relations to the anchors, and of those back.
         log_counts: (m,).
         classes: how many distinct ones there are with the candidate.
@@ -89,7 +89,7 @@ def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposit
     """The best `count` relations between objects, by place: subject, object, relation.
 
     Args:
-        slopes: (A, 4), see `RelationSlopes`.
+        slopes: (A, 4 + 2K), see `RelationSlopes`.
         log_odds: (A, n, n) between classes.
         log_counts: (n,).
         row: (N,) the class of each object.
@@ -168,7 +168,7 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
     """The `count` pairs whose likeliest relation exceeds those observed by the largest ratio.
 
     Args:
-        slopes: (A, 4), see `RelationSlopes`.
+        slopes: (A, 4 + 2K), see `RelationSlopes`.
         forward, backward: (A, P) log-odds from subject to object, and back.
         log_counts: (P,) log of the instance pairs of both classes.
         classes: how many distinct ones the scene has.

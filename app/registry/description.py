@@ -60,10 +60,12 @@ class PairSlope(CountSlope):
     """The same for a relation between two objects, and + log_classes·log of the scene's classes.
 
     n counts the instance pairs of both classes. In a room of many things an annotator lists fewer
-    of what each could be related to.
+    of what each could be related to. From each bend (at, change) on the sum x grows faster, by
+    change·(x - at) for x > at, and slower for a negative change.
     """
 
     log_classes: float = 0.0
+    bends: tuple[tuple[float, float], ...] = ()
 
 
 class Slope(Frozen):

@@ -14,7 +14,7 @@ Table = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelationSlopes:
-    """Of each canonical relation intercept, slope, log_count and log_classes, (A, 4).
+    """Of each canonical relation intercept, slope, log_count, log_classes and K bends, (A, 4 + 2K).
 
     Attributes:
         alone: for scenes of which no relation is given.
@@ -38,4 +38,9 @@ class RelationSlopes:
 
 
 def _table(entries: tuple[PairSlope, ...]) -> Table:
-    return np.array([(e.intercept, e.slope, e.log_count, e.log_classes) for e in entries])
+    bends = max((len(e.bends) for e in entries), default=0)
+    table = np.zeros((len(entries), 4 + 2 * bends))
+    for row, e in zip(table, entries, strict=True):
+        row[:4] = e.intercept, e.slope, e.log_count, e.log_classes
+        row[4 : 4 + 2 * len(e.bends)] = np.ravel(e.bends)
+    return table

@@ -497,21 +497,21 @@ def calibration() -> Calibration:
     return Calibration.neutral(2).model_copy(update={"missing": CountSlope(**entry)})
 
 
-@formula(
-    r"p = \sigma(\alpha_a + \beta_a \lambda_e + \gamma_a \log(n_i n_j) + \delta_a \log n)",
-)
+@formula(r"x = \alpha_a + \beta_a \lambda_e + \gamma_a \log(n_i n_j) + \delta_a \log n")
+@formula(r"p = \sigma\big(x + \sum_k c_k \max(0, x - x_k)\big)")
 def calibrated_relations() -> None:
     rng = np.random.default_rng(0)
-    slopes = rng.normal(size=(2, 4))
+    slopes = rng.normal(size=(2, 8))
     log_odds = rng.normal(size=(1, 2, 3, 3)).astype(np.float32)
     counts = np.array([1, 2, 5])
     logs = np.log(np.outer(counts, counts)).astype(np.float32)
     found = relation_probability(slopes, log_odds, logs, 3)
     for a, i, j in product(range(2), range(3), range(3)):
-        alpha, beta, gamma, delta = slopes[a]
+        alpha, beta, gamma, delta, *bends = slopes[a]
         x = alpha + beta * log_odds[0, a, i, j]
         x += gamma * math.log(counts[i] * counts[j]) + delta * math.log(3)
-        assert found[0, a, i, j] == pytest.approx(sigma(x), abs=1e-5)
+        bent = x + sum(c * max(0, x - at) for at, c in zip(bends[::2], bends[1::2], strict=True))
+        assert found[0, a, i, j] == pytest.approx(sigma(bent), abs=1e-5)
 
 
 @formula(r"p' = \frac{p}{\max(1, p + q)}")

@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from app.reasoning import missing, outliers, relations
 from app.reasoning.calibration import exclusive, relation_probability
@@ -32,6 +34,23 @@ def test_relations_have_a_calibration_each():
                 z = a + (1 + a) * float(log_odds[a, x, y]) - a * float(log_count[x, y])
                 z += 0.5 * a * math.log(7)
                 assert float(p[a, x, y]) == pytest.approx(sigmoid(z), abs=1e-6)
+
+
+@given(
+    st.lists(st.tuples(st.floats(-3, 3), st.floats(-0.9, 3)), max_size=4),
+    st.lists(st.floats(-6, 6), min_size=1, max_size=5),
+)
+def test_a_line_bends_where_its_entry_says(bends, log_odds):
+    entry = PairSlope(intercept=0.5, slope=0.8, bends=tuple(bends))
+    # An entry of fewer bends stands beside it.
+    slopes = RelationSlopes.of(Calibration(relation=(entry, PairSlope()))).alone
+    values = np.array([log_odds, log_odds], dtype=np.float64)[None, :, None]
+    p = relation_probability(slopes, values, np.zeros((1, len(log_odds))), 1)[0, :, 0]
+    for k, z in enumerate(log_odds):
+        x = 0.5 + 0.8 * z
+        y = x + sum(change * max(x - at, 0) for at, change in bends)
+        assert p[0, k] == pytest.approx(sigmoid(y), abs=1e-5)
+        assert p[1, k] == pytest.approx(sigmoid(z), abs=1e-5)
 
 
 def test_scenes_that_state_relations_have_entries_of_their_own():
@@ -122,7 +141,7 @@ def test_missing_at_a_place_is_there_and_stands_so(relation):
     """The two probabilities that the answer without a place gives, multiplied."""
     entry = CountSlope(intercept=-0.2, slope=0.8, log_count=0.3)
     # So low that no relation excludes its opposite.
-    slopes = (PairSlope(intercept=-3.0, slope=0.7, log_count=-0.4),) * 4
+    slopes = (PairSlope(intercept=-3.0, slope=0.7, log_count=-0.4, bends=((-3.5, 0.5),)),) * 4
     artifact = larger_artifact("triway-local", missing=entry, placement=slopes)
     scene = scene_of([0, 1, 1])
     anywhere = {a.label: a.probability for a in missing(artifact, scene, top_k=9)}

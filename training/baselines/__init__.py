@@ -34,6 +34,7 @@ from training.baselines.judges import (
     completion_r_precision,
     log_likelihood,
     missing_mrr,
+    partial_mrr,
     placed_mrr,
     r_precision,
 )
@@ -52,6 +53,9 @@ OBJECTS: Final[tuple[Baseline[ObjectScore], ...]] = (
     Baseline("scikit-learn BernoulliRBM", bernoulli_rbm.propose, missing_mrr, stochastic=True),
     Baseline("masked transformer", transformer.propose, missing_mrr, stochastic=True),
     Baseline("denoising autoencoder", denoising.propose, missing_mrr, stochastic=True),
+    Baseline(
+        "autoencoder, heavily masked", denoising.propose_for_parts, partial_mrr, stochastic=True
+    ),
 )
 
 RELATIONS: Final[tuple[Baseline[RelationScore], ...]] = (

@@ -6,6 +6,8 @@ ICML 2008. Trained as `masked_sets` says.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -18,6 +20,7 @@ from training.evaluation.missing import ObjectScore
 _WIDTH = 600
 _DROPOUT = (0.15, 0.3)
 _COURSE = Course(epochs=24, learning_rate=3e-3, weight_decay=0.1)
+_HEAVY = replace(_COURSE, noise=1.0)
 
 
 def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
@@ -36,9 +39,16 @@ def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Se
     return network
 
 
-def propose(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
+def propose(
+    train: SceneTensors, structure: Tensor, seed: int, course: Course = _COURSE
+) -> Proposals[ObjectScore]:
     """Dropout × epochs."""
     for dropout in _DROPOUT:
         network = build_autoencoder(train.v, _WIDTH, dropout, seed)
-        for epoch, score in train_network(network, train.v, structure, _COURSE, seed):
+        for epoch, score in train_network(network, train.v, structure, course, seed):
             yield {"dropout": dropout, "epochs": epoch}, score
+
+
+def propose_for_parts(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
+    """The same trained with heavy masking: any share of the other classes is hidden as well."""
+    return propose(train, structure, seed, _HEAVY)

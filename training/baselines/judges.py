@@ -8,6 +8,7 @@ from training.batches import SceneTensors
 from training.evaluation.completion import complete_scenes
 from training.evaluation.density import ObjectDensity
 from training.evaluation.missing import ObjectScore, leave_one_out
+from training.evaluation.partial import hide, rank_hidden
 from training.evaluation.placed import PlacedScore, leave_one_out_at
 from training.evaluation.relations import RelationScore, rank, rank_relations
 
@@ -20,6 +21,15 @@ def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> 
     """
     result = leave_one_out(scenes, structure, score)
     return result.ratio(result.reciprocal_rank()).value
+
+
+def partial_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
+    """T2 partial: mean reciprocal rank of the hidden half of every scene.
+
+    Raises:
+        ValueError: no scene has two classes.
+    """
+    return rank_hidden(hide(scenes, structure, 0.5), structure, score).mrr.value
 
 
 def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:

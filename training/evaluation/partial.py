@@ -111,7 +111,10 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> Part
     Raises:
         LeakError: the score depends on more than what is shown.
         FloatingPointError: a score is nan.
+        ValueError: no scene has two classes.
     """
+    if not len(partial.v):
+        raise ValueError("no scene has two classes, one to show and one to hide")
     values = _scores(partial, structure, score)
     blocks = _blocks(partial, values)
     ranking = rank_blocks(blocks, partial.scenes, skipped=partial.scenes - len(partial.scene))
