@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene
 
 _VIEWER = viewer_axes()
+_BLOCK: Final = 32
 
 
 def missing(
@@ -71,10 +73,7 @@ def missing(
     if place is None:
         logits = missing_logits(calibration, log_odds, listed)
     else:
-        relation, anchor, outgoing = place
-        row = int(given.present.row[anchor])
-        log_p = place_log_p(artifact, given, absent, relation, row, outgoing=outgoing)
-        logits = placed_logits(calibration, log_odds, log_p, listed)
+        logits = _at_place(artifact, given, place, absent, chosen, log_odds, listed, top_k)
     where, probabilities = likeliest_classes(logits, chosen, top_k)
     found = absent[where]
     labels = artifact.vocabulary.labels
@@ -93,6 +92,38 @@ def missing(
             because,
         )
     )
+
+
+def _at_place(
+    artifact: Artifact,
+    given: Posterior,
+    place: tuple[int, int, bool],
+    absent: NDArray[np.int64],
+    chosen: NDArray[np.bool_],
+    log_odds: NDArray[np.floating[Any]],
+    listed: int,
+    top_k: int,
+) -> NDArray[np.floating[Any]]:
+    """Logits of p(there) · p(stands so | there) of the best `top_k` candidates at least, (N,).
+
+    Candidates are asked in blocks, the likeliest to be there first. A product is never above its
+    first factor: once the next candidate is less likely to be there than `top_k` others are at the
+    place, no later one can be among the best. What was not asked is -inf.
+    """
+    relation, anchor, outgoing = place
+    row = int(given.present.row[anchor])
+    there = missing_logits(artifact.calibration, log_odds, listed)
+    logits = np.full_like(there, -np.inf)
+    order = np.flatnonzero(chosen)
+    order = order[np.argsort(-there[order], kind="stable")]
+    for start in range(0, len(order), _BLOCK):
+        some = order[start : start + _BLOCK]
+        best = np.sort(logits[order[:start]])[-top_k:]
+        if len(best) == top_k and there[some[0]] < best[0]:
+            break
+        log_p = place_log_p(artifact, given, absent[some], relation, row, outgoing=outgoing)
+        logits[some] = placed_logits(artifact.calibration, log_odds[some], log_p, listed)
+    return logits
 
 
 def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, ...]]:

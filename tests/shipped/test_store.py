@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from app.reasoning import missing
 from app.registry import Artifact, Store, load_model_set
-from app.scene import CANONICAL
+from app.scene import CANONICAL, Scene, SceneObject
 from training.config import load_config
 
 STORE = Store(Path(__file__).resolve().parents[2] / "model_store")
@@ -91,3 +92,22 @@ def test_the_training_configuration_is_stored(artifact):
 
     config = Config.model_validate(artifact.manifest.training["config"])
     assert config.name in shipped_configs()
+
+
+@pytest.mark.parametrize("name", ["indoor-triway", "everyday-triway"])
+@pytest.mark.parametrize("relation", ["on-top", "above", "behind"])
+def test_the_best_at_a_place_are_the_first_of_all(models, name, relation):
+    """Candidates that cannot be among the best are not asked."""
+    artifact = models.resolve(name)
+    assert isinstance(artifact, Artifact)
+    labels = ["table", "chair", "lamp", "laptop"]
+    things = [SceneObject(label, label, artifact.vocabulary.index(label)) for label in labels]
+    for scene in (Scene(tuple(things)), Scene(tuple(things[:1]))):
+        every = missing(artifact, scene, at=(relation, 0), top_k=1000, details=False)
+        assert len(every) > 80
+        for few in (1, 5, 40):
+            best = missing(artifact, scene, at=(relation, 0), top_k=few, details=False)
+            assert [one.label for one in best] == [one.label for one in every[:few]]
+            assert [one.probability for one in best] == pytest.approx(
+                [one.probability for one in every[:few]], rel=1e-5
+            )
