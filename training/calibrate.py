@@ -55,8 +55,7 @@ _ROUNDS = 3
 # Columns of an example, the scene first.
 _RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 5, 6
 # A source's examples count by this power of their number less. At 0 the likeliest of eight is right
-# for .62 of the pairs of 3DSSG, with an ECE of .034 over all sources; at .25 for .73, with .046; at
-# .5 for .82, with .056. A frequency table is right for .75.
+# for .62 of the pairs of 3DSSG, at .25 for .73, at .5 for .82. A frequency table is right for .75.
 _POWER = 0.5
 # The curve of all relations: how often it bends, its least slope, and the penalty on each change of
 # slope in log-likelihood.
