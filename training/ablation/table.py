@@ -11,6 +11,9 @@ from training.evaluation.intervals import Figure
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("T1a", "T1a relations", "R-precision, instance counts"),
+    ("T1 pairs", "T1 pairs", "accuracy"),
+    ("unseen pairs", "T1 pairs", "accuracy, unseen pairs"),
+    ("rare classes", "T1 pairs", "accuracy, rare classes"),
     ("T1b", "T1b completion", "R-precision"),
     ("T2", "T2 missing", "MRR"),
     ("T2-at", "T2-at missing at a place", "MRR"),

@@ -21,7 +21,7 @@ Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
 
 PRIMARY: dict[str, tuple[str, ...]] = {
     "T1a relations": ("R-precision, distinct classes", "R-precision, instance counts"),
-    "T1 pairs": ("accuracy", "log-loss", "accuracy, unseen pairs"),
+    "T1 pairs": ("accuracy", "log-loss", "accuracy, unseen pairs", "accuracy, rare classes"),
     "T1 with evidence": tuple(f"change of R-precision, {kind}" for kind in KINDS[:2]),
     "T1b completion": ("R-precision",),
     "T2 missing": ("MRR", "top-1", "top-10"),

@@ -33,6 +33,9 @@ from training.evaluation.relations import RelationScore, telling
 from training.evaluation.setting import Outcome, Setting
 from training.trainer import subset
 
+RARE = 10
+"""A class that is related to so many classes at most in training is rare."""
+
 VERTICAL = (CANONICAL.index("on-top"), CANONICAL.index("above"))
 
 # A relation that is held impossible costs this much at most, about 21 nats.
@@ -190,27 +193,34 @@ def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
         "accuracy, vertical": answers.upright(),
         "log-loss": answers.log_loss(),
     }
-    new = _unseen(answers.classes, setting)
-    if new is not None and new.any():
-        some = answers.where(new)
-        metrics["accuracy, unseen pairs"] = some.accuracy()
-        metrics["log-loss, unseen pairs"] = some.log_loss()
+    for name, which in _little_known(answers.classes, setting).items():
+        if which.any():
+            some = answers.where(which)
+            metrics[f"accuracy, {name}"] = some.accuracy()
+            metrics[f"log-loss, {name}"] = some.log_loss()
     return Outcome(metrics, len(scenes), 0)
 
 
-def _unseen(classes: NDArray[np.int64], setting: Setting) -> NDArray[np.bool_] | None:
-    """(N,) no relation of the two classes is listed in training; None where that is unknown.
+def _little_known(classes: NDArray[np.int64], setting: Setting) -> dict[str, NDArray[np.bool_]]:
+    """Which pairs (N, 2) training tells little of, (N,) bool; nothing where that is unknown.
 
-    By all that the contender may have learnt from, which is more than scenes of one source.
+    Unseen pairs: no relation of the two classes is listed in training. Rare classes: one of the two
+    is related to `RARE` classes at most there. By all that the contender may have learnt from,
+    which is more than scenes of one source.
     """
     V = setting.scenes.v.shape[1]
     triples = setting.seen
     if triples is None:
         if setting.train is None:
-            return None
+            return {}
         triples = seen_triples(setting.train.scenes, V)
-    known = np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1)
-    return ~np.isin(_keys(classes, V), _keys(known, V))
+    known = np.unique(np.sort(triples.numpy()[:, 1:].astype(np.int64), axis=1), axis=0)
+    partners = np.bincount(known.ravel(), minlength=V)
+    rare: NDArray[np.bool_] = np.any(partners[classes] <= RARE, axis=1)
+    return {
+        "unseen pairs": ~np.isin(_keys(classes, V), _keys(known, V)),
+        "rare classes": rare,
+    }
 
 
 def _keys(pairs: NDArray[np.int64], classes: int) -> NDArray[np.int64]:

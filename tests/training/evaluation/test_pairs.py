@@ -24,7 +24,7 @@ from training.evaluation import pairs
 from training.evaluation.asking import labels_alone, relation_probabilities
 from training.evaluation.contenders import Contender
 from training.evaluation.missing import LeakError
-from training.evaluation.pairs import pairs_task, service_score, vertical_pairs
+from training.evaluation.pairs import RARE, pairs_task, service_score, vertical_pairs
 from training.evaluation.setting import Setting
 
 LEFT, ON, ABOVE = 0, 2, 3
@@ -108,6 +108,21 @@ def test_unseen_pairs_are_those_that_no_training_relation_joins():
         assert (metrics["accuracy"].n, metrics["accuracy, unseen pairs"].n) == (2, 1)
     unknown = pairs_task(Contender(relations=flat), Setting(data, NO_STRUCTURE)).metrics
     assert "accuracy, unseen pairs" not in unknown
+
+
+def test_rare_classes_are_those_that_training_relates_to_few():
+    """Class 0 is related to RARE + 1 others, all others to it alone: (0, 1) has a rare end."""
+    V = RARE + 3
+    train = tensors([scene([0, k], [(ON, k, 0)]) for k in range(1, V - 1)], V)
+    none = torch.zeros(V, dtype=torch.bool)
+    for classes, rare in (([0, 1], 1), ([0, V - 1], 1)):
+        data = tensors([scene(classes, [(ON, classes[1], 0)])], V)
+        metrics = pairs_task(Contender(relations=flat), Setting(data, none, train)).metrics
+        assert metrics["accuracy, rare classes"].n == rare
+    often = [scene([a, b], [(ON, a, b)]) for a in range(V) for b in range(a)]
+    train = tensors(often, V)
+    metrics = pairs_task(Contender(relations=flat), Setting(data, none, train)).metrics
+    assert "accuracy, rare classes" not in metrics
 
 
 def test_no_relation_is_shown():
