@@ -49,7 +49,7 @@ from training.trainer import subset
 
 _SCENES = 2500
 # A machine without a closed form draws its answers, at a hundred times the cost.
-_SCENES_OF_DRAWS = 500
+_SCENES_OF_DRAWS = 300
 # An answer lists the best 20 relations by default.
 _LISTED = 20
 _OF_THE_REST = 0.02
