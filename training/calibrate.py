@@ -99,7 +99,7 @@ def calibrate(
     calibration = calibration.model_copy(
         update={
             "relation": alone,
-            "placement": fit_placements(artifact, related, seed),
+            **fit_placements(artifact, related, seed),
             "relation_given": fit_given(artifact, related, alone, seed),
         }
     )
@@ -152,8 +152,13 @@ def _asked_pairs(
 
 def fit_placements(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
-) -> tuple[PairSlope, ...]:
-    """The same for the relations of an object that was taken away to those that stayed."""
+) -> dict[str, tuple[PairSlope, ...]]:
+    """The same for the relations of an object that was taken away to those that stayed.
+
+    Returns:
+        `placement`, fitted to the likeliest places, which an answer lists; and `asked_place`,
+        fitted to every place alike, since a request may ask for any.
+    """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
     sources = sorted({encoded.source for encoded in scenes})
@@ -179,7 +184,11 @@ def fit_placements(
             which = np.full(len(a), number), a, values[0].ravel(), count, size, truth.ravel()
             source = np.full(len(a), sources.index(encoded.source))
             blocks.append(np.stack([*which, source], 1).astype(np.float64))
-    return _fit_listed(_examples(blocks), artifact.machine.spec.A, PLACES)
+    examples, relations = _examples(blocks), artifact.machine.spec.A
+    return {
+        "placement": _fit_listed(examples, relations, PLACES),
+        "asked_place": _fit_listed(examples, relations, len(examples)),
+    }
 
 
 def _examples(blocks: list[NDArray[np.float64]]) -> NDArray[np.float64]:

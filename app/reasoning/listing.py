@@ -205,17 +205,18 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
 
 
 @compiled
-def least_fitting(intercept, slope, log_odds, row):
+def least_fitting(intercept, slope, log_odds, structure, row):
     """Objects by how badly they fit, ties by place, (N,); and the probability of each class, (n,).
 
     Args:
         intercept, slope: from log-odds of presence to those of being an intruder.
         log_odds: (n,) of the classes.
+        structure: (n,) bool, classes that are never intruders.
         row: (N,) the class of each object.
     """
     intruder, p = np.empty(len(log_odds), np.float64), np.empty(len(log_odds), np.float64)
     for i in range(len(log_odds)):
-        intruder[i] = intercept + slope * log_odds[i]
+        intruder[i] = -np.inf if structure[i] else intercept + slope * log_odds[i]
         p[i] = 1.0 / (1.0 + np.exp(-intruder[i]))
     judged = np.empty(len(row), np.float64)
     for k in range(len(row)):

@@ -45,7 +45,8 @@ def outliers(
     the class, and all relations that touch it, are taken out first. So instances of one class
     score alike. Intruders are often common things in the wrong room: their prior is proportional
     to popularity^alpha, so alpha times the log-odds of the class in a training scene is subtracted
-    from its log-odds here. Ties go by position.
+    from its log-odds here. Structure, such as a wall, is never an intruder: its probability is 0.
+    Ties go by position.
 
     Args:
         sensitivity: which of the model's thresholds decide.
@@ -68,6 +69,7 @@ def outliers(
     order, p = least_fitting(
         *intruder_line(calibration, len(log_odds)),
         _adjusted(artifact, classes, log_odds),
+        artifact.vocabulary.structure[classes],
         given.present.row,
     )
     row = given.present.row[order]

@@ -41,7 +41,7 @@ def place_log_p(
         anchor: place in the classes that are present.
     """
     return placement_log_p(
-        artifact.relation_slopes.placement[relation],
+        artifact.relation_slopes.asked_place[relation],
         given.placed_log_p(candidates, relation, anchor, outgoing=outgoing),
         *(float(given.present.log_counts[anchor]), len(given.present.classes) + 1),
     )
@@ -76,21 +76,28 @@ def placements(
     if A > ON_TOP and stated:
         standing = {subject for relation, subject, _ in stated if relation == ON_TOP}
         backward[:, ON_TOP, [thing in standing for thing in first]] = NO_UNIT
+    asked_p: NDArray[np.floating[Any]] | None = None
     if at is not None:
-        relation, object_, outgoing = at
+        relation, object_, to_it = at
         (found,) = np.nonzero(anchors == present.row[object_])
         if len(found):
-            asked = ((0 if outgoing else A) + relation) * len(first) + int(found[0])
+            asked = ((0 if to_it else A) + relation) * len(first) + int(found[0])
+            row = int(anchors[found[0]])
+            asked_p = np.exp(
+                place_log_p(artifact, given, candidates, relation, row, outgoing=to_it)
+            )
             first[found[0]] = object_
-    which, relation, outgoing, anchor, probabilities = likeliest_places(
+    which, relations, outgoing, anchor, probabilities = likeliest_places(
         *(artifact.relation_slopes.placement, forward, backward, present.log_counts[anchors]),
         *(len(present.classes) + 1, PLACES, asked),
     )
+    if asked_p is not None:
+        probabilities[:: len(which) // len(candidates)] = asked_p
     offsets: Sequence[Offset | None] = [None] * len(which)
     if artifact.offsets is not None:
         ends = candidates[which], present.classes[anchors[anchor]]
-        offsets = offsets_of(artifact.offsets, relation, *ends, outgoing, axes)
-    named = zip(relation.tolist(), outgoing.tolist(), strict=True)
+        offsets = offsets_of(artifact.offsets, relations, *ends, outgoing, axes)
+    named = zip(relations.tolist(), outgoing.tolist(), strict=True)
     listed = entries(
         Placement,
         [(RELATIONS if out else _SEEN_FROM_ANCHORS)[number] for number, out in named],

@@ -126,7 +126,9 @@ class Calibration(Frozen):
         outlier: presence log-odds to the log-odds of being an intruder.
         relation: one entry a canonical relation.
         relation_given: the same where some relations of the scene are given; `relation` if empty.
-        placement: the same for a missing object and one that is there; `relation` if empty.
+        placement: the same for a missing object and one that is there, at its likeliest places;
+            `relation` if empty.
+        asked_place: the same at the place that a request asks for; `placement` if empty.
         misplaced: relation log-odds to the log-odds of being false.
     """
 
@@ -144,6 +146,7 @@ class Calibration(Frozen):
     relation: tuple[PairSlope, ...]
     relation_given: tuple[PairSlope, ...] = ()
     placement: tuple[PairSlope, ...] = ()
+    asked_place: tuple[PairSlope, ...] = ()
     misplaced: Slope = Slope()
 
     @model_validator(mode="before")
@@ -268,6 +271,7 @@ class Description(Frozen):
                 for kind, entries in (
                     ("relations given others", self.calibration.relation_given),
                     ("placements", self.calibration.placement),
+                    ("a place asked for", self.calibration.asked_place),
                 )
             ),
         ):

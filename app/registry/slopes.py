@@ -20,20 +20,24 @@ class RelationSlopes:
         alone: for scenes of which no relation is given.
         given: of which some are.
         placement: for a missing object and one that is there.
+        asked_place: the same at the place that a request asks for.
     """
 
     alone: Table
     given: Table
     placement: Table
+    asked_place: Table
 
     @classmethod
     def of(cls, calibration: Calibration) -> RelationSlopes:
         """The entries of a calibration, each kind standing in where another is empty."""
         alone = calibration.relation
+        placement = calibration.placement or alone
         return cls(
             _table(alone),
             _table(calibration.relation_given or alone),
-            _table(calibration.placement or alone),
+            _table(placement),
+            _table(calibration.asked_place or placement),
         )
 
 

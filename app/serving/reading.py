@@ -115,6 +115,8 @@ class Unknown:
             message = "the model does not know this room type"
             if not known:
                 message = "this model knows no room types"
+        if self.treatment == "nearest" and (label, is_room) not in self._looked_up:
+            message += f"; a request looks up the nearest class of {MAX_SUGGESTED} labels at most"
         few = len(faults.found.get(Reason.UNKNOWN_LABELS, ())) < MAX_SUGGESTED
         suggestions = [known[match.entry] for match in matches] if few else ()
         faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)

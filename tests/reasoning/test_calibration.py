@@ -152,3 +152,12 @@ def test_missing_at_a_place_is_there_and_stands_so(relation):
         assert (place.relation, place.object) == (relation, 1)
         expected = anywhere[answer.label] * place.probability
         assert answer.probability == pytest.approx(expected, rel=1e-4)
+
+
+def test_structure_is_never_an_intruder():
+    """Class 8 is structure."""
+    found = outliers(larger_artifact("triway-local"), scene_of([8, 0, 1, 8])).outliers
+    assert [one.object for one in found[-2:]] == [0, 3]
+    assert [one.probability for one in found[-2:]] == [0.0, 0.0]
+    assert not any(one.is_outlier for one in found[-2:])
+    assert all(one.probability > 0 for one in found[:-2])

@@ -251,7 +251,14 @@ def test_outliers(name, scene):
     _, found, unlikely = outliers(ARTIFACTS[name], scene)
     assert misplaced(ARTIFACTS[name], scene) == unlikely
     assert sorted(answer.object for answer in found) == list(range(len(scene.objects)))
-    keys = [(answer.log_odds, answer.object) for answer in found]
+    structure = ARTIFACTS[name].vocabulary.structure
+    wall = [bool(structure[scene.objects[answer.object].class_index]) for answer in found]
+    assert wall == sorted(wall), "structure comes last"
+    keys = [
+        (answer.log_odds, answer.object)
+        for answer, last in zip(found, wall, strict=True)
+        if not last
+    ]
     assert keys == sorted(keys)
     by_class: dict[str, set] = {}
     for answer in found:

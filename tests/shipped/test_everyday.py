@@ -15,7 +15,7 @@ FOLDER = REPOSITORY / EVERYDAY
 AT_LEAST = {
     "relations: the fact is the likeliest of eight": 40,
     "relations: the fact is the likeliest vertical one": 40,
-    "relations: the fact has p of at least .5": 26,
+    "relations: the fact has p of at least .5": 20,
     "missing: an expected object is among five": 20,
     "missing_at: an expected object is among five": 10,
     "outliers: the intruder comes first": 65,
