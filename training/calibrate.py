@@ -44,6 +44,7 @@ from training.cases import (
     told_pairs,
 )
 from training.datasets import EncodedScene
+from training.datasets.meanings import meaning_of
 from training.evaluation.alarms import kept_in_each_source
 from training.trainer import subset
 
@@ -157,7 +158,8 @@ def fit_placements(
 
     Returns:
         `placement`, fitted to the likeliest places, which an answer lists; and `asked_place`,
-        fitted to every place alike, since a request may ask for any.
+        fitted to every place alike, since a request may ask for any, of sources that tell of both
+        what holds and what does not: people's sentences tell of what holds.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
@@ -187,7 +189,7 @@ def fit_placements(
     examples, relations = _examples(blocks), artifact.machine.spec.A
     return {
         "placement": _fit_listed(examples, relations, PLACES),
-        "asked_place": _fit_listed(examples, relations, len(examples)),
+        "asked_place": _fit_listed(_told(examples, sources), relations, len(examples)),
     }
 
 
@@ -195,6 +197,15 @@ def _examples(blocks: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     """All of them, but of relations that have no unit in the machine and so no log-odds to read."""
     every = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     return every[every[:, _LOGIT] > NO_UNIT]
+
+
+def _told(examples: NDArray[np.float64], sources: Sequence[str]) -> NDArray[np.float64]:
+    """Those of relations that their source, if unlisted, says are off; all where no source does."""
+    telling = np.array([[how != "unobserved" for how in meaning_of(s).unlisted] for s in sources])
+    relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
+    told = telling[source, relation]
+    without = np.setdiff1d(relation, relation[told])
+    return examples[told | np.isin(relation, without)]
 
 
 def _fit_listed(

@@ -275,7 +275,11 @@ def _asked(reports: Reports) -> Iterator[Asked]:
 
 
 def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
-    """(source, task, metric name, one metric a seed) of a row."""
+    """(source, task, metric name, one metric a seed) of a row.
+
+    A metric that is pooled from fewer sources for one seed than for another is left out: a source
+    has no skill where all of its asked relations hold.
+    """
     found: dict[tuple[str, str, str], list[Metric]] = {}
     for (name, _), by_source in reports.items():
         if name != row:
@@ -285,4 +289,5 @@ def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list
                 for metric, value in (outcome.metrics if outcome else {}).items():
                     found.setdefault((source, task, metric), []).append(value)
     for (source, task, metric), values in found.items():
-        yield source, task, metric, values
+        if len({value.scenes for value in values}) == 1:
+            yield source, task, metric, values
