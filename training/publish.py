@@ -22,7 +22,7 @@ from app.scene import Vocabulary
 from training.calibrate import calibrate
 from training.draft import as_stored, draft_artifact
 from training.evaluation.everyday import EVERYDAY
-from training.evaluation.report import PUBLISHED_LIMIT, Row, evaluate
+from training.evaluation.report import Row, evaluate
 from training.offsets import fit_offsets
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
@@ -30,8 +30,6 @@ from training.terms import TERMS, terms_of
 from training.trainer import TrainingData
 
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
-# A machine without a closed form draws its answers: it is measured on so many times fewer scenes.
-_DRAWN = 10
 
 
 def publish_run(
@@ -124,13 +122,8 @@ def _measure(artifact: Artifact, data: TrainingData, progress: Callable[[str], N
     """Figures on the test part; none where there is none."""
     if not len(data.test):
         return []
-    limit = PUBLISHED_LIMIT if artifact.closed_form is not None else PUBLISHED_LIMIT // _DRAWN
     return evaluate(
-        artifact,
-        *(data.test, data.structure, data.train),
-        limit=limit,
-        everyday=EVERYDAY,
-        progress=progress,
+        artifact, data.test, data.structure, data.train, everyday=EVERYDAY, progress=progress
     )
 
 

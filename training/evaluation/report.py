@@ -60,8 +60,9 @@ _PUBLISHED: dict[str, tuple[str, ...]] = {
     "Offsets": METRICS,
     "Everyday": LINES,
 }
-PUBLISHED_LIMIT = 200
-"""Scenes of a source where a task is slow."""
+# Scenes of a source where a task is slow; and where the machine has no closed form and draws too.
+_LIMIT = 200
+_LIMIT_OF_DRAWS = 20
 
 Progress = Callable[[str], None]
 
@@ -260,7 +261,7 @@ def evaluate(
     structure: Tensor,
     train: SceneTensors,
     *,
-    limit: int | None = PUBLISHED_LIMIT,
+    limit: int | None = None,
     everyday: Path | None = None,
     progress: Progress = silent,
 ) -> list[Row]:
@@ -272,9 +273,12 @@ def evaluate(
         artifact: as it is published, with its calibration.
         structure: (V,) bool.
         train: training scenes, which generation must not copy, and which say what is typical.
-        limit: at most so many scenes of a source where a task is slow, see `Setting`.
+        limit: at most so many scenes of a source where a task is slow, see `Setting`; by default
+            fewer for a machine that draws its answers.
         everyday: folder of the everyday facts, see `Setting`.
     """
+    if limit is None:
+        limit = _LIMIT if artifact.closed_form is not None else _LIMIT_OF_DRAWS
     contender = artifact_contender(artifact, train)
     single = [task for task in _PUBLISHED if task not in WHOLE_SET]
     sources = list(by_source(scenes))

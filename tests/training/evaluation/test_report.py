@@ -254,7 +254,7 @@ def test_publishing_measures_the_published_tasks_on_every_source():
 def test_what_is_published_is_the_calibrated_artifact_s():
     """Another default threshold, other alarms; and no more scenes than the limit allows."""
 
-    def alarms(threshold, limit=None):
+    def alarms(threshold, limit=100):
         calibration = ARTIFACT.calibration.model_copy(
             update={"outlier_thresholds": Thresholds(medium=threshold)}
         )
