@@ -158,8 +158,8 @@ def fit_placements(
 
     Returns:
         `placement`, fitted to the likeliest places, which an answer lists; and `asked_place`,
-        fitted to every place alike, since a request may ask for any, of sources that tell of both
-        what holds and what does not: people's sentences tell of what holds.
+        fitted to every place alike, since a request may ask for any. Sources whose unlisted
+        relations are unobserved, such as people's sentences, are left out of the second.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
