@@ -154,6 +154,17 @@ def test_missing_at_a_place_is_there_and_stands_so(relation):
         assert answer.probability == pytest.approx(expected, rel=1e-4)
 
 
+def test_a_place_that_is_asked_about_has_entries_of_its_own():
+    """The others keep those of placements."""
+    listed, asked = (PairSlope(intercept=b, slope=0.0) for b in (-2.0, -1.0))
+    artifact = larger_artifact("triway-local", placement=(listed,) * 4, asked_place=(asked,) * 4)
+    for answer in missing(artifact, scene_of([0, 1, 1]), at=("left", 1), top_k=9):
+        first, *others = answer.placements
+        assert (first.relation, first.object) == ("left", 1)
+        assert first.probability == pytest.approx(sigmoid(-1.0), abs=1e-6)
+        assert [p.probability for p in others] == pytest.approx([sigmoid(-2.0)] * 2, abs=1e-6)
+
+
 def test_structure_is_never_an_intruder():
     """Class 8 is structure."""
     found = outliers(larger_artifact("triway-local"), scene_of([8, 0, 1, 8])).outliers

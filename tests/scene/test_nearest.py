@@ -55,6 +55,10 @@ def test_what_may_be_anything_is_taken_for_nothing(label: str) -> None:
     assert all(match.similarity < ACCEPTED for match in VOCABULARY.nearest(label))
 
 
+def test_names_that_begin_otherwise_are_seldom_misspelt() -> None:
+    assert nearest("magnot")[1] >= ACCEPTED > nearest("tagnet")[1]
+
+
 def test_only_plausible_names_are_suggested_best_first() -> None:
     assert VOCABULARY.suggest("fridgee") == ("fridge",)
     assert VOCABULARY.suggest("swivel chair") == ("chair",)
