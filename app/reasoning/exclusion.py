@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+
 Triple = tuple[int, int, int]
+
+# Relations of one direction: what is on top is higher too.
+_DIRECTION: Final = {ON_TOP: 0, ABOVE: 0, LEFT: 1, FRONT: 2}
 
 
 def staying(
@@ -19,24 +24,62 @@ def staying(
 ) -> NDArray[np.bool_]:
     """Which of the drawn relations stay, (m,).
 
-    Those that are given do. Of a(x, y) and a(y, x) the likelier one does, unless the other is
-    given. A class stands in no relation to itself, nor structure in any: training drops the
-    relations of structure, so what is drawn of them means nothing.
+    Those that are given do. The others are taken from the likeliest on. One stays if its two
+    classes have no relation yet (`app.scene.geometry` finds at most one), and if it closes no
+    circle: nothing is left of itself by way of others. A class stands in no relation to itself, nor
+    structure in any: training drops the relations of structure, so what is drawn of them means
+    nothing.
 
     Args:
         units: (m, 3) distinct (a, i, j) over classes.
-        logits: (m,) of each; where two are equal, the one from the smaller class stays.
+        logits: (m,) of each; where two are equal, the smaller (a, i, j) comes first.
         given: (a, i, j) over classes.
         structure: (V,) which classes are.
     """
-    a, i, j = units.T
-    classes = len(structure)
-    keys, mirrored = (a * classes + i) * classes + j, (a * classes + j) * classes + i
-    fixed = np.array([(b * classes + x) * classes + y for b, x, y in given], dtype=np.int64)
-    order = keys.argsort()
-    place = order[np.searchsorted(keys, mirrored, sorter=order).clip(max=len(keys) - 1)]
-    rival = np.where(keys[place] == mirrored, logits[place], -np.inf) if len(keys) else logits
-    wins = (logits > rival) | ((logits == rival) & (i < j))
-    possible = (i != j) & ~structure[i] & ~structure[j] & ~np.isin(mirrored, fixed)
-    stay: NDArray[np.bool_] = np.isin(keys, fixed) | (wins & possible)
-    return stay
+    order = np.lexsort((*units.T[::-1], -logits))
+    beyond = _Beyond()
+    for triple in given:
+        beyond.add(triple)
+    stay = np.zeros(len(units), dtype=np.bool_)
+    possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
+    triples: list[Triple] = [(a, i, j) for a, i, j in units.tolist()]
+    for k in order[possible[order]].tolist():
+        if beyond.admits(triples[k]):
+            beyond.add(triples[k])
+            stay[k] = True
+    return stay | np.array([triple in given for triple in triples], dtype=np.bool_)
+
+
+class _Beyond:
+    """Which classes lie beyond each class, in each of three directions, as bits of an integer."""
+
+    def __init__(self) -> None:
+        self._related: set[tuple[int, int]] = set()
+        self._places: dict[int, int] = {}
+        self._beyond: tuple[list[int], list[int], list[int]] = ([], [], [])
+
+    def admits(self, triple: Triple) -> bool:
+        """Whether the two are unrelated, and the first is not beyond the second already."""
+        a, i, j = triple
+        if (i, j) in self._related:
+            return False
+        x, y = self._place(i), self._place(j)
+        return not self._beyond[_DIRECTION[a]][y] >> x & 1
+
+    def add(self, triple: Triple) -> None:
+        """The second, and what is beyond it, is beyond the first and whatever that is beyond."""
+        a, i, j = triple
+        x, y = self._place(i), self._place(j)
+        self._related |= {(i, j), (j, i)}
+        beyond = self._beyond[_DIRECTION[a]]
+        more = beyond[y] | 1 << y
+        for k, own in enumerate(beyond):
+            if k == x or own >> x & 1:
+                beyond[k] = own | more
+
+    def _place(self, index: int) -> int:
+        place = self._places.setdefault(index, len(self._places))
+        if place == len(self._beyond[0]):
+            for direction in self._beyond:
+                direction.append(0)
+        return place

@@ -37,9 +37,9 @@ def generate(
 
     Structure stands in no relation but those of the evidence.
 
-    Of a(x, y) and a(y, x), which exclude each other, the one that is likelier given the context
-    stays where both were drawn; evidence stays in any case. A class stands in a relation to itself
-    only where the evidence says so, since a drawn scene holds every class once.
+    What was drawn can hold all at once: two classes have one relation at most, and nothing is left
+    of itself by way of others (`staying`). Evidence stays in any case. A class stands in a relation
+    to itself only where the evidence says so, since a drawn scene holds every class once.
 
     Args:
         count: how many scenes.
