@@ -14,6 +14,7 @@ Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -39,8 +40,8 @@ from training.trainer import subset
 
 Floats = NDArray[np.float64]
 
-COVERAGES = (0.3, 0.5, 0.7)
-WEIGHTS = (0.3, 0.5, 0.7, 1.0)
+COVERAGES = (0.3, 0.4, 0.5, 0.6, 0.7)
+WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
 # At .5 the share of uniform intruders that is caught on sunrgbd falls from .47 to .35.
 ALPHAS = (0.0, 0.125, 0.25, 0.375)
 PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
@@ -49,6 +50,8 @@ ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 
 # Scenes of a source.
 _PARTIAL_SCENES = 120
+# Classes of a scene that are hidden in turn, where all but one are shown.
+_DRAWS_OF_ONE = 4
 # Real rooms that are smaller than what is drawn, and scenes of a room type that tell.
 _SMALL = 0.1
 _UNSUITED = 0.15
@@ -57,9 +60,10 @@ _EVIDENCE_SCENES = 400
 # A machine without a closed form draws its answers, at a hundred times the cost.
 _EVIDENCE_SCENES_OF_DRAWS = 100
 # For the sake of others: what uniform intruders may lose of hit@1 and of the share caught, and what
-# all but one may.
+# nearly complete lists may lose of MRR.
 _UNIFORM_LOSS = np.array([0.04, 0.06])
-_COMPLETE_LOSS = 0.006
+_COMPLETE_LOSS = 0.002
+_NEARLY_COMPLETE = ("75 %", "all but one")
 # Pulls within so much of the best are as good: the least of them is taken.
 _AS_GOOD = 0.006
 # An answer lists ten classes by default; what is listed decides.
@@ -157,8 +161,8 @@ def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
 @dataclass(frozen=True, eq=False)
 class _Shown:
     """One scene of which a part is shown: log-odds (n,) of the unlisted classes, closed and by
-    coverage; which of them are hidden; how many are listed; the share's name; and how many scenes
-    of its source it stands for.
+    coverage; which of them are hidden; how many are listed; the share's name; its source; and how
+    many scenes of that it stands for.
     """
 
     closed: Floats
@@ -166,6 +170,7 @@ class _Shown:
     hidden: NDArray[np.bool_]
     listed: int
     share: str
+    source: int
     weight: float
 
 
@@ -197,11 +202,16 @@ def fit_coverage(
 
 
 def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
-    """Coverage and weight of the best MRR over all shares, that keep that of all but one."""
-    nearly = [case for case in cases if case.share == "all but one"]
-    floor = _mrr(nearly, 0.5, 0.0) - _COMPLETE_LOSS
-    both = [(coverage, weight) for coverage in COVERAGES for weight in (0.0, *WEIGHTS)]
-    allowed = [pair for pair in both if not pair[1] or _mrr(nearly, *pair) >= floor]
+    """Coverage and weight of the best MRR, that nearly keep that of nearly complete lists."""
+    keep = {
+        share: _mrr([case for case in cases if case.share == share], 0.5, 0.0) - _COMPLETE_LOSS
+        for share in _NEARLY_COMPLETE
+    }
+    allowed = [(0.5, 0.0)]
+    for pair in itertools.product(COVERAGES, WEIGHTS):
+        found = (_mrr([case for case in cases if case.share == share], *pair) for share in keep)
+        if all(mrr >= least for mrr, least in zip(found, keep.values(), strict=True)):
+            allowed.append(pair)
     return max(allowed, key=lambda pair: _mrr(cases, *pair))
 
 
@@ -219,11 +229,18 @@ def _shown(
         stands_for[own] = scenes.weight[order][own].sum() / min(count, _PARTIAL_SCENES)
     chosen = place < _PARTIAL_SCENES
     some, weight = subset(scenes, order[chosen]), stands_for[chosen].tolist()
+    source_of = source[chosen].tolist()
     whole = replace(
         artifact, calibration=artifact.calibration.model_copy(update={"coverage_weight": 1.0})
     )
-    for name, share in SHARES.items():
-        cases = hide(some, structure, share, seed)
+    # One hidden class of each scene alone would leave the choice to chance.
+    draws = [
+        (name, share, seed + draw)
+        for name, share in SHARES.items()
+        for draw in range(1 if share else _DRAWS_OF_ONE)
+    ]
+    for name, share, draw in draws:
+        cases = hide(some, structure, share, draw)
         for k, v, hidden in zip(cases.scene, cases.v.numpy(), cases.hidden.numpy(), strict=True):
             classes = np.flatnonzero(v)
             absent = np.flatnonzero((v == 0) & ~structure.numpy())
@@ -236,7 +253,8 @@ def _shown(
                 }
             closed = given.absent_log_odds(absent).astype(np.float64)
             listed = max(1, int((~structure.numpy()[classes]).sum()))
-            yield _Shown(closed, partial, hidden[absent], listed, name, weight[int(k)])
+            own = weight[int(k)] / (1 if share else _DRAWS_OF_ONE)
+            yield _Shown(closed, partial, hidden[absent], listed, name, source_of[int(k)], own)
 
 
 def _labels(classes: NDArray[np.int64]) -> Scene:
@@ -252,14 +270,14 @@ def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
 
 
 def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
-    """Mean over hidden classes of 1 / rank among the classes that are not hidden."""
-    found: list[Floats] = []
+    """Mean over hidden classes of 1 / rank among the classes that are not hidden; sources alike."""
+    found: dict[int, list[Floats]] = {}
     for case in cases:
         z = _mixed(case, coverage, weight)
         others = np.sort(z[~case.hidden])
         above = len(others) - np.searchsorted(others, z[case.hidden], side="right")
-        found.append(1.0 / (1.0 + above.astype(np.float64)))
-    return float(np.concatenate(found).mean())
+        found.setdefault(case.source, []).append(1.0 / (1.0 + above.astype(np.float64)))
+    return float(np.mean([np.concatenate(own).mean() for own in found.values()]))
 
 
 def _rows(case: _Shown, coverage: float, weight: float) -> Floats:
