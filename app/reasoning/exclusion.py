@@ -24,11 +24,14 @@ def staying(
 ) -> NDArray[np.bool_]:
     """Which of the drawn relations stay, (m,).
 
-    Those that are given do. The others are taken from the likeliest on. One stays if its two
-    classes have no relation yet (`app.scene.geometry` finds at most one), and if it closes no
-    circle: nothing is left of itself by way of others. A class stands in no relation to itself, nor
-    structure in any: training drops the relations of structure, so what is drawn of them means
-    nothing.
+    Those that are given do. The others are taken from the likeliest on. One stays if
+
+    - its two classes have no relation yet (`app.scene.geometry` finds at most one),
+    - it closes no circle: nothing is left of itself by way of others,
+    - its first class is on top of nothing else yet, where it is *on-top*.
+
+    A class stands in no relation to itself, nor structure in any: training drops the relations of
+    structure, so what is drawn of them means nothing.
 
     Args:
         units: (m, 3) distinct (a, i, j) over classes.
@@ -37,31 +40,35 @@ def staying(
         structure: (V,) which classes are.
     """
     order = np.lexsort((*units.T[::-1], -logits))
-    beyond = _Beyond()
+    holding = _Holding()
     for triple in given:
-        beyond.add(triple)
+        holding.add(triple)
     stay = np.zeros(len(units), dtype=np.bool_)
     possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
     triples: list[Triple] = [(a, i, j) for a, i, j in units.tolist()]
     for k in order[possible[order]].tolist():
-        if beyond.admits(triples[k]):
-            beyond.add(triples[k])
+        if holding.admits(triples[k]):
+            holding.add(triples[k])
             stay[k] = True
     return stay | np.array([triple in given for triple in triples], dtype=np.bool_)
 
 
-class _Beyond:
-    """Which classes lie beyond each class, in each of three directions, as bits of an integer."""
+class _Holding:
+    """Relations that hold, and which classes lie beyond each in each of three directions.
+
+    Classes have places in the order in which they come. Those beyond a class are the bits of a number.
+    """
 
     def __init__(self) -> None:
         self._related: set[tuple[int, int]] = set()
+        self._supported: set[int] = set()
         self._places: dict[int, int] = {}
         self._beyond: tuple[list[int], list[int], list[int]] = ([], [], [])
 
     def admits(self, triple: Triple) -> bool:
-        """Whether the two are unrelated, and the first is not beyond the second already."""
+        """Whether it can hold together with those that were added."""
         a, i, j = triple
-        if (i, j) in self._related:
+        if (i, j) in self._related or (a == ON_TOP and i in self._supported):
             return False
         x, y = self._place(i), self._place(j)
         return not self._beyond[_DIRECTION[a]][y] >> x & 1
@@ -71,6 +78,8 @@ class _Beyond:
         a, i, j = triple
         x, y = self._place(i), self._place(j)
         self._related |= {(i, j), (j, i)}
+        if a == ON_TOP:
+            self._supported.add(i)
         beyond = self._beyond[_DIRECTION[a]]
         more = beyond[y] | 1 << y
         for k, own in enumerate(beyond):

@@ -37,9 +37,10 @@ def generate(
 
     Structure stands in no relation but those of the evidence.
 
-    What was drawn can hold all at once: two classes have one relation at most, and nothing is left
-    of itself by way of others (`staying`). Evidence stays in any case. A class stands in a relation
-    to itself only where the evidence says so, since a drawn scene holds every class once.
+    What was drawn can hold all at once: two classes have one relation at most, a class is on top of
+    one other at most, and nothing is left of itself by way of others (`staying`). Evidence stays in
+    any case. A class stands in a relation to itself only where the evidence says so, since a drawn
+    scene holds every class once.
 
     Args:
         count: how many scenes.

@@ -20,9 +20,12 @@ NONE = np.zeros(V, dtype=np.bool_)
 
 
 def possible(triples):
-    """One relation a pair, and an order of the classes in each direction."""
+    """One relation a pair, one support a class, and an order of the classes in each direction."""
     pairs = [frozenset((i, j)) for _, i, j in triples]
     if len(set(pairs)) < len(pairs) or any(len(pair) == 1 for pair in pairs):
+        return False
+    supported = [i for a, i, _ in triples if a == ON_TOP]
+    if len(set(supported)) < len(supported):
         return False
     try:
         for direction in ({ON_TOP, ABOVE}, {LEFT}, {FRONT}):
