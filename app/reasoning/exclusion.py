@@ -56,7 +56,7 @@ def staying(
 class _Holding:
     """Relations that hold, and which classes lie beyond each in each of three directions.
 
-    Classes have places in the order in which they come. Those beyond a class are the bits of a number.
+    Classes have places in the order they come in. Those beyond a class are the bits of a number.
     """
 
     def __init__(self) -> None:
