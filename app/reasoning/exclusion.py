@@ -12,7 +12,7 @@ from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
 
 Triple = tuple[int, int, int]
 
-# Relations of one direction: what is on top is higher too.
+# The direction of each relation: a thing on top of another is higher, as one above it is.
 _DIRECTION: Final = {ON_TOP: 0, ABOVE: 0, LEFT: 1, FRONT: 2}
 
 
@@ -27,11 +27,11 @@ def staying(
     Those that are given do. The others are taken from the likeliest on. One stays if
 
     - its two classes have no relation yet (`app.scene.geometry` finds at most one),
-    - it closes no circle: nothing is left of itself by way of others,
-    - its first class is on top of nothing else yet, where it is *on-top*.
+    - it closes no circle, such as A left of B, B left of C, C left of A,
+    - its first class has no other support yet, where it is *on-top*.
 
-    A class stands in no relation to itself, nor structure in any: training drops the relations of
-    structure, so what is drawn of them means nothing.
+    A class stands in no relation to itself. Structure stands in none: training drops its relations,
+    so those that are drawn have no meaning.
 
     Args:
         units: (m, 3) distinct (a, i, j) over classes.
@@ -74,7 +74,7 @@ class _Holding:
         return not self._beyond[_DIRECTION[a]][y] >> x & 1
 
     def add(self, triple: Triple) -> None:
-        """The second, and what is beyond it, is beyond the first and whatever that is beyond."""
+        """Note that it holds, and everything that follows for what lies beyond what."""
         a, i, j = triple
         x, y = self._place(i), self._place(j)
         self._related |= {(i, j), (j, i)}
