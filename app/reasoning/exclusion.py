@@ -8,16 +8,23 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
+from app.compiling import compiled
+from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
 
 Triple = tuple[int, int, int]
+Places = NDArray[np.int64]
 
-# The direction of each relation: a thing on top of another is higher, as one above it is.
-_DIRECTION: Final = {ON_TOP: 0, ABOVE: 0, LEFT: 1, FRONT: 2}
+# The direction of each relation: up, left or front. A thing on another is higher, as one above it.
+_DIRECTION: Final = np.zeros(len(CANONICAL), dtype=np.int64)
+_DIRECTION[[LEFT, FRONT]] = 1, 2
+_DIRECTIONS: Final = 3
+
+_ONE: Final = np.uint64(1)
+_WORD: Final = 64
 
 
 def staying(
-    units: NDArray[np.int64],
+    units: Places,
     logits: NDArray[np.floating[Any]],
     given: Collection[Triple],
     structure: NDArray[np.bool_],
@@ -39,56 +46,50 @@ def staying(
         given: (a, i, j) over classes.
         structure: (V,) which classes are.
     """
+    fixed = np.array(sorted(given), dtype=np.int64).reshape(-1, 3)
     order = np.lexsort((*units.T[::-1], -logits))
-    holding = _Holding()
-    for triple in given:
-        holding.add(triple)
-    stay = np.zeros(len(units), dtype=np.bool_)
     possible = (units[:, 1] != units[:, 2]) & ~structure[units[:, 1:]].any(axis=1)
-    triples: list[Triple] = [(a, i, j) for a, i, j in units.tolist()]
-    for k in order[possible[order]].tolist():
-        if holding.admits(triples[k]):
-            holding.add(triples[k])
-            stay[k] = True
-    return stay | np.array([triple in given for triple in triples], dtype=np.bool_)
+    every = np.concatenate([fixed, units])
+    classes, places = np.unique(every[:, 1:], return_inverse=True)
+    stay: NDArray[np.bool_] = _holding(
+        every[:, 0], places.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
+    )
+    shape = len(CANONICAL), len(structure), len(structure)
+    stay |= np.isin(np.ravel_multi_index(units.T, shape), np.ravel_multi_index(fixed.T, shape))
+    return stay
 
 
-class _Holding:
-    """Relations that hold, and which classes lie beyond each in each of three directions.
+@compiled
+def _holding(
+    relation: Places, places: Places, order: Places, given: int, count: int
+) -> NDArray[np.bool_]:
+    """Which of m relations hold beside those that are given, (m,).
 
-    Classes have places in the order they come in. Those beyond a class are the bits of a number.
+    Args:
+        relation: (given + m,), those that are given first.
+        places: (given + m, 2) of the two classes.
+        order: of those to try, 0 to m - 1, likeliest first.
+        given: how many are given.
+        count: n, how many classes there are.
     """
-
-    def __init__(self) -> None:
-        self._related: set[tuple[int, int]] = set()
-        self._supported: set[int] = set()
-        self._places: dict[int, int] = {}
-        self._beyond: tuple[list[int], list[int], list[int]] = ([], [], [])
-
-    def admits(self, triple: Triple) -> bool:
-        """Whether it can hold together with those that were added."""
-        a, i, j = triple
-        if (i, j) in self._related or (a == ON_TOP and i in self._supported):
-            return False
-        x, y = self._place(i), self._place(j)
-        return not self._beyond[_DIRECTION[a]][y] >> x & 1
-
-    def add(self, triple: Triple) -> None:
-        """Note that it holds, and everything that follows for what lies beyond what."""
-        a, i, j = triple
-        x, y = self._place(i), self._place(j)
-        self._related |= {(i, j), (j, i)}
-        if a == ON_TOP:
-            self._supported.add(i)
-        beyond = self._beyond[_DIRECTION[a]]
-        more = beyond[y] | 1 << y
-        for k, own in enumerate(beyond):
-            if k == x or own >> x & 1:
-                beyond[k] = own | more
-
-    def _place(self, index: int) -> int:
-        place = self._places.setdefault(index, len(self._places))
-        if place == len(self._beyond[0]):
-            for direction in self._beyond:
-                direction.append(0)
-        return place
+    # Bit y of beyond[d, x]: y lies beyond x in direction d.
+    beyond = np.zeros((_DIRECTIONS, count, count // _WORD + 1), np.uint64)
+    related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
+    stay = np.zeros(len(relation) - given, np.bool_)
+    for turn in range(given + len(order)):
+        e = turn if turn < given else given + order[turn - given]
+        x, y, far = places[e, 0], places[e, 1], beyond[_DIRECTION[relation[e]]]
+        word, bit = x // _WORD, np.uint64(x % _WORD)
+        on_top = relation[e] == ON_TOP
+        if turn >= given:
+            circle = far[y, word] >> bit & _ONE
+            if circle or related[x, y] or (on_top and supported[x]):
+                continue
+            stay[e - given] = True
+        related[x, y] = related[y, x] = True
+        supported[x] |= on_top
+        for k in range(count):
+            if k == x or far[k, word] >> bit & _ONE:
+                far[k] |= far[y]
+                far[k, y // _WORD] |= _ONE << np.uint64(y % _WORD)
+    return stay
