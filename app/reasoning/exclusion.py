@@ -12,7 +12,7 @@ from app.compiling import compiled
 from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
 
 Triple = tuple[int, int, int]
-Places = NDArray[np.int64]
+Indices = NDArray[np.int64]
 
 # The direction of each relation: up, left or front. A thing on another is higher, as one above it.
 _DIRECTION: Final = np.zeros(len(CANONICAL), dtype=np.int64)
@@ -24,7 +24,7 @@ _WORD: Final = 64
 
 
 def staying(
-    units: Places,
+    units: Indices,
     logits: NDArray[np.floating[Any]],
     given: Collection[Triple],
     structure: NDArray[np.bool_],
@@ -52,7 +52,8 @@ def staying(
     every = np.concatenate([fixed, units])
     classes, places = np.unique(every[:, 1:], return_inverse=True)
     stay: NDArray[np.bool_] = _holding(
-        every[:, 0], places.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)
+        np.ascontiguousarray(every[:, 0]),
+        *(places.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)),
     )
     shape = len(CANONICAL), len(structure), len(structure)
     stay |= np.isin(np.ravel_multi_index(units.T, shape), np.ravel_multi_index(fixed.T, shape))
@@ -61,7 +62,7 @@ def staying(
 
 @compiled
 def _holding(
-    relation: Places, places: Places, order: Places, given: int, count: int
+    relation: Indices, places: Indices, order: Indices, given: int, count: int
 ) -> NDArray[np.bool_]:
     """Which of m relations hold beside those that are given, (m,).
 

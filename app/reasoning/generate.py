@@ -37,9 +37,9 @@ def generate(
 
     Structure stands in no relation but those of the evidence.
 
-    What was drawn can hold all at once: two classes have one relation at most, a class is on top of
-    one other at most, and nothing is left of itself by way of others (`staying`). Evidence stays in
-    any case. A class stands in a relation to itself only where the evidence says so, since a drawn
+    The drawn relations can hold all at once (`staying`): two classes have one at most, a class is
+    on top of one other at most, and no circle of left, front or above closes. Evidence stays in any
+    case. A class stands in a relation to itself only where the evidence says so, since a drawn
     scene holds every class once.
 
     Args:
