@@ -203,15 +203,13 @@ def fit_coverage(
 
 def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
     """Coverage and weight of the best MRR, that nearly keep that of nearly complete lists."""
-    keep = {
-        share: _mrr([case for case in cases if case.share == share], 0.5, 0.0) - _COMPLETE_LOSS
-        for share in _NEARLY_COMPLETE
-    }
-    allowed = [(0.5, 0.0)]
-    for pair in itertools.product(COVERAGES, WEIGHTS):
-        found = (_mrr([case for case in cases if case.share == share], *pair) for share in keep)
-        if all(mrr >= least for mrr, least in zip(found, keep.values(), strict=True)):
-            allowed.append(pair)
+    nearly = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
+    least = [_mrr(some, 0.5, 0.0) - _COMPLETE_LOSS for some in nearly]
+    allowed = [(0.5, 0.0)] + [
+        pair
+        for pair in itertools.product(COVERAGES, WEIGHTS)
+        if all(_mrr(some, *pair) >= limit for some, limit in zip(nearly, least, strict=True))
+    ]
     return max(allowed, key=lambda pair: _mrr(cases, *pair))
 
 
