@@ -33,7 +33,12 @@ from training.cases import logistic
 from training.evaluation.alarms import alarm_threshold
 from training.evaluation.evidence import removals
 from training.evaluation.missing import machine_score
-from training.evaluation.outliers import IntruderScores, by_popularity, intruder_scores
+from training.evaluation.outliers import (
+    IntruderScores,
+    by_popularity,
+    clean_scores,
+    intruder_scores,
+)
 from training.evaluation.partial import SHARES, hide
 from training.evaluation.signature import by_signature
 from training.trainer import subset
@@ -48,6 +53,9 @@ PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
 ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Shares of untouched scenes of the hardest large source that raise an alarm."""
 
+# Lists of up to so many classes have thresholds of their own, where so many scenes tell them.
+_SHORT_LISTS = 4
+_SHORT_LIST_SCENES = 30
 # Scenes of a source.
 _PARTIAL_SCENES = 120
 # Classes of a scene that are hidden in turn, where all but one are shown.
@@ -297,7 +305,12 @@ def fit_outliers(
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
-    """`popularity_weight`, `outlier` and `outlier_thresholds`."""
+    """`popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
+
+    A robot that has just begun to look lists few classes of a scene. The probability is fitted to
+    whole scenes and is too high there: in a procedural room a lone stove is rare. So lists of up to
+    four classes have thresholds of their own, by the same rule, on parts of the same scenes.
+    """
     score = machine_score(artifact.machine)
     prior = np.array(artifact.calibration.popularity)
     laws = {
@@ -325,16 +338,51 @@ def fit_outliers(
     slope, size, intercept = logistic(examples[:, :2], examples[:, 2] > 0)
     entry = CountSlope(intercept=intercept, slope=slope, log_count=size)
     untouched = next(iter(judged.values()))
-    logits = intercept + slope * untouched.log_odds + size * np.log(untouched.size)
+    limits = _limits(untouched, scenes, entry, rng)
+    fitted: dict[str, Any] = {
+        "popularity_weight": alpha,
+        "outlier": entry,
+        "outlier_thresholds": limits,
+    }
+    short = []
+    for listed in range(1, _SHORT_LISTS + 1):
+        some, parts_of = listing(scenes, structure, listed, rng)
+        if len(some) < _SHORT_LIST_SCENES:
+            return fitted
+        found = clean_scores(parts_of, structure, score).with_prior(alpha * prior)
+        short.append(_at_least(limits, _limits(found, some, entry, rng)))
+    return fitted | {"short_list_thresholds": tuple(short)}
+
+
+def listing(
+    scenes: SceneTensors, structure: Tensor, listed: int, rng: np.random.Generator
+) -> tuple[SceneTensors, Tensor]:
+    """The scenes of more classes than so many, and presence (N, V) of so many of them.
+
+    Structure is listed as it was and does not count.
+    """
+    plain = (scenes.v > 0) & ~structure
+    large = (plain.sum(1) > listed).nonzero().squeeze(1)
+    order = torch.from_numpy(rng.random(plain[large].shape)).masked_fill(~plain[large], 2.0)
+    kept = order.argsort(1)[:, :listed]
+    shown = scenes.v[large] * structure
+    return subset(scenes, large), shown.scatter(1, kept, 1.0)
+
+
+def _limits(
+    untouched: IntruderScores, scenes: SceneTensors, entry: CountSlope, rng: np.random.Generator
+) -> Thresholds:
+    logits = entry.intercept + entry.slope * untouched.log_odds
+    logits = logits + entry.log_count * np.log(untouched.size)
     limits = {
         name: float(1 / (1 + np.exp(-alarm_threshold(logits, untouched, scenes, rng, share))))
         for name, share in ALARMS.items()
     }
-    return {
-        "popularity_weight": alpha,
-        "outlier": entry,
-        "outlier_thresholds": Thresholds(**limits),
-    }
+    return Thresholds(**limits)
+
+
+def _at_least(limits: Thresholds, found: Thresholds) -> Thresholds:
+    return Thresholds(**{name: max(getattr(limits, name), getattr(found, name)) for name in ALARMS})
 
 
 def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:

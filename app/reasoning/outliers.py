@@ -46,7 +46,7 @@ def outliers(
     score alike. Intruders are often common things in the wrong room: their prior is proportional
     to popularity^alpha, so alpha times the log-odds of the class in a training scene is subtracted
     from its log-odds here. Structure, such as a wall, is never an intruder: its probability is 0.
-    Ties go by position.
+    Ties go by position. A list of few classes says little of the scene, so its threshold is higher.
 
     Args:
         sensitivity: which of the model's thresholds decide.
@@ -58,7 +58,11 @@ def outliers(
     """
     calibration = artifact.calibration
     if threshold is None:
-        threshold = _threshold(calibration.outlier_thresholds, sensitivity)
+        presets = calibration.outlier_thresholds
+        listed = _listed(artifact, scene)
+        if 0 < listed <= len(calibration.short_list_thresholds):
+            presets = calibration.short_list_thresholds[listed - 1]
+        threshold = _threshold(presets, sensitivity)
     if not 0 <= threshold <= 1:
         raise ValueError(f"threshold must be in [0, 1], not {threshold}")
     if not scene.objects:
@@ -99,6 +103,13 @@ def misplaced(
     if not scene.objects:
         return ()
     return _misplaced(artifact, posterior(artifact, scene), scene, sensitivity)
+
+
+def _listed(artifact: Artifact, scene: Scene) -> int:
+    """How many classes of the vocabulary are listed, structure aside."""
+    structure = artifact.vocabulary.structure
+    known = {thing.class_index for thing in scene.objects} - {None}
+    return sum(not structure[index] for index in known)
 
 
 def _threshold(presets: Thresholds, sensitivity: Sensitivity) -> float:

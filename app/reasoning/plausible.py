@@ -54,7 +54,9 @@ class Plausible:
         if not self._suits_room(classes):
             return False
         judged = Scene(objects, room_type=self._room)
-        found = outliers(self._artifact, judged, sensitivity="medium", details=False).outliers
+        # A drawn scene is whole, however few its classes are.
+        whole = self._artifact.calibration.outlier_thresholds.medium
+        found = outliers(self._artifact, judged, threshold=whole, details=False).outliers
         return not any(
             entry.is_outlier and objects[entry.object].class_index not in self._given
             for entry in found

@@ -118,6 +118,8 @@ class Calibration(Frozen):
         popularity: (V,) log-odds of finding each class in a training scene; empty: all alike.
         popularity_weight: alpha of the prior of an intruder, proportional to popularity^alpha.
         outlier_thresholds: probabilities from which an object is an outlier.
+        short_list_thresholds: the same for lists of 1, 2, ... classes, structure aside; longer
+            lists have `outlier_thresholds`.
         misplaced_thresholds: probabilities from which a relation is misplaced.
         smallest: (C + 1,) classes that nine in ten real rooms of each type have at least,
             and last of all rooms together; empty: any number.
@@ -139,6 +141,7 @@ class Calibration(Frozen):
     popularity: tuple[float, ...] = ()
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
     outlier_thresholds: Thresholds = Thresholds()
+    short_list_thresholds: tuple[Thresholds, ...] = ()
     misplaced_thresholds: Thresholds = Thresholds()
     smallest: tuple[Count, ...] = ()
     room_fit: tuple[float, ...] = ()

@@ -61,6 +61,26 @@ def test_a_higher_sensitivity_raises_every_alarm_of_a_lower_one(name):
     assert outliers(artifact, scene) == outliers(artifact, scene, sensitivity="medium")
 
 
+def test_a_list_of_few_classes_has_a_threshold_of_its_own():
+    """By its distinct classes without structure; the request's own threshold still wins."""
+    short = tuple(Thresholds(low=p, medium=p - 0.01, high=p - 0.02) for p in (0.99, 0.95))
+    artifact = larger_artifact(
+        "triway-local", outlier_thresholds=PRESETS, short_list_thresholds=short
+    )
+    wall = LABELS.index("wall")
+    for listed, high, medium in (
+        ([0], 0.97, 0.98),
+        ([0, 0, wall], 0.97, 0.98),
+        ([0, 1, 1], 0.93, 0.94),
+        ([0, 1, 2], 0.3, 0.6),
+        ([wall], 0.3, 0.6),
+    ):
+        scene = scene_of(listed)
+        assert outliers(artifact, scene).threshold == pytest.approx(medium)
+        assert outliers(artifact, scene, sensitivity="high").threshold == pytest.approx(high)
+        assert outliers(artifact, scene, threshold=0.5).threshold == 0.5
+
+
 def test_a_threshold_replaces_that_of_objects_only():
     artifact = larger_artifact(
         "triway-local", outlier_thresholds=PRESETS, misplaced_thresholds=PRESETS

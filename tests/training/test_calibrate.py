@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from app.boltzmann import MachineSpec, build
-from app.reasoning import misplaced
+from app.reasoning import misplaced, outliers
 from app.registry import Calibration
 from tests.reasoning.artifacts import artifact_of
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, rooms
@@ -28,15 +28,17 @@ from training.calibrate_objects import (
     fit_coverage,
     fit_evidence,
     least_of_the_best,
+    listing,
     popularity,
 )
 from training.cases import altered_case
 from training.config import ObjectsConfig
 from training.draft import draft_artifact
-from training.evaluation.alarms import alarm_threshold
+from training.evaluation.alarms import alarm_threshold, calibrated_alarm
 from training.evaluation.answers import QUESTIONS, collect
+from training.evaluation.asking import of_classes
 from training.evaluation.missing import machine_score
-from training.evaluation.outliers import IntruderScores, intruder_scores
+from training.evaluation.outliers import IntruderScores, clean_scores, intruder_scores
 from training.objects import fit_objects, store_samples
 
 ROOM_COUNT = 400
@@ -206,8 +208,32 @@ def test_thresholds_keep_their_share_of_untouched_scenes(model, fitted):
     logits = entry.intercept + entry.slope * own.log_odds + entry.log_count * np.log(own.size)
     p = 1 / (1 + np.exp(-logits))
     for name, share in ALARMS.items():
-        found = own.false_alarms(p, getattr(fitted.outlier_thresholds, name)).value
+        found = own.false_alarms(p >= getattr(fitted.outlier_thresholds, name)).value
         assert 0 < found <= share + 0.01
+
+
+def test_lists_of_few_classes_keep_the_share_too(model, fitted):
+    """On other parts of the rooms than were fitted on."""
+    scenes, rng = complete_scenes(rooms(300, 1)), np.random.default_rng(7)
+    artifact = replace(model, calibration=fitted)
+    assert len(fitted.short_list_thresholds) == 4
+    for listed in range(1, 5):
+        some, parts = listing(scenes, STRUCTURE, listed, rng)
+        plain = (parts > 0) & ~STRUCTURE
+        assert (plain.sum(1) == listed).all()
+        assert (parts <= some.v).all()
+        assert (parts * STRUCTURE == some.v * STRUCTURE).all()
+        assert ((some.v > 0) & ~STRUCTURE).sum(1).min() > listed
+        found = clean_scores(parts, STRUCTURE, machine_score(model.machine))
+        assert (found.listed == listed).all()
+        alarms = found.false_alarms(calibrated_alarm(fitted).raised(found)).value
+        # 300 rooms: a share of .1 lies above .17 with probability 1e-4.
+        assert alarms <= 0.17
+        k = int(found.scene[0])
+        told = of_classes(parts[k].nonzero().squeeze(1).tolist())
+        limit = outliers(artifact, told).threshold
+        assert limit == fitted.short_list_thresholds[listed - 1].medium
+        assert limit >= fitted.outlier_thresholds.medium
 
 
 def test_hidden_classes_are_as_likely_as_said(model, fitted):

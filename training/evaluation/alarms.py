@@ -42,10 +42,19 @@ class Alarm:
     Attributes:
         suspicion: scores (N,) of each judged object, higher = more an intruder.
         threshold: from which an object raises the alarm.
+        short: the same for lists of 1, 2, ... classes, structure aside.
     """
 
     suspicion: Callable[[IntruderScores], Floats]
     threshold: float
+    short: tuple[float, ...] = ()
+
+    def raised(self, scores: IntruderScores) -> NDArray[np.bool_]:
+        """Whether each scored object raises the alarm, (N,)."""
+        limits = np.array([*self.short, self.threshold])
+        limit = limits[np.minimum(scores.listed - 1, len(self.short))]
+        loud: NDArray[np.bool_] = self.suspicion(scores) >= limit
+        return loud
 
 
 def calibrated_alarm(calibration: Calibration) -> Alarm:
@@ -60,7 +69,8 @@ def calibrated_alarm(calibration: Calibration) -> Alarm:
         logits = entry.intercept + entry.slope * scores.log_odds + size
         return np.asarray(1 / (1 + np.exp(-logits)))
 
-    return Alarm(suspicion, calibration.outlier_thresholds.medium)
+    short = tuple(limits.medium for limits in calibration.short_list_thresholds)
+    return Alarm(suspicion, calibration.outlier_thresholds.medium, short)
 
 
 def fitted_alarm(

@@ -7,7 +7,7 @@ uniformly from the classes that training saw in the same room type.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +41,13 @@ class IntruderScores:
     scenes: int
     skipped: int
 
+    @property
+    def listed(self) -> NDArray[np.int64]:
+        """(N,) number of distinct classes in the scene as scored, structure aside."""
+        as_scored = 2 * self.scene + self.clean
+        counts: NDArray[np.int64] = np.bincount(as_scored)[as_scored]
+        return counts
+
     def with_prior(self, prior: NDArray[np.float64]) -> IntruderScores:
         """With the log-odds of being an intruder taken from each class, (V,)."""
         return replace(self, log_odds=self.log_odds - prior[self.thing])
@@ -69,24 +76,17 @@ class IntruderScores:
         scene, score = self.scene[rows], -self.log_odds[rows]
         return Scored(statistic, scene, score, self.intruder[rows], self.scenes)
 
-    def false_alarms(self, suspicion: NDArray[np.float64], threshold: float) -> Ratio:
-        """Share of untouched scenes in which something reaches the threshold.
+    def false_alarms(self, loud: NDArray[np.bool_]) -> Ratio:
+        """Share of untouched scenes in which some object is loud, (N,)."""
+        return self._alarms(loud, self.clean)
 
-        Args:
-            suspicion: (N,) of each object; the higher, the more an intruder.
-        """
-        return self._alarms(suspicion, threshold, self.clean)
+    def caught(self, loud: NDArray[np.bool_]) -> Ratio:
+        """Share of intruders that are loud, (N,)."""
+        return self._alarms(loud, self.intruder)
 
-    def caught(self, suspicion: NDArray[np.float64], threshold: float) -> Ratio:
-        """Share of intruders that reach the threshold."""
-        return self._alarms(suspicion, threshold, self.intruder)
-
-    def _alarms(
-        self, suspicion: NDArray[np.float64], threshold: float, judged: NDArray[np.bool_]
-    ) -> Ratio:
+    def _alarms(self, loud: NDArray[np.bool_], judged: NDArray[np.bool_]) -> Ratio:
         there = np.bincount(self.scene[judged], minlength=self.scenes) > 0
-        loud = judged & (suspicion >= threshold)
-        alarm = np.bincount(self.scene[loud], minlength=self.scenes) > 0
+        alarm = np.bincount(self.scene[judged & loud], minlength=self.scenes) > 0
         return Ratio(alarm.astype(np.float64), there.astype(np.float64))
 
 
@@ -140,12 +140,35 @@ def intruder_scores(
     """Score every object of every scene, clean and with one intruder; see `draw_intruders`."""
     added = draw_intruders(scenes, structure, weights, seed)
     kept = (added >= 0).nonzero().squeeze(1)
+    blocks = (
+        part
+        for index in kept.split(block)
+        if len(index)
+        for part in _scored_blocks(scenes.v[index], index, added[index], structure, score)
+    )
+    return _scores(blocks, len(scenes), len(kept))
+
+
+@torch.no_grad()
+def clean_scores(
+    v: Tensor, structure: Tensor, score: ObjectScore, block: int = 64
+) -> IntruderScores:
+    """Score every object of every scene (N, V) as it is."""
+    index = torch.arange(len(v))
+    blocks = (
+        _scored(v[some], some, torch.full_like(some, -1), structure, score, clean=True)
+        for some in index.split(block)
+        if len(some)
+    )
+    return _scores(blocks, len(v), len(v))
+
+
+_Columns = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def _scores(blocks: Iterable[_Columns], scenes: int, kept: int) -> IntruderScores:
     nothing = torch.zeros(0, dtype=torch.int64)
-    parts = [(nothing, nothing.double(), nothing.bool(), nothing, nothing.bool(), nothing)]
-    for index in kept.split(block):
-        if not len(index):
-            continue
-        parts += _scored_blocks(scenes.v[index], index, added[index], structure, score)
+    parts = [(nothing, nothing.double(), nothing.bool(), nothing, nothing.bool(), nothing), *blocks]
     placed, log_odds, intruder, sizes, untouched, thing = (
         torch.cat(column).numpy() for column in zip(*parts, strict=True)
     )
@@ -156,21 +179,25 @@ def intruder_scores(
         sizes,
         untouched,
         thing,
-        scenes=len(scenes),
-        skipped=len(scenes) - len(kept),
+        scenes=scenes,
+        skipped=scenes - kept,
     )
 
 
 def _scored_blocks(
     clean: Tensor, index: Tensor, added: Tensor, structure: Tensor, score: ObjectScore
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]]:
-    if not len(index):
-        return
+) -> Iterator[_Columns]:
     dirty = clean.scatter(1, added.unsqueeze(1), 1.0)
-    for v, is_clean in ((clean, True), (dirty, False)):
-        row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
-        rest = v[row].scatter(1, thing.unsqueeze(1), 0.0)
-        odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
-        bad = (thing == added[row]) & (not is_clean)
-        size = (v > 0).sum(1)[row]
-        yield index[row], odds.double(), bad, size, torch.full_like(bad, is_clean), thing
+    yield _scored(clean, index, added, structure, score, clean=True)
+    yield _scored(dirty, index, added, structure, score, clean=False)
+
+
+def _scored(
+    v: Tensor, index: Tensor, added: Tensor, structure: Tensor, score: ObjectScore, *, clean: bool
+) -> _Columns:
+    row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
+    rest = v[row].scatter(1, thing.unsqueeze(1), 0.0)
+    odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
+    bad = (thing == added[row]) & (not clean)
+    size = (v > 0).sum(1)[row]
+    return index[row], odds.double(), bad, size, torch.full_like(bad, clean), thing

@@ -96,7 +96,7 @@ def metrics(
     if len(outliers.scene):
         found["T3 hit@1"] = outliers.hit_at_1()
         found["T3 AUROC"] = outliers.auroc()
-        found["T3 alarms"] = outliers.false_alarms(loud.astype(float), 0.5)
+        found["T3 alarms"] = outliers.false_alarms(loud)
     false = placement_scores(consistent, structure, asked.stated, seed=seed)
     if len(false.scene):
         found["T3b hit@1"] = false.hit_at_1()
@@ -153,8 +153,7 @@ def directly(artifact: Artifact) -> Asked:
         scenes: SceneTensors, structure: Tensor, seed: int
     ) -> tuple[IntruderScores, NDArray[np.bool_]]:
         found = intruder_scores(scenes, structure, objects, seed=seed)
-        alarm = calibrated_alarm(calibration)
-        return found, alarm.suspicion(found) >= alarm.threshold
+        return found, calibrated_alarm(calibration).raised(found)
 
     return Asked(objects, relations, stated, placed, intruders)
 

@@ -15,7 +15,7 @@ stands beside it. Structure raises no alarm and takes no rank. Ties score their 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -28,7 +28,9 @@ from app.reasoning import Sensitivity
 from app.registry import Artifact
 from app.scene import Scene, SceneObject
 from training.batches import SceneTensors
+from training.datasets import EncodedScene
 from training.evaluation.asking import SENSITIVITIES, ask_every, judge, labels_alone, things
+from training.evaluation.cases import scene_rng
 from training.evaluation.contenders import Contender
 from training.evaluation.intervals import Metric
 from training.evaluation.metrics import Ratio
@@ -45,6 +47,9 @@ _OFTEN = 0.2
 _FOREIGN = 0.01
 
 Law = Callable[[SceneTensors, SceneTensors], Tensor]
+
+# Lists of so few classes are asked too: a robot that has just begun to look.
+_SHORT_LISTS = (1, 2, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,18 +173,33 @@ def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
 
 
 def alarms(
-    artifact: Artifact, scenes: SceneTensors, structure: Tensor, sensitivity: Sensitivity
-) -> NDArray[np.bool_]:
-    """(N,) some object of the untouched scene is called an outlier."""
-    plain = ~structure.numpy()
-    cases = [labels_alone(scene) for scene in scenes.scenes]
+    artifact: Artifact,
+    cases: Sequence[Scene],
+    structure: Tensor,
+    sensitivity: Sensitivity,
+    judged: NDArray[np.bool_],
+) -> Ratio:
+    """Share of the judged of N untouched scenes with an object that is called an outlier."""
+    plain = structure.numpy()
     found = ask_every(partial(verdict, artifact, sensitivity), cases)
-    return np.array(
+    loud = np.array(
         [
-            bool((columns[:, 2] > 0)[plain[scene.instance_classes]].any())
-            for scene, columns in zip(scenes.scenes, found, strict=True)
-        ],
-        dtype=np.bool_,
+            bool(((columns[:, 2] > 0) & things(case, plain)).any())
+            for case, columns in zip(cases, found, strict=True)
+        ]
+    )
+    return Ratio((loud & judged).astype(np.float64), judged.astype(np.float64))
+
+
+def first_classes(
+    encoded: EncodedScene, structure: Tensor, listed: int, rng: np.random.Generator
+) -> Scene:
+    """All instances of so many of its classes, drawn at random, and its structure."""
+    things_there = np.unique(encoded.instance_classes)
+    things_there = rng.permutation(things_there[~structure.numpy()[things_there]])
+    hidden = things_there[listed:]
+    return labels_alone(
+        encoded, np.flatnonzero(~np.isin(encoded.instance_classes, hidden)).tolist()
     )
 
 
@@ -235,8 +255,21 @@ def sensitivity_task(contender: Contender, setting: Setting) -> Outcome | None:
             metrics[f"caught, {name}, {sensitivity}"] = judged.caught(sensitivity)
     if not metrics:
         return None
+    cases = [labels_alone(scene) for scene in scenes.scenes]
     for sensitivity in SENSITIVITIES:
-        loud = alarms(artifact, scenes, structure, sensitivity) & judged_scenes
-        share = Ratio(loud.astype(np.float64), judged_scenes.astype(np.float64))
-        metrics[f"alarms, {sensitivity}"] = share
+        metrics[f"alarms, {sensitivity}"] = alarms(
+            artifact, cases, structure, sensitivity, judged_scenes
+        )
+    plain = (scenes.v > 0) & ~structure
+    for listed in _SHORT_LISTS:
+        large = judged_scenes & (plain.sum(1) > listed).numpy()
+        if not large.any():
+            continue
+        cases = [
+            first_classes(scene, structure, listed, scene_rng(scene, setting.seed))
+            for scene in scenes.scenes
+        ]
+        metrics[f"alarms, medium, {listed} listed"] = alarms(
+            artifact, cases, structure, "medium", large
+        )
     return Outcome(metrics, len(scenes), int((~judged_scenes).sum()))

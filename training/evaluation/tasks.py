@@ -220,9 +220,9 @@ def outliers_task(
         "average precision": scores.average_precision(),
     }
     if contender.alarm is not None:
-        suspicion, threshold = contender.alarm.suspicion(scores), contender.alarm.threshold
-        metrics["alarms in untouched scenes"] = scores.false_alarms(suspicion, threshold)
-        metrics["intruders caught"] = scores.caught(suspicion, threshold)
+        loud = contender.alarm.raised(scores)
+        metrics["alarms in untouched scenes"] = scores.false_alarms(loud)
+        metrics["intruders caught"] = scores.caught(loud)
     return Outcome(metrics, len(scenes), scores.skipped)
 
 

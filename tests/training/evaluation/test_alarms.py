@@ -41,7 +41,7 @@ def smooth(v):
 def shares(score, alarm, scenes):
     """Share of untouched scenes with an alarm, by source."""
     scores = intruder_scores(scenes, WIDE_STRUCTURE, score)
-    loud = alarm.suspicion(scores) >= alarm.threshold
+    loud = alarm.raised(scores)
     alarms = np.bincount(scores.scene[loud & scores.clean], minlength=len(scenes)) > 0
     source = np.array([entry.source for entry in scenes.scenes])
     return {str(name): float(alarms[source == name].mean()) for name in np.unique(source)}
@@ -72,8 +72,8 @@ def test_a_machine_and_a_baseline_of_the_same_scores_alarm_alike():
     rng = np.random.default_rng
     plain = alarm_threshold(-scores.log_odds, scores, scenes, rng(0))
     mapped = alarm_threshold(1 - 2 * scores.log_odds, scores, scenes, rng(0))
-    baseline = scores.false_alarms(-scores.log_odds, plain).value
-    assert scores.false_alarms(1 - 2 * scores.log_odds, mapped).value == baseline
+    baseline = scores.false_alarms(-scores.log_odds >= plain).value
+    assert scores.false_alarms(1 - 2 * scores.log_odds >= mapped).value == baseline
     assert 0 < baseline <= MEDIUM + 0.02
 
 
@@ -85,7 +85,7 @@ def test_a_smaller_share_of_alarms_has_a_higher_threshold():
         for share in (0.02, MEDIUM, 0.2)
     ]
     assert limits == sorted(limits, reverse=True)
-    alarms = [scores.false_alarms(-scores.log_odds, limit).value for limit in limits]
+    alarms = [scores.false_alarms(-scores.log_odds >= limit).value for limit in limits]
     for alarm, share in zip(alarms, (0.02, MEDIUM, 0.2), strict=True):
         assert 0 < alarm <= share + 0.02
 

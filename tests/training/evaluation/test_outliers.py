@@ -57,9 +57,9 @@ def test_metrics_by_hand():
     # Intruders at -1 and 1, others at 1, 2, 0, 3: 4 pairs + 2.5 pairs of 8.
     assert scores.auroc().value == pytest.approx(6.5 / 8)
     suspicion = -scores.log_odds
-    assert scores.false_alarms(suspicion, 0.0).value == pytest.approx(1 / 2)
-    assert scores.false_alarms(suspicion, 0.5).value == 0.0
-    assert scores.caught(suspicion, 0.5).value == pytest.approx(1 / 2)
+    assert scores.false_alarms(suspicion >= 0.0).value == pytest.approx(1 / 2)
+    assert scores.false_alarms(suspicion >= 0.5).value == 0.0
+    assert scores.caught(suspicion >= 0.5).value == pytest.approx(1 / 2)
     # Class 0 is often an intruder: the second scene's is found, and the first one's still.
     likely = scores.with_prior(np.array([1.5, 0.0, 0.0]))
     assert likely.log_odds.tolist() == [-0.5, 2, -1, 0, 3, -0.5, -0.5, 2, 0, 3]

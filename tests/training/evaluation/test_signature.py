@@ -128,6 +128,8 @@ def test_every_sensitivity_has_alarms_and_catches():
     for name in SENSITIVITIES:
         for figure in ("alarms", "caught, uniform", "caught, by popularity"):
             assert 0 <= outcome.metrics[f"{figure}, {name}"].value <= 1
+    for listed in (1, 2):
+        assert 0 <= outcome.metrics[f"alarms, medium, {listed} listed"].value <= 1
     assert outcome.scenes == 12
     assert sensitivity_task(Contender(), Setting(DATA, STRUCTURE, TRAIN)) is None
 
