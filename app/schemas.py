@@ -281,7 +281,7 @@ class OutliersOptions(Request):
         Sensitivity,
         Field(
             description="how readily an alarm is raised: in about 2, 10 or 20 % of untouched "
-            "scenes of the hardest large source"
+            "scenes of the hardest large source, and of lists of few classes"
         ),
     ] = "medium"
     threshold: Annotated[

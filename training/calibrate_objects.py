@@ -54,8 +54,9 @@ ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Shares of untouched scenes of the hardest large source that raise an alarm."""
 
 # Lists of up to so many classes have thresholds of their own, where so many scenes tell them.
-_SHORT_LISTS = 4
+_SHORT_LISTS = 12
 _SHORT_LIST_SCENES = 30
+_NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 # Scenes of a source.
 _PARTIAL_SCENES = 120
 # Classes of a scene that are hidden in turn, where all but one are shown.
@@ -308,8 +309,9 @@ def fit_outliers(
     """`popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
 
     A robot that has just begun to look lists few classes of a scene. The probability is fitted to
-    whole scenes and is too high there: in a procedural room a lone stove is rare. So lists of up to
-    four classes have thresholds of their own, by the same rule, on parts of the same scenes.
+    whole scenes and is too high there: in a procedural room a lone stove is rare. So such lists
+    have thresholds of their own, by the same rule, on parts of the same scenes: no lower than those
+    of whole scenes, and no higher than those of shorter lists.
     """
     score = machine_score(artifact.machine)
     prior = np.array(artifact.calibration.popularity)
@@ -344,13 +346,16 @@ def fit_outliers(
         "outlier": entry,
         "outlier_thresholds": limits,
     }
-    short = []
+    short: list[Thresholds] = []
     for listed in range(1, _SHORT_LISTS + 1):
         some, parts_of = listing(scenes, structure, listed, rng)
         if len(some) < _SHORT_LIST_SCENES:
-            return fitted
+            break
         found = clean_scores(parts_of, structure, score).with_prior(alpha * prior)
-        short.append(_at_least(limits, _limits(found, some, entry, rng)))
+        own = _between(limits, _limits(found, some, entry, rng), short[-1] if short else _NEVER)
+        if own == limits:
+            break
+        short.append(own)
     return fitted | {"short_list_thresholds": tuple(short)}
 
 
@@ -381,8 +386,13 @@ def _limits(
     return Thresholds(**limits)
 
 
-def _at_least(limits: Thresholds, found: Thresholds) -> Thresholds:
-    return Thresholds(**{name: max(getattr(limits, name), getattr(found, name)) for name in ALARMS})
+def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds:
+    return Thresholds(
+        **{
+            name: min(max(getattr(found, name), getattr(low, name)), getattr(high, name))
+            for name in ALARMS
+        }
+    )
 
 
 def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:

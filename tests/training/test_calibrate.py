@@ -216,8 +216,12 @@ def test_lists_of_few_classes_keep_the_share_too(model, fitted):
     """On other parts of the rooms than were fitted on."""
     scenes, rng = complete_scenes(rooms(300, 1)), np.random.default_rng(7)
     artifact = replace(model, calibration=fitted)
-    assert len(fitted.short_list_thresholds) == 4
-    for listed in range(1, 5):
+    assert fitted.short_list_thresholds
+    every = [*fitted.short_list_thresholds, fitted.outlier_thresholds]
+    for name in ALARMS:
+        limits = [getattr(one, name) for one in every]
+        assert limits == sorted(limits, reverse=True)
+    for listed in range(1, len(every)):
         some, parts = listing(scenes, STRUCTURE, listed, rng)
         plain = (parts > 0) & ~STRUCTURE
         assert (plain.sum(1) == listed).all()
