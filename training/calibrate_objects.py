@@ -54,7 +54,7 @@ ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Shares of untouched scenes of the hardest large source that raise an alarm."""
 
 # Lists of up to so many classes have thresholds of their own, where so many scenes tell them.
-_SHORT_LISTS = 12
+_SHORT_LISTS = 4
 _SHORT_LIST_SCENES = 30
 _NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 # Scenes of a source.
