@@ -20,7 +20,7 @@ from app.reasoning.listing import least_fitting
 from app.reasoning.posterior import Posterior, posterior
 from app.reasoning.reasons import EXPLAINED, strongest_reasons
 from app.registry.artifact import Artifact
-from app.registry.description import Thresholds
+from app.registry.description import Calibration, Thresholds
 from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
 
@@ -57,18 +57,16 @@ def outliers(
         ValueError: a threshold outside [0, 1].
     """
     calibration = artifact.calibration
-    if threshold is None:
-        presets = calibration.outlier_thresholds
-        listed = _listed(artifact, scene)
-        if 0 < listed <= len(calibration.short_list_thresholds):
-            presets = calibration.short_list_thresholds[listed - 1]
-        threshold = _threshold(presets, sensitivity)
-    if not 0 <= threshold <= 1:
+    if threshold is not None and not 0 <= threshold <= 1:
         raise ValueError(f"threshold must be in [0, 1], not {threshold}")
     if not scene.objects:
-        return OutliersFound(threshold, (), ())
+        limit = _threshold(calibration.outlier_thresholds, sensitivity)
+        return OutliersFound(limit if threshold is None else threshold, (), ())
     given = posterior(artifact, scene)
     classes = given.present.classes
+    if threshold is None:
+        listed = int((~artifact.vocabulary.structure[classes]).sum())
+        threshold = _threshold(_presets(calibration, listed), sensitivity)
     log_odds = given.log_odds_given_rest()
     order, p = least_fitting(
         *intruder_line(calibration, len(log_odds)),
@@ -105,11 +103,11 @@ def misplaced(
     return _misplaced(artifact, posterior(artifact, scene), scene, sensitivity)
 
 
-def _listed(artifact: Artifact, scene: Scene) -> int:
-    """How many classes of the vocabulary are listed, structure aside."""
-    structure = artifact.vocabulary.structure
-    known = {thing.class_index for thing in scene.objects} - {None}
-    return sum(not structure[index] for index in known)
+def _presets(calibration: Calibration, listed: int) -> Thresholds:
+    """The thresholds where so many classes are listed, structure aside."""
+    if 0 < listed <= len(calibration.short_list_thresholds):
+        return calibration.short_list_thresholds[listed - 1]
+    return calibration.outlier_thresholds
 
 
 def _threshold(presets: Thresholds, sensitivity: Sensitivity) -> float:
