@@ -180,11 +180,10 @@ def alarms(
     judged: NDArray[np.bool_],
 ) -> Ratio:
     """Share of the judged of N untouched scenes with an object that is called an outlier."""
-    plain = structure.numpy()
     found = ask_every(partial(verdict, artifact, sensitivity), cases)
     loud = np.array(
         [
-            bool(((columns[:, 2] > 0) & things(case, plain)).any())
+            bool(((columns[:, 2] > 0) & things(case, structure.numpy())).any())
             for case, columns in zip(cases, found, strict=True)
         ]
     )
@@ -195,12 +194,10 @@ def first_classes(
     encoded: EncodedScene, structure: Tensor, listed: int, rng: np.random.Generator
 ) -> Scene:
     """All instances of so many of its classes, drawn at random, and its structure."""
-    things_there = np.unique(encoded.instance_classes)
-    things_there = rng.permutation(things_there[~structure.numpy()[things_there]])
-    hidden = things_there[listed:]
-    return labels_alone(
-        encoded, np.flatnonzero(~np.isin(encoded.instance_classes, hidden)).tolist()
-    )
+    every = np.unique(encoded.instance_classes)
+    hidden = rng.permutation(every[~structure.numpy()[every]])[listed:]
+    kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden))
+    return labels_alone(encoded, kept.tolist())
 
 
 def signature_task(contender: Contender, setting: Setting) -> Outcome | None:
