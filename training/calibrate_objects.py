@@ -377,8 +377,7 @@ def listing(
 def _limits(
     untouched: IntruderScores, scenes: SceneTensors, entry: CountSlope, rng: np.random.Generator
 ) -> Thresholds:
-    logits = entry.intercept + entry.slope * untouched.log_odds
-    logits = logits + entry.log_count * np.log(untouched.size)
+    logits = entry.log_odds(untouched.log_odds, untouched.size).astype(np.float64)
     limits = {
         name: float(1 / (1 + np.exp(-alarm_threshold(logits, untouched, scenes, rng, share))))
         for name, share in ALARMS.items()

@@ -75,8 +75,7 @@ def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
 
 def missing_logits(calibration: Calibration, log_odds: Floats, listed: int) -> Floats:
     """Logits of "this class is there unlisted", with so many classes listed."""
-    entry = calibration.missing
-    return entry.intercept + entry.log_count * math.log(listed) + entry.slope * log_odds
+    return calibration.missing.log_odds(log_odds, listed)
 
 
 def placement_log_p(

@@ -6,6 +6,8 @@ import json
 from datetime import UTC, datetime
 from typing import Annotated, Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     AwareDatetime,
@@ -25,6 +27,7 @@ from app.scene.vocabulary import Vocabulary
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Text = Annotated[str, StringConstraints(min_length=1)]
 Count = Annotated[int, Field(ge=0)]
+Floats = NDArray[np.floating[Any]]
 
 
 def _in_utc(moment: datetime) -> datetime:
@@ -54,6 +57,11 @@ class CountSlope(Frozen):
     intercept: float = 0.0
     slope: float = 1.0
     log_count: float = 0.0
+
+    def log_odds(self, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
+        """The log-odds of logits z (N,), of one n or of one each (N,)."""
+        found: Floats = self.intercept + self.log_count * np.log(n) + self.slope * z
+        return found
 
 
 class PairSlope(CountSlope):

@@ -204,9 +204,7 @@ def test_thresholds_keep_their_share_of_untouched_scenes(model, fitted):
     scenes = complete_scenes(rooms(300, 1))
     scores = intruder_scores(scenes, STRUCTURE, machine_score(model.machine))
     own = scores.with_prior(fitted.popularity_weight * np.array(fitted.popularity))
-    entry = fitted.outlier
-    logits = entry.intercept + entry.slope * own.log_odds + entry.log_count * np.log(own.size)
-    p = 1 / (1 + np.exp(-logits))
+    p = 1 / (1 + np.exp(-fitted.outlier.log_odds(own.log_odds, own.size)))
     for name, share in ALARMS.items():
         found = own.false_alarms(p >= getattr(fitted.outlier_thresholds, name)).value
         assert 0 < found <= share + 0.01

@@ -65,9 +65,7 @@ def calibrated_alarm(calibration: Calibration) -> Alarm:
     def suspicion(scores: IntruderScores) -> Floats:
         if len(popularity):
             scores = scores.with_prior(calibration.popularity_weight * popularity)
-        size = entry.log_count * np.log(scores.size)
-        logits = entry.intercept + entry.slope * scores.log_odds + size
-        return np.asarray(1 / (1 + np.exp(-logits)))
+        return np.asarray(1 / (1 + np.exp(-entry.log_odds(scores.log_odds, scores.size))))
 
     short = tuple(limits.medium for limits in calibration.short_list_thresholds)
     return Alarm(suspicion, calibration.outlier_thresholds.medium, short)
