@@ -375,7 +375,7 @@ def nonsense() -> Iterator[Hostile]:
             text = json.dumps(body | extra).encode()
             yield Hostile(f"{path} {name}", path, text, expected=frozenset(expected))
         if path != "/generate":
-            scenes = [body for body, _ in bodies.values()] + [None, [], MARKER, {}]
+            scenes: list[Any] = [body for body, _ in bodies.values()] + [None, [], MARKER, {}]
             text = json.dumps({"scenes": scenes}).encode()
             yield Hostile(f"{path} nonsense at once", f"{path}/batch", text)
             text = json.dumps({"scenes": [{}] * 257}).encode()

@@ -1,0 +1,535 @@
+"""Record what a running service answers, and compare another version's answers with the record.
+
+    python -m scripts.corpus record http://127.0.0.1:8000 answers.jsonl.gz --key ADMIN_KEY
+    python -m scripts.corpus compare http://127.0.0.1:8001 answers.jsonl.gz --key ADMIN_KEY
+
+Both services serve the repository's own `model_store`; `compare` replays the recorded requests. An
+answer is equal if its status, its problem type and its fields are, its numbers within 1e-5. Order
+and cut of a list may differ where probabilities are that close. Of `/generate` only what does not
+depend on the draw is compared here, and the shares of classes in many drawn scenes, each by a test
+of two proportions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import gzip
+import hashlib
+import json
+import math
+import random
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import httpx
+from websockets.sync.client import connect
+
+from tests.chaos import corpus as hostile
+
+TOLERANCE: Final = 1e-5
+SEED: Final = 20261123
+QUESTIONS: Final = ("relations", "missing", "outliers")
+MODELS: Final = (
+    "default", "indoor-triway", "indoor-gbm", "indoor-rbm", "indoor-triway-deep", "open-triway",
+    "everyday-triway", "procthor-triway", "indoor-triway@2.0.0",
+)  # fmt: skip
+RELATIONS: Final = ("left", "right", "front", "behind", "on-top", "under", "above", "below")
+HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "location")
+# No deadline passes on a busy machine.
+PATIENCE: Final = {"x-request-timeout-ms": "600000"}
+# Different in each answer, or in each process.
+VOLATILE: Final = frozenset({"request_id", "instance", "session", "seed"})
+# Chance that one of all compared shares of classes differs although nothing has changed.
+FAILURE: Final = 1e-3
+
+Json = Any
+
+
+# ------------------------------------------------------------------------------------ requests
+
+
+class Scenes:
+    """Random scenes of one model.
+
+    Args:
+        labels: that the model knows.
+        rooms: room types that it knows.
+        likely: scenes that it has drawn, so that half of ours are like real ones.
+    """
+
+    def __init__(
+        self, rng: random.Random, labels: list[str], rooms: list[str], likely: list[list[str]]
+    ) -> None:
+        self.rng, self.labels, self.rooms, self.likely = rng, labels, rooms, likely
+
+    def classes(self) -> list[str]:
+        """1 to 24 labels, some of them twice."""
+        rng = self.rng
+        found = list(rng.choice(self.likely)) if rng.random() < 0.6 else []
+        found += rng.sample(self.labels, rng.choice([0, 1, 1, 2, 4, 12]))
+        found = found or [rng.choice(self.labels)]
+        if rng.random() < 0.2:
+            found += rng.choices(found, k=2)
+        rng.shuffle(found)
+        return found[:24]
+
+    def scene(self) -> dict[str, Json]:
+        """What every question takes."""
+        rng, labels = self.rng, self.classes()
+        body: dict[str, Json] = {"objects": labels}
+        form = rng.random()
+        if form < 0.35:
+            body["objects"] = [self.detection(k, label) for k, label in enumerate(labels)]
+            body["frame_id"] = rng.choice(["base_link", "map", "camera_optical_frame", "odom"])
+            if rng.random() < 0.4:
+                body["viewpoint"] = {k: round(rng.uniform(-3, 3), 2) for k in ("x", "y", "yaw")}
+        elif form < 0.65 and len(set(labels)) > 1:
+            labels = list(dict.fromkeys(labels))
+            body["objects"] = labels
+            body["relations"] = self.relations(labels)
+            body["relations_complete"] = rng.random() < 0.2
+        elif form < 0.75:
+            body["objects"] = [
+                {"label": label, "confidence": round(rng.uniform(0.05, 1), 2)} for label in labels
+            ]
+        if self.rooms and rng.random() < 0.4:
+            body["room_type"] = rng.choice(self.rooms)
+        if rng.random() < 0.1:
+            body["stamp"] = {"sec": rng.randrange(10**9), "nanosec": rng.randrange(10**9)}
+        if rng.random() < 0.25:
+            body["unknown_labels"] = rng.choice(["error", "ignore", "nearest"])
+            word = rng.choice(self.labels)
+            wrong = rng.choice([word + "s", word[1:], word[:-1] + "x", "blue " + word, "zzxqv"])
+            body["objects"] = [*body["objects"], wrong]
+        return body
+
+    def detection(self, number: int, label: str) -> dict[str, Json]:
+        rng = self.rng
+        found: dict[str, Json] = {"id": f"{label[:20]}#{number}", "label": label}
+        if rng.random() < 0.95:
+            far = 3000.0 if rng.random() < 0.01 else 3.0
+            found["position"] = {
+                "x": round(rng.uniform(0, far), 3), "y": round(rng.uniform(-far, far), 3),
+                "z": round(rng.uniform(0, 1.5), 3),
+            }  # fmt: skip
+        if rng.random() < 0.6:
+            found["size"] = {k: round(rng.uniform(0.1, 1.5), 3) for k in "xyz"}
+        if rng.random() < 0.3:
+            angle = rng.uniform(-math.pi, math.pi)
+            found["orientation"] = {"x": 0.0, "y": 0.0, "z": math.sin(angle), "w": math.cos(angle)}
+        if rng.random() < 0.3:
+            found["confidence"] = round(rng.uniform(0.05, 1), 2)
+        return found
+
+    def relations(self, labels: list[str]) -> list[dict[str, str]]:
+        rng = self.rng
+        pairs = [(a, b) for k, a in enumerate(labels) for b in labels[k + 1 :]]
+        return [
+            {"subject": a, "relation": rng.choice(RELATIONS), "object": b}
+            for a, b in rng.sample(pairs, min(len(pairs), rng.choice([1, 2, 5, 15])))
+        ]
+
+    def options(self, question: str, body: dict[str, Json]) -> dict[str, Json]:
+        """What one question takes beside the scene."""
+        rng = self.rng
+        names = [o if isinstance(o, str) else o.get("id", o["label"]) for o in body["objects"]]
+        found: dict[str, Json] = {}
+        if rng.random() < 0.5 and question != "outliers":
+            found["top_k"] = rng.choice([1, 3, 10, 50])
+        match question:
+            case "relations":
+                if rng.random() < 0.3:
+                    found["include_opposites"] = True
+                if rng.random() < 0.3:
+                    found["min_probability"] = rng.choice([0.01, 0.2, 0.9])
+                if rng.random() < 0.3:
+                    found["pairs"] = [
+                        {"subject": rng.choice(names), "object": rng.choice(names)}
+                        for _ in range(rng.choice([1, 4]))
+                    ]
+            case "missing":
+                if rng.random() < 0.4:
+                    found["coverage"] = rng.choice([0.0, 0.25, 0.5, 0.9, 1.0])
+                if rng.random() < 0.3:
+                    found["candidates"] = rng.sample(self.labels, 5)
+                if rng.random() < 0.4:
+                    found["at"] = {"relation": rng.choice(RELATIONS), "object": rng.choice(names)}
+            case "outliers":
+                if rng.random() < 0.5:
+                    found["sensitivity"] = rng.choice(["low", "medium", "high"])
+                if rng.random() < 0.2:
+                    found["threshold"] = rng.choice([0.0, 0.3, 0.7, 1.0])
+        return found
+
+
+def post(path: str, body: Json, **headers: str) -> dict[str, Json]:
+    """A request as it is recorded."""
+    return {
+        "method": "POST", "path": path,
+        "headers": {"content-type": "application/json", **PATIENCE, **headers},
+        "body": base64.b64encode(json.dumps(body).encode()).decode(),
+    }  # fmt: skip
+
+
+def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Json]]:
+    """Scenes of every model, alone and in batches."""
+    for model in MODELS:
+        words = client.get(f"/models/{model}/vocabulary").raise_for_status().json()
+        drawn = client.post("/generate", json={"model": model, "count": 64, "seed": 1}).json()
+        likely = [scene["objects"] for scene in drawn["scenes"] if scene["objects"]]
+        labels = [entry["label"] for entry in words["objects"]]
+        scenes = Scenes(rng, labels, words["room_types"], likely)
+        count = 60 if model in {"procthor-triway", "indoor-triway@2.0.0"} else 210
+        for k in range(count):
+            question = QUESTIONS[k % 3]
+            body = scenes.scene() | {"model": model}
+            if model == "default":
+                del body["model"]
+            yield post(f"/{question}", body | scenes.options(question, body))
+        for question in QUESTIONS:
+            for size in (1, 4, 16):
+                batch: list[Json] = [scenes.scene() | {"model": model} for _ in range(size)]
+                batch[-1] |= scenes.options(question, batch[-1])
+                yield post(f"/{question}/batch", {"scenes": [*batch, {"objects": [""]}]})
+        for _ in range(12):
+            body = scenes.scene() | {"model": model, "count": 3, "seed": 7, "steps": 20}
+            yield post("/generate", body)
+
+
+def drawn(client: httpx.Client) -> Iterator[dict[str, Json]]:
+    """Questions of `/generate` whose answers are compared by the shares of classes."""
+    for model in MODELS[1:7]:
+        words = client.get(f"/models/{model}/vocabulary").json()
+        rooms = [room for room in ("kitchen", "bedroom", "bathroom") if room in words["room_types"]]
+        evidence: list[dict[str, Json]] = [
+            {},
+            *({"room_type": room} for room in rooms),
+            {"objects": ["table"]},
+        ]
+        for body in evidence:
+            yield post("/generate", {**body, "model": model, "count": 64, "seed": 11})
+
+
+def errors() -> Iterator[dict[str, Json]]:
+    """Requests that are refused, some of each kind."""
+    kinds = (
+        list(hostile.wrong_values())[::23], list(hostile.whole_bodies())[::2],
+        list(hostile.nonsense()), list(hostile.media_types())[::5], list(hostile.methods()),
+    )  # fmt: skip
+    for kind in kinds:
+        for entry in kind:
+            headers = dict(hostile.JSON) | entry.headers
+            if len(entry.body) > 200_000 or not all(isinstance(v, str) for v in headers.values()):
+                continue
+            if "home" in entry.path or entry.path == hostile.ALIAS:
+                continue
+            yield {
+                "method": entry.method, "path": entry.path, "headers": headers,
+                "body": base64.b64encode(entry.body).decode(),
+            }  # fmt: skip
+    for given in ("0", "-1", "x", "600001", "1.5", "600000"):
+        yield post("/missing", {"objects": ["bed"]}, **{"x-request-timeout-ms": given})
+    yield post("/missing", {"objects": ["bed"]}, **{"x-request-id": "corpus-1"})
+
+
+def pages(client: httpx.Client) -> Iterator[dict[str, Json]]:
+    """Everything that is read, and administration without and with its key."""
+    listed = client.get("/models").json()
+    paths = [
+        "/", "/docs", "/redoc", "/openapi.json", "/models", "/health/live", "/health/ready", "/v2",
+        "/v2/health/live", "/v2/health/ready", "/problems", "/nowhere", "/stream", "/models/none",
+        "/models/none/vocabulary", "/v2/models/none", "/v2/models/none/ready",
+    ]  # fmt: skip
+    listing = client.get("/problems").text.split('"/problems/')[1:]
+    paths += ["/problems/" + entry.partition('"')[0] for entry in listing]
+    names = [model["name"] for model in listed["models"]]
+    for name in [*names, "default", "procthor-triway"]:
+        paths += [f"/models/{name}", f"/models/{name}/vocabulary", f"/models/{name}/contexts"]
+        paths += [f"/v2/models/{name}", f"/v2/models/{name}/ready"]
+    for model in listed["models"]:
+        paths += [f"/models/{model['name']}/versions/{v['version']}" for v in model["versions"]]
+        paths.append(f"/models/{model['name']}/versions/9.9.9")
+    for path in paths:
+        yield {"method": "GET", "path": path, "headers": {}, "body": ""}
+    alias = "/models/aliases/candidate"
+    yield post("/models/refresh", None)
+    for key in ("wrong", "KEY"):
+        header = {"x-admin-key": key, "content-type": "application/json"}
+        yield {"method": "POST", "path": "/models/refresh", "headers": header, "body": ""}
+        for body in (
+            {"model": "indoor-rbm"}, {"model": "indoor-gbm", "expected": "open-triway"},
+            {"model": "indoor-triway@2.0.0", "expected": "indoor-rbm"}, {"model": "none"}, {},
+            {"model": "indoor-rbm@9.9.9"},
+        ):  # fmt: skip
+            request = post(alias, body, **header)
+            yield request | {"method": "PUT"}
+            yield request | {"method": "PUT", "path": "/models/aliases/indoor-rbm"}
+    yield post("/missing", {"objects": ["bed", "lamp"], "model": "candidate"})
+
+
+def streams(rng: random.Random) -> Iterator[list[dict[str, Json]]]:
+    """Conversations: a scene that grows and shrinks, with faults in between."""
+    labels = ["bed", "lamp", "pillow", "nightstand", "stove", "desk", "chair", "toilet", "sofa"]
+    for number in range(24):
+        ask = [{"missing": {"top_k": 5}, "outliers": {}}, {"relations": {"top_k": 5}}][number % 2]
+        talk: list[dict[str, Json]] = [{"type": "open", "ask": ask}]
+        if number % 3 == 0:
+            talk[0]["model"] = rng.choice(MODELS[:6])
+        present: list[str] = []
+        for seq in range(1, 9):
+            kind = rng.random()
+            if kind < 0.15 and len(present) > 1:
+                gone = present.pop(rng.randrange(len(present)))
+                talk.append({"type": "update", "seq": seq, "remove": [gone]})
+            elif kind < 0.25:
+                talk.append({"type": "update", "seq": seq, "objects": ["bedd"]})
+            elif kind < 0.35:
+                present = rng.sample(labels, 4)
+                talk.append({"type": "scene", "seq": seq, "objects": present[:]})
+            else:
+                new = rng.choice(labels)
+                entry: Json = new
+                if rng.random() < 0.5:
+                    entry = {"id": new, "label": new}
+                    entry["position"] = {k: round(rng.uniform(0, 2), 2) for k in "xyz"}
+                if new not in present:
+                    present.append(new)
+                talk.append({"type": "update", "seq": seq, "objects": [entry]})
+        talk += [{"type": "update", "seq": 3, "objects": ["bed"]}, {"type": "nonsense"}]
+        yield talk
+
+
+# ------------------------------------------------------------------------------------- asking
+
+
+def ask(client: httpx.Client, request: dict[str, Json], key: str) -> dict[str, Json]:
+    """What the service answers."""
+    headers = {k: v.replace("KEY", key) if v == "KEY" else v for k, v in request["headers"].items()}
+    body = base64.b64decode(request["body"])
+    answer = client.request(request["method"], request["path"], headers=headers, content=body)
+    found: dict[str, Json] = {
+        "status": answer.status_code,
+        "headers": {k: _in_order(answer.headers[k]) for k in HEADERS if k in answer.headers},
+    }
+    if "json" in answer.headers.get("content-type", ""):
+        found["json"] = answer.json()
+    else:
+        found["sha256"] = hashlib.sha256(answer.content).hexdigest()
+    return found
+
+
+def _in_order(header: str) -> str:
+    """The methods of `Allow` have no order."""
+    return ", ".join(sorted(header.split(", ")))
+
+
+def converse(url: str, talk: list[dict[str, Json]]) -> list[Json]:
+    """The events of a stream: after each message one, and of answers the whole lists."""
+    # The lists of streams that send differences.
+    from app.changes import applied
+    from app.messages import ListChanges
+
+    lists: dict[str, Json] = {}
+    events = []
+    with connect(url.replace("http", "ws", 1) + "/stream", max_size=2**24) as socket:
+        for message in talk:
+            socket.send(json.dumps(message))
+            event = json.loads(socket.recv(timeout=30))
+            if event["type"] == "answer":
+                if event["full"]:
+                    lists = {}
+                changes = {
+                    name: ListChanges.model_validate(change)
+                    for name, change in event.pop("changes").items()
+                }
+                lists = applied(lists, changes, event.pop("dropped", ()))
+                for name in ("full", "revision", "superseded"):
+                    event.pop(name, None)
+                event["lists"] = lists
+            elif event["type"] == "opened":
+                event = {"type": "opened", "seq": event["seq"]}
+            events.append(event)
+    return events
+
+
+# ---------------------------------------------------------------------------------- comparing
+
+
+def differences(old: Json, new: Json, at: str = "") -> Iterator[str]:
+    """Where two JSON values differ."""
+    if isinstance(old, bool) or isinstance(new, bool) or old is None or isinstance(old, str):
+        if old != new or type(old) is not type(new):
+            yield f"{at}: {old!r:.80} → {new!r:.80}"
+    elif isinstance(old, int | float) and isinstance(new, int | float):
+        if not math.isclose(old, new, rel_tol=TOLERANCE, abs_tol=TOLERANCE):
+            yield f"{at}: {old!r} → {new!r}"
+    elif isinstance(old, dict) and isinstance(new, dict):
+        for name in sorted(old.keys() | new.keys()):
+            if name in VOLATILE:
+                continue
+            if name not in old or name not in new:
+                yield f"{at}/{name}: {'only before' if name in old else 'only now'}"
+            else:
+                yield from differences(old[name], new[name], f"{at}/{name}")
+    elif isinstance(old, list) and isinstance(new, list):
+        yield from _lists(old, new, at)
+    else:
+        yield f"{at}: {old!r:.80} → {new!r:.80}"
+
+
+def _lists(old: list[Json], new: list[Json], at: str) -> Iterator[str]:
+    scored = [e for e in (*old, *new) if isinstance(e, dict) and _score(e) is not None]
+    if not scored or len(scored) < len(old) + len(new):
+        if len(old) != len(new):
+            yield f"{at}: {len(old)} entries → {len(new)}"
+        for k, (a, b) in enumerate(zip(old, new, strict=False)):
+            yield from differences(a, b, f"{at}/{k}")
+        return
+    before, after = ({_texts(e): e for e in entries} for entries in (old, new))
+    for name, entry in before.items():
+        if name in after:
+            yield from differences(entry, after[name], f"{at}/{name}")
+    # An entry may be cut off by another that is as likely.
+    for mine, other, when in ((old, after, "before"), (new, before, "now")):
+        last = abs(_score(mine[-1]) or 0.0) if mine else 0.0
+        for entry in mine:
+            if _texts(entry) not in other and abs(abs(_score(entry) or 0.0) - last) > TOLERANCE:
+                yield f"{at}/{_texts(entry)}: only {when}"
+    ranks = [abs(_score(before[_texts(e)]) or 0.0) for e in new if _texts(e) in before]
+    falling = old and abs(_score(old[0]) or 0.0) >= abs(_score(old[-1]) or 0.0)
+    steps = pairwise(ranks)
+    if falling and any(b > a + TOLERANCE for a, b in steps) and not _is_ordered(old, before, new):
+        yield f"{at}: another order"
+
+
+def _is_ordered(old: list[Json], before: dict[Json, Json], new: list[Json]) -> bool:
+    """Whether the new order is the old one, which need not fall (disagreements, reasons)."""
+    common = [_texts(e) for e in new if _texts(e) in before]
+    return [_texts(e) for e in old if _texts(e) in set(common)] == common
+
+
+def _score(entry: dict[str, Json]) -> float | None:
+    return entry.get("probability", entry.get("log_odds_change"))
+
+
+def _texts(entry: dict[str, Json]) -> Json:
+    return tuple(str(v) for v in entry.values() if isinstance(v, str))
+
+
+def shares(old: Json, new: Json, tests: int) -> Iterator[str]:
+    """Classes whose shares in drawn scenes differ: two proportions, Bonferroni over all tests."""
+    a, b = (
+        Counter(label for scene in answer["json"]["scenes"] for label in set(scene["objects"]))
+        for answer in (old, new)
+    )
+    n, m = len(old["json"]["scenes"]), len(new["json"]["scenes"])
+    # |z| of a normal above which a share of FAILURE / tests lies.
+    limit = math.sqrt(2 * math.log(tests / FAILURE))
+    for label in a.keys() | b.keys():
+        p = (a[label] + b[label] + 1) / (n + m + 2)
+        z = (a[label] / n - b[label] / m) / math.sqrt(p * (1 - p) * (1 / n + 1 / m))
+        if abs(z) > limit:
+            yield f"{label}: in {a[label]} of {n} scenes → {b[label]} of {m}"
+
+
+def undrawn(answer: dict[str, Json]) -> dict[str, Json]:
+    """An answer of `/generate` without what depends on the draw."""
+    if answer["status"] != 200:
+        return answer
+    scenes = answer["json"]["scenes"]
+    layers = [sorted(scene["context"]) for scene in scenes]
+    return answer | {"json": answer["json"] | {"scenes": layers}}
+
+
+# ----------------------------------------------------------------------------------- commands
+
+
+def record(url: str, file: Path, key: str) -> int:
+    """Ask everything, and write what came."""
+    rng = random.Random(SEED)
+    with httpx.Client(base_url=url, timeout=60) as client, gzip.open(file, "wt") as out:
+        asked: Counter[str] = Counter()
+
+        def keep(kind: str, request: Json, answer: Json) -> None:
+            asked[kind] += 1
+            out.write(json.dumps({"kind": kind, "request": request, "answer": answer}) + "\n")
+
+        for kind, requests in (
+            ("question", questions(client, rng)), ("drawn", drawn(client)), ("error", errors()),
+            ("page", pages(client)),
+        ):  # fmt: skip
+            for request in requests:
+                keep(kind, request, ask(client, request, key))
+        for talk in streams(rng):
+            keep("stream", talk, converse(url, talk))
+    sys.stdout.write(f"{sum(asked.values())} recorded: {dict(asked)}\n")
+    return 0
+
+
+def compare(url: str, file: Path, key: str) -> int:
+    """Ask everything again; 1 if an answer differs."""
+    with gzip.open(file, "rt") as lines:
+        entries = [json.loads(line) for line in lines]
+    tests = 400 * sum(entry["kind"] == "drawn" for entry in entries)
+    differing = 0
+    with httpx.Client(base_url=url, timeout=60) as client:
+        for entry in entries:
+            request, old = entry["request"], entry["answer"]
+            if entry["kind"] == "stream":
+                found = list(differences(old, converse(url, request)))
+            else:
+                new = ask(client, request, key)
+                if entry["kind"] == "drawn" and old["status"] == new["status"] == 200:
+                    found = list(shares(old, new, tests))
+                elif request["path"] == "/generate":
+                    found = list(differences(undrawn(old), undrawn(new)))
+                else:
+                    found = list(differences(old, new))
+            if found:
+                differing += 1
+                what = request[0] if entry["kind"] == "stream" else request
+                body = base64.b64decode(what.get("body", ""))[:300].decode("latin-1")
+                name = what.get("method", "stream"), what.get("path", ""), body
+                sys.stdout.write(f"{' '.join(map(str, name))}\n")
+                sys.stdout.writelines(f"    {line}\n" for line in found[:6])
+    sys.stdout.write(f"{differing} of {len(entries)} answers differ\n")
+    return int(differing > 0)
+
+
+def wait_until_ready(url: str) -> None:
+    """Return when the service is ready; it may have to compile first.
+
+    Raises:
+        TimeoutError: it is not within ten minutes.
+    """
+    end = time.monotonic() + 600
+    while time.monotonic() < end:
+        with suppress(httpx.TransportError):
+            if httpx.get(f"{url}/health/ready").status_code == 200:
+                return
+        time.sleep(0.5)
+    raise TimeoutError(f"{url} is not ready")
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("command", choices=("record", "compare"))
+    parser.add_argument("url")
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--key", default="", help="the service's admin key")
+    options = parser.parse_args()
+    wait_until_ready(options.url)
+    act = record if options.command == "record" else compare
+    return act(options.url, options.file, options.key)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
