@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import socket
 import sys
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
 from app.settings import Settings
-
-if TYPE_CHECKING:
-    from app.serving.peers import Peers
 
 
 def main() -> int:
@@ -30,12 +25,6 @@ def main() -> int:
             variable = "SCENE_" + "_".join(str(part) for part in fault["loc"]).upper()
             sys.stderr.write(f"{variable}: {fault['msg'].removeprefix('Value error, ')}\n")
         return 2
-    if settings.workers > 1:
-        # Imported where it is needed, as is the service below: a supervisor without torch takes a
-        # tenth of the memory.
-        from app.workers.supervisor import supervise
-
-        return supervise(settings)
     return serve(settings)
 
 
@@ -59,18 +48,8 @@ def _give_back_what_is_large() -> None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
 
 
-def serve(
-    settings: Settings,
-    *,
-    peers: Peers | None = None,
-    sockets: list[socket.socket] | None = None,
-) -> int:
+def serve(settings: Settings) -> int:
     """Serve from this process until it is stopped.
-
-    Args:
-        settings: of the service.
-        peers: the other processes that serve the same models, if there are any.
-        sockets: bound already; by default the address of the settings.
 
     Returns:
         The exit status: not 0 where the service did not start.
@@ -82,10 +61,10 @@ def serve(
     _give_back_what_is_large()
     from app.server import build
 
-    server = build(settings, peers)
+    server = build(settings)
     # Ctrl-C has ended the server in order by the time it comes up here.
     with suppress(KeyboardInterrupt):
-        server.run(sockets)
+        server.run()
     return 0 if server.started else 3
 
 

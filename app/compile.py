@@ -24,7 +24,7 @@ def main() -> int:
         The exit status: 1 where one of them cannot be used.
     """
     settings = Settings()
-    runtime = Runtime(settings.store, Limits(), settings.queue_rows, Unmeasured())
+    runtime = Runtime(settings.store, Limits(), settings.queue_rows, Unmeasured(), poll=0)
     asyncio.run(runtime.start())
     runtime.stop()
     compileall.compile_dir(Path(__file__).parent, quiet=1)

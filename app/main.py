@@ -9,7 +9,6 @@ from fastapi import FastAPI
 
 from app import __version__, api
 from app.serving.metrics import Metrics, Unmeasured
-from app.serving.peers import Peers
 from app.serving.reading import Limits
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -25,12 +24,11 @@ The figures in the examples illustrate; a model's own depend on what it was trai
 """
 
 
-def create_app(settings: Settings | None = None, peers: Peers | None = None) -> FastAPI:
+def create_app(settings: Settings | None = None) -> FastAPI:
     """The service.
 
     Args:
         settings: by default those of the environment.
-        peers: the other processes that serve the same models; by default there are none.
 
     Raises:
         pydantic.ValidationError: the environment's settings make no sense.
@@ -41,7 +39,7 @@ def create_app(settings: Settings | None = None, peers: Peers | None = None) -> 
         Limits(objects=settings.max_objects, relations=settings.max_relations),
         settings.queue_rows,
         Metrics() if settings.metrics else Unmeasured(),
-        peers,
+        settings.store_poll,
     )
 
     @asynccontextmanager

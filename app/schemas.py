@@ -634,7 +634,7 @@ class FieldError(Reply):
 class Failure(Reply):
     """Something in the store that cannot be used, and why."""
 
-    subject: Annotated[str, Field(description="`name@version`, an alias, `store` or `worker`")]
+    subject: Annotated[str, Field(description="`name@version`, an alias, or `store`")]
     reason: Annotated[str, Field(description="a stable code")]
     detail: str
 
@@ -721,6 +721,10 @@ class ModelSummary(Reply):
 class ModelList(Reply):
     """What the service has, and the aliases that lead to it."""
 
+    generation: Annotated[
+        str,
+        Field(description="the same in all replicas that serve the same versions and aliases"),
+    ]
     models: list[ModelSummary]
     aliases: Annotated[
         dict[str, str], Field(description="alias to `name@version`, or to `name` for its newest")

@@ -11,7 +11,6 @@ import uvicorn
 from app.api import connections, sockets
 from app.main import create_app
 from app.serving.logs import log_config
-from app.serving.peers import Peers
 from app.serving.runtime import Runtime
 from app.serving.stream import Streams
 from app.settings import Settings
@@ -54,13 +53,9 @@ class Server(uvicorn.Server):
         return await super().on_tick(counter)
 
 
-def build(settings: Settings, peers: Peers | None = None) -> Server:
-    """The service behind a server of its own, not started yet.
-
-    Args:
-        peers: the other processes that serve the same models, if there are any.
-    """
-    app = create_app(settings, peers)
+def build(settings: Settings) -> Server:
+    """The service behind a server of its own, not started yet."""
+    app = create_app(settings)
     config = uvicorn.Config(
         app,
         host=settings.host,

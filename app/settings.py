@@ -68,10 +68,16 @@ class Settings(BaseSettings):
 
     host: Annotated[str, Field(min_length=1, description="address to listen on")] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535, description="0 = any free port")] = 8000
-    workers: Annotated[
-        int, Field(ge=1, le=64, description="processes that serve; each holds every model")
-    ] = 1
     store: Annotated[Path, Field(description="directory of published models")] = Path("model_store")
+    store_poll: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=3600,
+            allow_inf_nan=False,
+            description="seconds between two looks for changes of the store; 0 = never",
+        ),
+    ] = 5
     admin_key: Annotated[
         SecretStr | None,
         Field(
@@ -172,11 +178,6 @@ class Settings(BaseSettings):
     ] = "info"
     log_format: Annotated[Literal["json", "plain"], BeforeValidator(_lower)] = "json"
     access_log: Annotated[bool, Field(description="one line a request, never its payload")] = True
-
-    @property
-    def longest_drain(self) -> float:
-        """Seconds from SIGTERM until the process ends, at most."""
-        return self.drain_seconds + self.drain_timeout + 1.0
 
     @property
     def secrets(self) -> list[str]:

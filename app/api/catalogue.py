@@ -108,9 +108,9 @@ REFRESH_REFUSED: Final = ProblemType(
     409,
     "The store was not taken over",
     "Something in the store is worse than what is being served: a version that did not verify, did "
-    "not answer its warm-up, or an alias that leads to none. Or one of several workers could not "
-    "follow (`worker`). Nothing has changed: the versions served before still answer. `failures` "
-    "names what was refused and why.",
+    "not answer its warm-up, or an alias that leads to none. "
+    "Nothing has changed: the versions served before still answer. `failures` names what was "
+    "refused and why.",
 )
 STORE_NOT_WRITABLE: Final = ProblemType(
     "store-not-writable",

@@ -21,10 +21,10 @@ router = APIRouter(tags=["monitoring"])
     responses=problems(),
 )
 async def show_metrics(runtime: RuntimeDep) -> PlainTextResponse:
-    """Counters, gauges and histograms in the text format, of all worker processes together.
+    """Counters, gauges and histograms in the text format.
 
     docs/operations.md says what each of them means.
     """
-    # Of several processes there are files to read: others are served meanwhile.
+    # Many series take over 10 ms to write out: others are served meanwhile.
     text = await asyncio.to_thread(runtime.metrics.exposition)
     return PlainTextResponse(text, media_type=CONTENT_TYPE)

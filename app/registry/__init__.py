@@ -18,7 +18,7 @@ from app.registry.manifest import Manifest
 from app.registry.models import ArtifactFailure, ModelSet, StoreFailure, load_model_set
 from app.registry.offsets import Offsets
 from app.registry.references import AliasTarget
-from app.registry.store import Store
+from app.registry.store import Store, StoreState
 
 __all__ = [
     "AliasTarget",
@@ -40,6 +40,7 @@ __all__ = [
     "Store",
     "StoreError",
     "StoreFailure",
+    "StoreState",
     "Thresholds",
     "VocabularyEntry",
     "load_artifact",

@@ -14,11 +14,11 @@ import os
 import shutil
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
 from numpy.typing import ArrayLike
 
@@ -28,6 +28,7 @@ from app.registry.description import Description
 from app.registry.durable import make_directory, rename
 from app.registry.errors import ArtifactError, StoreError, cause
 from app.registry.locking import exclusive
+from app.registry.manifest import CARD, MANIFEST, WEIGHTS
 from app.registry.references import (
     AliasTarget,
     check_name,
@@ -42,6 +43,9 @@ from app.registry.tensors import StorageDtype
 _ALIASES: Final = "aliases.json"
 _LOCK: Final = ".lock"
 _TEMPORARY: Final = ".publishing-"
+
+
+StoreState: TypeAlias = tuple[tuple[str | int, ...], ...]
 
 
 class Store:
@@ -129,6 +133,16 @@ class Store:
                 "wrong_place", f"this is {manifest.name}@{manifest.version}, not {name}@{version}"
             )
         return artifact
+
+    def state(self) -> StoreState:
+        """What changes whenever a version or an alias does; no file is read for it."""
+        files = [self.root / _ALIASES]
+        with suppress(StoreError):
+            for name in self.names():
+                for version in self.versions(name):
+                    folder = self.root / name / version
+                    files += [folder / file for file in (MANIFEST, WEIGHTS, CARD)]
+        return tuple((str(file), *_appearance(file)) for file in files)
 
     # -- writing --------------------------------------------------------------------------------
 
@@ -279,6 +293,15 @@ class Store:
                     shutil.rmtree(entry)
                 else:
                     entry.unlink()
+
+
+def _appearance(path: Path) -> tuple[int, ...]:
+    """Inode, size and time of the last change; nothing where there is no such file."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return ()
+    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _is_directory(path: Path) -> bool:

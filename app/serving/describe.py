@@ -31,6 +31,7 @@ from app.serving.models import ServedModel, ServedModels
 def everything(models: ServedModels) -> ModelList:
     """All models, versions, aliases and failures."""
     return ModelList(
+        generation=models.generation,
         models=[_summary(models, name) for name in models.store.versions],
         aliases={alias: str(target) for alias, target in sorted(models.store.aliases.items())},
         failures=list(models.failures.values()),

@@ -1,16 +1,14 @@
 """What the service tells Prometheus: counted where it happens, written out when it is asked for.
 
 Every label has few values, whatever clients send: routes by their templates, models only while
-they are served. With several worker processes each writes into files of a shared directory, and
-any of them reports the sum; see docs/decisions/metrics.md.
+they are served. A replica is one process and tells its own; see docs/decisions/metrics.md.
 """
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterable
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 from prometheus_client import (
     CONTENT_TYPE_PLAIN_0_0_4,
@@ -18,22 +16,17 @@ from prometheus_client import (
     Counter,
     Gauge,
     Histogram,
-    Metric,
     disable_created_metrics,
     generate_latest,
-    values,
 )
-from prometheus_client.multiprocess import MultiProcessCollector
 
 from app.schemas import ModelReference
 from app.serving.errors import ServingError
 from app.serving.models import DEFAULT, Key, ServedModels
 
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
-SHARED_DIRECTORY: Final = "PROMETHEUS_MULTIPROC_DIR"
-"""The library's variable: where worker processes put what they count."""
 
-Change = Literal["refresh", "alias"]
+Change = Literal["refresh", "alias", "poll"]
 Outcome = Literal["success", "refused", "failed"]
 Info = tuple[str, str, str, str, str]
 
@@ -55,16 +48,9 @@ class Metrics:
 
     Attributes:
         registry: of its own, so that a process can hold several applications.
-
-    Raises:
-        RuntimeError: `SHARED_DIRECTORY` was set after the library had been imported, which would
-            let every process report only itself.
     """
 
     def __init__(self) -> None:
-        self._shared = SHARED_DIRECTORY in os.environ
-        if self._shared and values.ValueClass is values.MutexValue:
-            raise RuntimeError(f"{SHARED_DIRECTORY} must be set before the service is imported")
         self.registry = registry = CollectorRegistry()
         self._requests = Counter(
             "scene_requests_total",
@@ -116,13 +102,11 @@ class Metrics:
             "scene_pending_rows",
             "Scenes waiting for a model",
             _MODEL,
-            multiprocess_mode="livesum",
             registry=registry,
         )
         self._streams = Gauge(
             "scene_streams",
             "Streams that are open",
-            multiprocess_mode="livesum",
             registry=registry,
         )
         self._messages = Counter(
@@ -142,31 +126,26 @@ class Metrics:
             "Updates of streams that a newer one replaced before they were answered",
             registry=registry,
         )
-        # 1 if any process serves it: processes that disagree show as two versions of one alias.
         self._info = Gauge(
             _INFO,
             "1 for every model that is served, once for each alias that leads to it",
             (*_MODEL, "variant", "digest", "alias"),
-            multiprocess_mode="livemax",
             registry=registry,
         )
         self._reloads = Counter(
             "scene_reloads_total",
-            "Changes of what is served: refreshes and moved aliases, with refused ones",
+            "Changes of what is served: refreshes, moved aliases, polls, with refused ones",
             ("change", "outcome"),
             registry=registry,
         )
-        # Of each process: the latest tells of restarts, the least whether all are ready.
         self._started = Gauge(
             "scene_start_time_seconds",
             "Unix time when the process began to load its models",
-            multiprocess_mode="liveall",
             registry=registry,
         )
         self._ready = Gauge(
             "scene_ready_time_seconds",
             "Unix time when its default model had answered; 0 before",
-            multiprocess_mode="liveall",
             registry=registry,
         )
         self._series: dict[Key, _ModelSeries] = {}
@@ -181,8 +160,8 @@ class Metrics:
     def started(self) -> None:
         """The process begins to load its models."""
         self._started.set(time.time())
-        for change in ("refresh", "alias"):
-            for outcome in ("success", "refused", "failed"):
+        for change in get_args(Change):
+            for outcome in get_args(Outcome):
                 self._reloads.labels(change, outcome)
 
     def serving(self, models: ServedModels) -> None:
@@ -193,9 +172,7 @@ class Metrics:
             self._series[key] = _ModelSeries(self, key)
         infos = set(_infos(models))
         for info in self._infos - infos:
-            self._info.labels(*info).set(0)
-            if not self._shared:
-                self._info.remove(*info)
+            self._info.remove(*info)
         for info in infos - self._infos:
             self._info.labels(*info).set(1)
         self._infos = infos
@@ -205,14 +182,11 @@ class Metrics:
 
     def _forget(self, key: Key) -> None:
         series = self._series.pop(key)
-        series.pending.set(0)
-        # The library cannot take anything back from a shared file: there it is left out on reading.
-        if not self._shared:
-            self._queue.remove(*key)
-            self._pending.remove(*key)
-            for question in series.questions:
-                self._compute.remove(*key, question)
-                self._rows.remove(*key, question)
+        self._queue.remove(*key)
+        self._pending.remove(*key)
+        for question in series.questions:
+            self._compute.remove(*key, question)
+            self._rows.remove(*key, question)
 
     def reloaded(self, change: Change, outcome: Outcome) -> None:
         """Somebody tried to change what is served."""
@@ -289,12 +263,8 @@ class Metrics:
     # ------------------------------------------------------------------------- what is told
 
     def exposition(self) -> bytes:
-        """Everything in Prometheus' text format, of all processes where there are several."""
-        if not self._shared:
-            return generate_latest(self.registry)
-        together = CollectorRegistry()
-        together.register(_AllProcesses())
-        return generate_latest(together)
+        """Everything in Prometheus' text format."""
+        return generate_latest(self.registry)
 
 
 class Unmeasured(Metrics):
@@ -363,30 +333,6 @@ class _ModelSeries:
         )
         self.questions[question] = bound
         return bound
-
-
-class _AllProcesses:
-    """The metrics of all processes that share a directory, without models that none serves."""
-
-    def collect(self) -> Iterable[Metric]:
-        metrics = list(MultiProcessCollector(None).collect())  # type: ignore[no-untyped-call]
-        served = {
-            (sample.labels["model"], sample.labels["version"])
-            for metric in metrics
-            if metric.name == _INFO
-            for sample in metric.samples
-            if sample.value > 0
-        }
-        for metric in metrics:
-            metric.samples = [
-                sample
-                for sample in metric.samples
-                if "model" not in sample.labels
-                or (sample.labels["model"], sample.labels["version"]) in served
-            ]
-            if metric.name == _INFO:
-                metric.samples = [sample for sample in metric.samples if sample.value > 0]
-        return metrics
 
 
 def _infos(models: ServedModels) -> Iterable[Info]:

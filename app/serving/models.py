@@ -7,6 +7,8 @@ in its place.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -100,6 +102,21 @@ class ServedModels:
         """The same snapshot with one alias moved."""
         aliases = MappingProxyType({**self.store.aliases, alias: target})
         return replace(self, store=replace(self.store, aliases=aliases))
+
+    @cached_property
+    def usable(self) -> frozenset[str]:
+        """What works: versions as ``name@version``, aliases, and the store, as ``failures`` do."""
+        versions = {f"{name}@{version}" for name, version in self.served}
+        subjects = versions | self.store.aliases.keys() | {DEFAULT, "store"}
+        return frozenset(subjects - self.failures.keys())
+
+    @cached_property
+    def generation(self) -> str:
+        """The same in all replicas that serve the same versions under the same aliases."""
+        versions = {"@".join(key): model.artifact.digest for key, model in self.served.items()}
+        aliases = {alias: str(target) for alias, target in self.store.aliases.items()}
+        text = json.dumps([versions, aliases], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def backlog(self) -> int:

@@ -8,14 +8,14 @@ import gc
 import logging
 import sys
 from collections.abc import Awaitable, Callable
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 import torch
 
 from app.compiling import pack
-from app.registry import AliasTarget, Store, StoreError, load_model_set
+from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 from app.serving.errors import (
     AliasConflictError,
@@ -32,11 +32,9 @@ from app.serving.errors import (
     StoreNotWritableError,
     UnknownModelError,
 )
-from app.serving.generation import Generation, restore
 from app.serving.metrics import Change as Counted
 from app.serving.metrics import Metrics
 from app.serving.models import DEFAULT, ServedModels, prepare
-from app.serving.peers import Alone, Change, Peers
 from app.serving.queue import Threads, Ticket, WorkQueue
 from app.serving.reading import Limits
 from app.serving.record import RequestRecord
@@ -92,7 +90,7 @@ class Runtime:
         limits: what one scene may hold.
         queue_rows: what may wait for one model.
         metrics: what the service counts.
-        peers: the other processes that serve the same models; by default there are none.
+        poll: seconds between two looks for changes of the store; 0 for none.
 
     Attributes:
         draining: nothing new is taken.
@@ -104,7 +102,7 @@ class Runtime:
         limits: Limits,
         queue_rows: int,
         metrics: Metrics,
-        peers: Peers | None = None,
+        poll: float,
     ) -> None:
         self.metrics = metrics
         self.draining = False
@@ -112,9 +110,11 @@ class Runtime:
         self._limits = limits
         self._queue_rows = queue_rows
         self._threads = Threads()
-        self._peers = peers or Alone()
+        self._poll = poll
+        self._polling: asyncio.Task[None] | None = None
+        self._changing = asyncio.Lock()
         self._models: ServedModels | None = None
-        self._candidate: ServedModels | None = None
+        self._seen: StoreState | None = None
 
     @property
     def models(self) -> ServedModels:
@@ -162,21 +162,22 @@ class Runtime:
         self.draining = True
 
     async def start(self) -> None:
-        """Load, verify and warm everything in the store; `models` tells what is wrong.
-
-        Raises:
-            ConnectionError: the peers are gone.
-        """
+        """Load, verify and warm everything in the store; `models` tells what is wrong."""
         # Serving scales by processes: threads within one would fight over the same cores.
         torch.set_num_threads(1)
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
-        await self._peers.join(self)
+        # Nobody waits yet, and a thread of its own costs time and memory.
+        self._serve(self._load(None))
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
+        if self._poll:
+            self._polling = asyncio.create_task(self._follow())
 
     def stop(self) -> None:
         """Let go of the worker threads; what they have not begun is dropped."""
+        if self._polling is not None:
+            self._polling.cancel()
         self._threads.stop()
 
     @_counted("refresh")
@@ -190,29 +191,18 @@ class Runtime:
             RefreshRefusedError: nothing has changed.
             NotReadyError: nothing has been loaded yet.
         """
-        async with self._peers.change() as change:
+        async with self._changing:
             old = self.models
-            # In a thread, so that the old snapshot goes on answering.
-            new = await asyncio.to_thread(self._load, old)
-            worse = [
-                failure
-                for subject, failure in new.failures.items()
-                if subject == DEFAULT or subject not in old.failures
-            ]
-            if worse:
-                raise RefreshRefusedError(worse)
-            answer = RefreshAnswer(
+            new = await self._take_over(
+                lambda subject: subject == DEFAULT or subject not in old.failures
+            )
+            return RefreshAnswer(
                 request_id=request_id,
                 default=new.resolve(DEFAULT).reference,
                 added=_names(new, but_not=old),
                 removed=_names(old, but_not=new),
                 failures=list(new.failures.values()),
             )
-            # From here on only requests in flight may keep the old snapshot alive.
-            del old
-            await self._agree(change, new)
-            await change.commit()
-            return answer
 
     @_counted("alias")
     async def move_alias(self, alias: str, request: AliasRequest, request_id: str) -> AliasAnswer:
@@ -224,20 +214,17 @@ class Runtime:
             ModelUnusableError: the version was refused.
             AliasConflictError: the alias leads elsewhere than expected, or is a model's name.
             StoreNotWritableError, StoreBusyError: the store cannot be changed (now).
-            RefreshRefusedError: another process cannot follow.
             NotReadyError: nothing has been loaded yet.
         """
-        async with self._peers.change() as change:
+        async with self._changing:
             target = self._target(request.model)
             expected = _expected(request)
-            # Before the store is written: then nothing but writing it can fail.
-            await self._agree(change, self.models.with_alias(alias, target))
             try:
                 previous = self._store.aliases().get(alias)
                 await asyncio.to_thread(self._store.set_alias, alias, target, expected=expected)
             except StoreError as error:
                 raise _refusal(error) from None
-            await change.commit()
+            self._serve(self.models.with_alias(alias, target))
             return AliasAnswer(
                 request_id=request_id,
                 alias=alias,
@@ -245,41 +232,62 @@ class Runtime:
                 previous=None if previous is None else str(previous),
             )
 
-    # -- a participant of changes, whoever leads them -------------------------------------------
+    async def _follow(self) -> None:
+        """Take over what others change in the store: publishers, operators, other replicas."""
+        while True:
+            await asyncio.sleep(self._poll)
+            if await asyncio.to_thread(self._store.state) == self._seen:
+                continue
+            try:
+                await self._take_over_changes()
+            except RefreshRefusedError as error:
+                for failure in error.failures:
+                    _logger.error(
+                        "The store's changes are not served: %s: %s: %s",
+                        *(failure.subject, failure.reason, failure.detail),
+                    )
+            except Exception:
+                _logger.exception("The store's changes could not be loaded")
 
-    async def prepare(self, generation: Generation | None) -> Generation:
-        """See `Participant.prepare`."""
-        previous = self._models or self._candidate
-        if generation is None:
-            make = partial(self._load, previous)
-        else:
-            make = partial(restore, generation, self._store, self._new_queue, previous)
-        # At the start of one that has no peers nobody waits to be served or heard, and a thread of
-        # its own costs time and memory.
-        nobody_waits = self._models is None and isinstance(self._peers, Alone)
-        self._candidate = make() if nobody_waits else await asyncio.to_thread(make)
-        return Generation.of(self._candidate)
+    @_counted("poll")
+    async def _take_over_changes(self) -> None:
+        """Take over the store's changes; a version or alias that works now must go on working.
 
-    def commit(self) -> None:
-        """See `Participant.commit`."""
-        if self._candidate is None:
-            raise RuntimeError("nothing was made ready")
-        unchanged = self._models is not None and self._models.served == self._candidate.served
-        self._models, self._candidate = self._candidate, None
-        self.metrics.serving(self._models)
+        New versions that fail are listed as refused and keep nothing else back.
+
+        Raises:
+            RefreshRefusedError: something would stop working; nothing has changed.
+        """
+        async with self._changing:
+            await self._take_over(self.models.usable.__contains__)
+
+    async def _take_over(self, matters: Callable[[str], bool]) -> ServedModels:
+        """Load the store and serve it.
+
+        Args:
+            matters: whether the failure of a subject keeps everything as it is.
+
+        Raises:
+            RefreshRefusedError: such a subject fails.
+        """
+        # In a thread, so that the old snapshot goes on answering.
+        new = await asyncio.to_thread(self._load, self.models)
+        worse = [failure for subject, failure in new.failures.items() if matters(subject)]
+        if worse:
+            raise RefreshRefusedError(worse)
+        self._serve(new)
+        return new
+
+    def _serve(self, models: ServedModels) -> None:
+        unchanged = self._models is not None and self._models.served == models.served
+        self._models = models
+        self.metrics.serving(models)
         if not unchanged:
             _settle_memory()
 
-    def abort(self) -> None:
-        """See `Participant.abort`."""
-        self._candidate = None
-
-    async def _agree(self, change: Change, models: ServedModels) -> None:
-        await change.agree(Generation.of(models))
-        # Not before: a change that was given up meanwhile must not stand in the next one's place.
-        self._candidate = models
-
     def _load(self, previous: ServedModels | None) -> ServedModels:
+        # Before anything is read: what changes meanwhile is seen by the next look.
+        self._seen = self._store.state()
         known = None if previous is None else previous.store
         return prepare(load_model_set(self._store, known), self._new_queue, previous)
 

@@ -183,6 +183,9 @@ async def test_reloads_are_told_with_refused_ones(store: Path, admin: dict[str, 
         led = [key[5] for key in found if key[:2] == ("scene_model_info", "default")]
     assert led == ["1.1.0"]
     assert {key[1:]: n for key, n in found.items() if key[0] == "scene_reloads_total"} == {
+        ("poll", "success"): 0,
+        ("poll", "refused"): 0,
+        ("poll", "failed"): 0,
         ("refresh", "success"): 1,
         ("refresh", "refused"): 1,
         ("refresh", "failed"): 0,

@@ -31,7 +31,6 @@ def test_the_defaults_are_safe(tmp_path: Path) -> None:
     assert settings.api_key is None
     assert settings.cors_origins == ()
     assert settings.max_objects == 256
-    assert settings.workers == 1
 
 
 def test_settings_come_from_the_environment(
@@ -57,9 +56,9 @@ def test_settings_come_from_the_environment(
         ("port", -1),
         ("port", 65536),
         ("port", "tcp://10.0.0.1:80"),
-        ("workers", 0),
-        ("workers", 65),
-        ("workers", "auto"),
+        ("store_poll", -1),
+        ("store_poll", "nan"),
+        ("store_poll", 3601),
         ("store", "no/such/directory"),
         ("admin_key", "too-short"),
         ("admin_key", "has spaces in between"),

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from prometheus_client.multiprocess import mark_process_dead
 from prometheus_client.parser import text_string_to_metric_families
 
 from app.registry import AliasTarget, Artifact, Store, load_model_set
-from app.serving.metrics import SHARED_DIRECTORY, Metrics, Unmeasured
+from app.serving.metrics import Metrics, Unmeasured
 from app.serving.models import ServedModel, ServedModels
 from app.serving.queue import Threads, WorkQueue
 from tests.http.stores import make_store
@@ -193,17 +189,6 @@ def test_nothing_counts_where_nothing_is_to_be_measured(models: ServedModels) ->
     assert public <= set(vars(Unmeasured))
 
 
-def test_a_directory_that_comes_too_late_is_refused(tmp_path: Path) -> None:
-    code = (
-        "import os, prometheus_client; "
-        f"os.environ['{SHARED_DIRECTORY}'] = {str(tmp_path)!r}; "
-        "from app.serving.metrics import Metrics; Metrics()"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert run.returncode != 0
-    assert f"{SHARED_DIRECTORY} must be set before" in run.stderr
-
-
 def test_the_documentation_lists_every_metric(repository: Path) -> None:
     text = (repository / "docs" / "operations.md").read_text("utf-8")
     rows = re.findall(r"^\| `(scene_\w+)` \| (\w+) \|(.*?)\| (.+?) \|$", text, re.MULTILINE)
@@ -226,120 +211,3 @@ def test_the_documentation_lists_every_metric(repository: Path) -> None:
         re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.+?) \|", text, re.MULTILINE)))
     )
     assert set().union(*labels.values()) - {"le"} <= explained
-
-
-# ---------------------------------------------------------------------- several processes
-
-_COUNT = """
-import sys
-from pathlib import Path
-from app.serving.metrics import Metrics
-from app.serving.models import ServedModels
-from tests.serving.test_metrics import unwarmed
-
-models = unwarmed(Path(sys.argv[1]))
-model = models.served["home", "1.0.0"].reference
-plain = models.served["plain", "1.0.0"].reference
-metrics = Metrics()
-metrics.started()
-metrics.serving(models)
-metrics.answered("/missing", "POST", "success", 0.003)
-metrics.waited(model, 0.25)
-metrics.computed(model, "missing", 2, 0.5)
-metrics.computed(plain, "missing", 1, 0.5)
-metrics.pending(model, 3)
-metrics.serialised(1.0)
-metrics.reloaded("refresh", "refused")
-"""
-_WITHOUT_PLAIN = """
-rest = {key: served for key, served in models.served.items() if key[0] != "plain"}
-metrics.serving(ServedModels(models.store, rest, {}))
-"""
-_TELL_WHEN_ASKED = """
-import os
-print(os.getpid(), flush=True)
-for line in sys.stdin:
-    print(metrics.exposition().decode() + "# end", flush=True)
-"""
-
-
-class Worker:
-    """A process that counts, and tells when it is asked."""
-
-    def __init__(self, code: str, store: Path, environment: dict[str, str]) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", code + _TELL_WHEN_ASKED, str(store)],
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdin
-        assert self.process.stdout
-        self.stdin, self.stdout = self.process.stdin, self.process.stdout
-        self.pid = ""
-
-    def wait(self) -> None:
-        """Until it has counted."""
-        self.pid = self.stdout.readline().strip()
-
-    def tell(self) -> dict[tuple[str, ...], float]:
-        self.stdin.write("\n")
-        self.stdin.flush()
-        text = "".join(iter(self.stdout.readline, "# end\n"))
-        return parsed(text)
-
-    def end(self) -> None:
-        self.process.communicate(timeout=30)
-
-
-@pytest.mark.system
-def test_every_process_tells_of_all(tmp_path: Path, repository: Path) -> None:
-    store = make_store(tmp_path / "store")
-    shared = tmp_path / "shared"
-    shared.mkdir()
-    environment = {**os.environ, SHARED_DIRECTORY: str(shared), "PYTHONPATH": str(repository)}
-    # The third serves what the others do but one model.
-    workers = [
-        Worker(code, store, environment) for code in (_COUNT, _COUNT, _COUNT + _WITHOUT_PLAIN)
-    ]
-    first, second, third = workers
-    try:
-        for worker in workers:
-            worker.wait()
-        found = first.tell()
-        for worker in (second, third):
-            assert worker.tell() == found
-        assert found["scene_requests_total", "POST", "success", "/missing"] == 3
-        assert found["scene_request_duration_seconds_count", "/missing"] == 3
-        assert found["scene_request_duration_seconds_bucket", "+Inf", "/missing"] == 3
-        assert found["scene_queue_duration_seconds_sum", "home", "1.0.0"] == 0.75
-        assert found["scene_batch_rows_sum", "home", "missing", "1.0.0"] == 6
-        assert found["scene_batch_rows_sum", "plain", "missing", "1.0.0"] == 3
-        assert found["scene_pending_rows", "home", "1.0.0"] == 9
-        assert found["scene_reloads_total", "refresh", "refused"] == 3
-        infos = [value for key, value in found.items() if key[0] == "scene_model_info"]
-        assert infos == [1, 1, 1, 1]
-        for name in ("scene_start_time_seconds", "scene_ready_time_seconds"):
-            assert {key[1] for key in found if key[0] == name} == {w.pid for w in workers}
-
-        # One ends: what it counted stays, what it held does not.
-        first.end()
-        mark_process_dead(first.pid, str(shared))
-        found = second.tell()
-        assert found["scene_requests_total", "POST", "success", "/missing"] == 3
-        assert found["scene_pending_rows", "home", "1.0.0"] == 6
-        started = {key[1] for key in found if key[0] == "scene_start_time_seconds"}
-        assert started == {second.pid, third.pid}
-        assert any("plain" in key for key in found)
-
-        # A model that no living process serves is gone, whoever counted for it.
-        second.end()
-        mark_process_dead(second.pid, str(shared))
-        found = third.tell()
-        assert not any("plain" in key for key in found)
-        assert found["scene_batch_rows_sum", "home", "missing", "1.0.0"] == 6
-    finally:
-        for worker in workers:
-            if worker.process.poll() is None:
-                worker.end()

@@ -44,7 +44,7 @@ class Service:
 
     def __init__(self, store: Path, limits: Limits | None = None) -> None:
         self.runner = asyncio.Runner()
-        self.runtime = Runtime(store, limits or Limits(), 256, Unmeasured())
+        self.runtime = Runtime(store, limits or Limits(), 256, Unmeasured(), poll=0)
         self.runner.run(self.runtime.start())
 
     def view(self) -> Session:
