@@ -7,11 +7,11 @@ from typing import Generic, TypeVar
 
 import torch
 
-from app.boltzmann import MachineSpec
-from app.boltzmann.gibbs import State, gibbs_step, initial_state
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, rbms, scikit_learn
+from training.machines import MachineSpec
+from training.machines.gibbs import State, gibbs_step, initial_state
 
 OURS, SKLEARN, RBMS = "ours", "scikit-learn", "rbms"
 PRODUCTS = "two bare products"

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.boltzmann import MachineSpec
-from app.boltzmann.log_odds import object_log_odds
-from app.boltzmann.mean_field import Evidence, mean_field
-from app.boltzmann.scoring import ContextScorer
+from app.inference.scoring import ContextScorer
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes, scikit_learn
+from training.machines import MachineSpec
+from training.machines.log_odds import object_log_odds
+from training.machines.mean_field import Evidence, mean_field
 
 OURS, UNPREPARED = "ours, exp(W) precomputed", "ours, from the weights alone"
 TWO_COPIES = "scikit-learn, 2 V copies"
@@ -28,11 +28,12 @@ def log_odds(
     """The local Triway machine in closed form; scikit-learn by free energies of copied scenes."""
     spec = MachineSpec("triway", V=V, A=4, H1=H, K=K, form="local")
     machine = object_machine(spec, objects)
-    scorer, rbm = ContextScorer(machine), scikit_learn(machine)
+    scorer, rbm = ContextScorer(machine.W.detach().numpy()), scikit_learn(machine)
     v = presence(random_scenes(1, V, objects, torch.Generator().manual_seed(1)), V)
 
     def prepared() -> Tensor:
-        return machine.b + scorer.gain(mean_field(machine, Evidence(v)).y)
+        y = mean_field(machine, Evidence(v)).y[0].numpy()
+        return machine.b + torch.from_numpy(scorer.gain(y))
 
     def unprepared() -> Tensor:
         return object_log_odds(machine, Evidence(v))

@@ -19,8 +19,6 @@ from tempfile import TemporaryDirectory
 import torch
 
 from app import reasoning
-from app.boltzmann import BoltzmannMachine, MachineSpec, Triway
-from app.boltzmann.fantasies import pack_scenes
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.description import Calibration, Description, VocabularyEntry
 from app.scene.scene import Scene, SceneObject
@@ -28,6 +26,8 @@ from app.scene.vocabulary import ObjectClass, Vocabulary
 from benchmarks.report import Fact, Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes
+from training.machines import BoltzmannMachine, MachineSpec, Triway
+from training.machines.fantasies import pack_scenes
 
 CLASSES = (417, 2_000, 10_000)
 OBJECTS, SCENES = 12, 8

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import torch
 
-from app.boltzmann import MachineSpec, build
 from benchmarks.report import Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import frequencies, presence, random_scenes
 from training.batches import Batch
 from training.config import ObjectiveConfig
+from training.machines import MachineSpec, build
 from training.objectives import ContrastiveDivergence
 
 OURS, LOCAL, DENSE = "ours, seed form", "ours, local form", "dense Triway"

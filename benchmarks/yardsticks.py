@@ -8,7 +8,7 @@ from rbms.bernoulli_bernoulli.classes import BBRBM
 from sklearn.neural_network import BernoulliRBM
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
+from training.machines import BoltzmannMachine, MachineSpec, build
 
 
 def frequencies(V: int, objects: float) -> Tensor:

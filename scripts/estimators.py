@@ -17,13 +17,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from app.boltzmann.fantasies import unpack_scenes
 from app.reasoning.calibration import sigmoid
-from app.reasoning.closed import ClosedPosterior
-from app.reasoning.drawn import DrawnPosterior
 from app.reasoning.posterior import Posterior
 from app.registry import Artifact, Store, load_model_set
 from app.scene import Scene, SceneObject, derive_relations
+from training.oracle.drawn import DrawnPosterior
 
 Values = NDArray[np.floating[Any]]
 
@@ -34,7 +32,7 @@ _RELATIONS = 20
 def scenes(artifact: Artifact, count: int, kind: str) -> Iterator[Scene]:
     """Scenes of the machine's own objects."""
     rng = np.random.default_rng(0)
-    for v in unpack_scenes(artifact.machine.fantasies, artifact.machine.spec.V)[:count].numpy():
+    for v in artifact.weights.scenes[:count]:
         classes = np.flatnonzero(v)[:_OBJECTS].tolist()
         n = len(classes)
         if n < 4:
@@ -70,23 +68,21 @@ def answers(given: Posterior, absent: NDArray[np.int64]) -> dict[str, Values]:
 
 def errors(artifact: Artifact, count: int, draws: int) -> dict[tuple[str, str, str], list[Values]]:
     """|estimate - reference| by kind of scene, answer and estimate."""
-    closed = artifact.closed_form
-    assert closed is not None
     structure = artifact.vocabulary.structure
     found: dict[tuple[str, str, str], list[Values]] = {}
-    few: Callable[[Scene], Posterior] = lambda scene: DrawnPosterior(artifact, scene)  # noqa: E731
+    few: Callable[[Scene], Any] = lambda scene: DrawnPosterior(artifact, scene)  # noqa: E731
     for kind in ("bare", "relations", "poses"):
         for scene in scenes(artifact, count, kind):
             with (
-                patch("app.reasoning.evidence.DRAWS", draws),
-                patch("app.reasoning.evidence._RELATION_DRAWS", 1 << 40),
+                patch("training.oracle.evidence.DRAWS", draws),
+                patch("training.oracle.evidence._RELATION_DRAWS", 1 << 40),
             ):
                 exact = few(scene)
                 present = exact.present.classes
                 absent = np.setdiff1d(np.flatnonzero(~structure), present)
                 reference = answers(exact, absent)
             for name, given in (
-                ("closed form", ClosedPosterior(artifact, closed, scene)),
+                ("closed form", Posterior(artifact, scene)),
                 ("64 draws", few(scene)),
             ):
                 for answer, values in answers(given, absent).items():

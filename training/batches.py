@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, Triway
-from app.boltzmann.edges import Edges, find_triples, pair_edges, triple_keys
+from training.machines import BoltzmannMachine, Triway
+from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
 
 if TYPE_CHECKING:
     from training.datasets import EncodedScene

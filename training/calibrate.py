@@ -29,7 +29,6 @@ from scipy.special import expit
 from app.reasoning import misplaced
 from app.reasoning.placements import PLACES
 from app.reasoning.posterior import posterior
-from app.reasoning.units import NO_UNIT
 from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
 from app.scene import CANONICAL
 from training.batches import SceneTensors
@@ -46,6 +45,7 @@ from training.cases import (
 from training.datasets import EncodedScene
 from training.datasets.meanings import meaning_of
 from training.evaluation.alarms import kept_in_each_source
+from training.oracle.units import NO_UNIT
 from training.trainer import subset
 
 _SCENES = 2500
@@ -92,7 +92,7 @@ def calibrate(
     generator = torch.Generator().manual_seed(seed)
     pick = torch.randperm(len(scenes), generator=generator)
     annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
-    count = _SCENES if artifact.closed_form is not None else _SCENES_OF_DRAWS
+    count = _SCENES if artifact.oracle is None else _SCENES_OF_DRAWS
     related = subset(scenes, torch.tensor(annotated[:count], dtype=torch.int64)).scenes
     if not len(related):
         return calibration
@@ -111,7 +111,7 @@ def calibrate(
 def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[PairSlope, ...]:
     """Per canonical relation, from class-level log-odds to instance pairs; nothing is given."""
     examples = _examples(_asked_pairs(artifact, scenes))
-    return _fit_listed(examples, artifact.machine.spec.A, _LISTED)
+    return _fit_listed(examples, artifact.spec.A, _LISTED)
 
 
 def fit_given(
@@ -186,7 +186,7 @@ def fit_placements(
             which = np.full(len(a), number), a, values[0].ravel(), count, size, truth.ravel()
             source = np.full(len(a), sources.index(encoded.source))
             blocks.append(np.stack([*which, source], 1).astype(np.float64))
-    examples, relations = _examples(blocks), artifact.machine.spec.A
+    examples, relations = _examples(blocks), artifact.spec.A
     return {
         "placement": _fit_listed(examples, relations, PLACES),
         "asked_place": _fit_listed(_told(examples, sources), relations, len(examples)),

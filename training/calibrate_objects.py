@@ -41,6 +41,7 @@ from training.evaluation.outliers import (
 )
 from training.evaluation.partial import SHARES, hide
 from training.evaluation.signature import by_signature
+from training.machines.arrays import machine_of
 from training.trainer import subset
 
 Floats = NDArray[np.float64]
@@ -126,7 +127,7 @@ def calibrate_objects(
     calibration = calibration.model_copy(update={"evidence": weights})
     artifact = replace(artifact, calibration=calibration)
     update = fit_outliers(artifact, scenes, learnt, structure, seed, chosen)
-    update |= {"smallest": smallest_scenes(learnt, structure, artifact.machine.spec.C)}
+    update |= {"smallest": smallest_scenes(learnt, structure, artifact.spec.C)}
     update |= {"room_fit": room_limits(artifact, learnt)}
     return calibration.model_copy(update=update)
 
@@ -155,11 +156,11 @@ def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple
 def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
     """What 85 % of the scenes of each room type exceed of `room_fit`, (C,); -1e9 for few scenes."""
     found = []
-    for t in range(artifact.machine.spec.C):
+    for t in range(artifact.spec.C):
         own = train.v[train.room == t].numpy()
         limit = -1e9
         if len(own) >= _ROOM_SCENES:
-            limit = float(np.quantile(room_fit(artifact.machine, own, t), _UNSUITED))
+            limit = float(np.quantile(room_fit(artifact.weights, own, t), _UNSUITED))
         found.append(round(limit, 4))
     return tuple(found)
 
@@ -313,7 +314,7 @@ def fit_outliers(
     have thresholds of their own, by the same rule, on parts of the same scenes: no lower than those
     of whole scenes, and no higher than those of shorter lists.
     """
-    score = machine_score(artifact.machine)
+    score = machine_score(machine_of(artifact.weights))
     prior = np.array(artifact.calibration.popularity)
     laws = {
         "uniform": None,
@@ -429,7 +430,7 @@ def fit_evidence(
     scenes = complete_scenes(validation, seed)
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
     rng = np.random.default_rng(seed)
-    count = _EVIDENCE_SCENES if artifact.closed_form is not None else _EVIDENCE_SCENES_OF_DRAWS
+    count = _EVIDENCE_SCENES if artifact.oracle is None else _EVIDENCE_SCENES_OF_DRAWS
     chosen = rng.permutation(related)[:count].astype(np.int64)
     some = subset(scenes, torch.from_numpy(chosen))
     if not len(some):

@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from app.boltzmann import MachineSpec, build
-from app.boltzmann.spec import Form, Variant
+from app.inference.spec import Form, Variant
+from training.machines import MachineSpec, build
 
 DATA = Path("../shared/data")
 """Where the sources that are known by name are looked for."""

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import torch
 
-from app.boltzmann import BoltzmannMachine
+from app.inference.closed_form import ClosedForm
 from app.registry import Artifact, Calibration, Offsets
 from app.scene import Vocabulary
+from training.machines import BoltzmannMachine
+from training.machines.arrays import weights_of
+from training.oracle.drawn import DrawnPosterior
 
 
 @torch.no_grad()
@@ -29,11 +32,12 @@ def draft_artifact(
     """An artifact in memory alone, with the neutral calibration unless one is given."""
     return Artifact(
         manifest=None,  # type: ignore[arg-type]  # nothing that answers a question looks at it
-        machine=machine,
+        weights=weights_of(machine),
         vocabulary=vocabulary,
         calibration=calibration or Calibration.neutral(machine.spec.A),
         digest="",
         card="",
         path=Path(),
         offsets=offsets,
+        oracle=None if ClosedForm.fits(weights_of(machine)) else DrawnPosterior,
     )

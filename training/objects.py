@@ -27,12 +27,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine
-from app.boltzmann.bernoulli import bernoulli
-from app.boltzmann.fantasies import pack_scenes
-from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import SceneTensors
 from training.config import ObjectsConfig
+from training.machines import BoltzmannMachine
+from training.machines.bernoulli import bernoulli
+from training.machines.fantasies import pack_scenes
+from training.machines.mean_field import Evidence, mean_field
 
 OBJECT_WEIGHTS = ("b", "c1", "c2", "W", "J", "Q")
 # The last part of the run is averaged, by a running mean that then forgets as slowly as this.

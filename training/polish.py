@@ -8,7 +8,7 @@ the object part alone, mend that and leave the answers as they were; a term
 
 holds the weights where the answers left them. The chains go on with the averaged weights
 afterwards, each under the room type of the scene it began at, and are kept as the machine's
-fantasies (see `app.boltzmann.fantasies`).
+fantasies (see `training.machines.fantasies`).
 
 Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
 """
@@ -20,13 +20,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine
-from app.boltzmann.bernoulli import bernoulli
-from app.boltzmann.fantasies import pack_scenes
-from app.boltzmann.gibbs import Clamp, State, initial_state, run
-from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import SceneTensors
 from training.config import PolishConfig
+from training.machines import BoltzmannMachine
+from training.machines.bernoulli import bernoulli
+from training.machines.fantasies import pack_scenes
+from training.machines.gibbs import Clamp, State, initial_state, run
+from training.machines.mean_field import Evidence, mean_field
 
 _NAMES = ("b", "c1", "c2", "W", "Q")
 _AVERAGING = 0.98

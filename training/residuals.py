@@ -19,9 +19,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, Triway, build
-from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import SceneTensors, relation_units
+from training.machines import BoltzmannMachine, Triway, build
+from training.machines.mean_field import Evidence, mean_field
 from training.objectives.relations import partly_shown
 
 # τ: so many scenes at even odds would weigh four times as much.

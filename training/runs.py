@@ -16,8 +16,8 @@ from pathlib import Path
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
 from training.config import Config
+from training.machines import BoltzmannMachine, MachineSpec, build
 from training.trainer import TrainingResult
 
 

@@ -16,8 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, Triway, build
-from app.boltzmann.spec import FACTORISED
+from app.inference.spec import FACTORISED
 from training.batches import SceneTensors, seen_triples
 from training.checkpoints import load_checkpoint, save_checkpoint
 from training.config import Config
@@ -26,6 +25,7 @@ from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.reconstruction import reconstruction_error
 from training.evaluation.relations import machine_score as relation_score
 from training.evaluation.relations import rank_relations
+from training.machines import BoltzmannMachine, MachineSpec, Triway, build
 from training.objectives import OBJECTIVES, CompositeLikelihood, Objective, RelationLikelihood
 from training.objectives.relations import bake_word_prior
 from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.boltzmann.elementary import logistic
 from app.compiling import compiled, inlined
+from app.inference.elementary import logistic
 from app.registry.description import Calibration
 
 Floats = NDArray[np.floating[Any]]

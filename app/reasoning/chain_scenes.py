@@ -1,4 +1,4 @@
-"""Scenes drawn by compiled chains, one by one, for machines that have them."""
+"""Scenes drawn by compiled chains, one by one."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from app.boltzmann import philox
-from app.boltzmann.scene_chains import ConditionedChains, Conditions, Drawn
+from app.inference import MachineSpec, philox
+from app.inference.scene_chains import ConditionedChains, Conditions, Drawn
 from app.reasoning.answers import GeneratedScene
-from app.reasoning.chains import held_units
 from app.reasoning.exclusion import Triple, staying
 from app.reasoning.given import given_relations
 from app.reasoning.plausible import ATTEMPTS, Plausible
@@ -30,19 +29,11 @@ def chain_scenes(
     context: Mapping[str, Sequence[int]],
     stop: Callable[[], bool],
 ) -> tuple[GeneratedScene, ...]:
-    """See `generate`. Every chain has a random stream of its own.
-
-    Raises:
-        ValueError: the machine has no compiled chains.
-    """
-    chains = artifact.scene_chains
-    if chains is None:
-        raise ValueError("this machine has no compiled chains")
-    held, _ = held_units(artifact.machine, context)
-    spec = artifact.machine.spec
+    """See `generate`."""
+    spec = artifact.spec
     classes = present(scene, spec)
-    conditions = _conditions(scene, classes, spec.A, np.flatnonzero(held.numpy()))
-    conditioned = chains.given(conditions, temperature)
+    conditions = _conditions(scene, classes, spec.A, _held_units(spec, context))
+    conditioned = artifact.scene_chains.given(conditions, temperature)
     shown = ~artifact.vocabulary.structure
     shown[classes.classes] = True
     of = classes.classes[classes.row].tolist()
@@ -61,7 +52,7 @@ def chain_scenes(
 
 
 def _conditions(
-    scene: Scene, classes: Present, relations: int, held: NDArray[np.int64]
+    scene: Scene, classes: Present, relations: int, held: Mapping[str, NDArray[np.int64]]
 ) -> Conditions:
     given = given_relations(scene, classes, relations)
     a = i = j = np.zeros(0, dtype=np.int64)
@@ -75,9 +66,28 @@ def _conditions(
         i=i,
         j=j,
         r=r,
-        held=held,
+        held=held["h1"],
+        held2=held["h2"],
         room=scene.room_type,
     )
+
+
+def _held_units(
+    spec: MachineSpec, context: Mapping[str, Sequence[int]]
+) -> dict[str, NDArray[np.int64]]:
+    """The hidden units of each layer that are held on.
+
+    Raises:
+        ValueError: a layer or a unit that the machine does not have.
+    """
+    sizes = {"h1": spec.H1, "h2": spec.H2}
+    for layer, units in context.items():
+        if not sizes.get(layer):
+            raise ValueError(f"the model has no layer {layer!r}")
+        for unit in units:
+            if not 0 <= unit < sizes[layer]:
+                raise ValueError(f"unit {unit} of {layer} must be below {sizes[layer]}")
+    return {layer: np.unique(np.array(context.get(layer, ()), dtype=np.int64)) for layer in sizes}
 
 
 def _scene(
@@ -99,5 +109,12 @@ def _scene(
         objects=tuple(labels[index] for index in drawn.classes[shown].tolist()),
         relations=tuple((labels[i], CANONICAL[a], labels[j]) for a, i, j in triples),
         log_score=chains.log_score(drawn, shown, kept),
-        context={"h1": tuple(drawn.h1.tolist())},
+        context=_layers(artifact.spec, drawn),
     )
+
+
+def _layers(spec: MachineSpec, drawn: Drawn) -> dict[str, tuple[int, ...]]:
+    layers = {"h1": tuple(drawn.h1.tolist())}
+    if spec.H2:
+        layers["h2"] = tuple(drawn.h2.tolist())
+    return layers

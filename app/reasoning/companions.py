@@ -48,11 +48,10 @@ def companions(
 
 
 def _companions(artifact: Artifact, usable: NDArray[np.bool_], index: int) -> tuple[str, ...]:
-    machine = artifact.machine
-    context = machine.c1.detach().numpy() + machine.W.detach().numpy()[index]
-    beside = artifact.scorer.row_gain(context.astype(np.float32, copy=False))
+    weights = artifact.weights
+    beside = artifact.scorer.gain(weights["c1"] + weights["W"][index])
     increase = np.where(usable, beside - artifact.empty_gain, 0)
-    score = increase * sigmoid(machine.b.detach().numpy() + beside)
+    score = increase * sigmoid(weights["b"] + beside)
     score[increase < max(_LEAST_SHARE * float(increase.max()), 1e-6)] = 0
     labels = artifact.vocabulary.labels
     return tuple([labels[place] for place in best(score, score > 0, COMPANIONS).tolist()])

@@ -50,7 +50,7 @@ def disagreements(
         top_k: at most so many.
         min_probability: leave out what is expected with less.
     """
-    A = artifact.machine.spec.A
+    A = artifact.spec.A
     stated = [triple for triple in scene.relations or () if triple[0] < A]
     if not stated:
         return ()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from app.reasoning.answers import GeneratedScene
-from app.reasoning.block_scenes import block_scenes
 from app.reasoning.chain_scenes import chain_scenes
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene
@@ -31,9 +30,8 @@ def generate(
     relations; what it shows not to hold stays off; all else is drawn. Structure that is no
     evidence is drawn with the rest and left out of the answer.
 
-    Every chain has a random stream of its own, where the machine has compiled chains; for other
-    machines, every block of chains of fixed size, which is always run as a whole. So scene k
-    depends on the seed and on k, not on how many others a request asked for.
+    Every chain has a random stream of its own. So scene k depends on the seed and on k, not on how
+    many others a request asked for.
 
     Structure stands in no relation but those of the evidence.
 
@@ -48,7 +46,7 @@ def generate(
         steps: Gibbs sweeps of a chain, `STEPS` by default.
         temperature: of the chains; above 1 for more varied scenes.
         context: layer name ("h1", "h2") to the units that are held on.
-        stop: asked between scenes, or blocks of them; once it says so, those drawn so far are all.
+        stop: asked between scenes; once it says so, those drawn so far are all.
 
     Raises:
         ValueError: a number out of range, or a layer or unit that the machine does not have.
@@ -62,5 +60,4 @@ def generate(
         raise ValueError(f"steps must be at least 1, not {steps}")
     if not temperature > 0:
         raise ValueError(f"temperature must be positive, not {temperature}")
-    draw = block_scenes if artifact.scene_chains is None else chain_scenes
-    return draw(artifact, scene, count, seed, steps, temperature, context or {}, stop)
+    return chain_scenes(artifact, scene, count, seed, steps, temperature, context or {}, stop)

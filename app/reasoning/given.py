@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.boltzmann.closed_form import Given
-from app.boltzmann.mean_field import Pull
 from app.compiling import compiled
+from app.inference.closed_form import Pull
+from app.inference.relation_part import Given
 from app.reasoning.present import Present
 from app.registry.description import EvidenceWeights
 from app.scene.evidence import instance_evidence, pooled

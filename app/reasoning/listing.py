@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.boltzmann.relation_kernels import NO_UNIT
 from app.compiling import compiled
+from app.inference.relation_kernels import NO_UNIT
 from app.reasoning.calibration import exclusive, relation_probability
 from app.reasoning.ranking import best
 

@@ -55,7 +55,7 @@ def missing(
         ValueError: top_k below 1, a coverage outside [0, 1], a candidate outside the vocabulary, an
             unknown relation, or an anchor that is no object of the scene.
     """
-    spec, calibration = artifact.machine.spec, artifact.calibration
+    spec, calibration = artifact.spec, artifact.calibration
     if top_k < 1:
         raise ValueError(f"top_k must be at least 1, not {top_k}")
     coverage = calibration.coverage if coverage is None else coverage

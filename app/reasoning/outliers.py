@@ -153,7 +153,7 @@ def _misplaced(
     artifact: Artifact, given: Posterior, scene: Scene, sensitivity: Sensitivity
 ) -> tuple[MisplacedAnswer, ...]:
     """The scene's relations that the machine knows, least likely first, ties by their order."""
-    stated = [triple for triple in scene.relations or () if triple[0] < artifact.machine.spec.A]
+    stated = [triple for triple in scene.relations or () if triple[0] < artifact.spec.A]
     if not stated:
         return ()
     calibration, row = artifact.calibration, given.present.row

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.inference.relation_kernels import NO_UNIT
 from app.reasoning.answers import Offset, Placement, entries
 from app.reasoning.calibration import placement_log_p
 from app.reasoning.listing import likeliest_places
 from app.reasoning.offsets import offsets_of
 from app.reasoning.posterior import Posterior
-from app.reasoning.units import NO_UNIT
 from app.registry.artifact import Artifact
 from app.scene.frames import Axes
 from app.scene.relations import ON_TOP, RELATIONS, opposite

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from app.boltzmann import BoltzmannMachine
+from app.inference import Weights
 from app.reasoning.outliers import outliers
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene, SceneObject
@@ -66,21 +66,20 @@ class Plausible:
         limits = self._artifact.calibration.room_fit
         if self._room is None or not limits:
             return True
-        v = np.zeros((1, self._artifact.machine.spec.V), dtype=np.float32)
+        v = np.zeros((1, self._artifact.spec.V), dtype=np.float32)
         v[0, classes] = 1.0
-        return bool(room_fit(self._artifact.machine, v, self._room)[0] >= limits[self._room])
+        return bool(room_fit(self._artifact.weights, v, self._room)[0] >= limits[self._room])
 
 
-def room_fit(machine: BoltzmannMachine, v: NDArray[np.float32], room: int) -> NDArray[np.float64]:
+def room_fit(weights: Weights, v: NDArray[np.float32], room: int) -> NDArray[np.float64]:
     """log p(v | room type) / p(v), up to a constant of the room type, (B,), for presence (B, V).
 
     sum_k [softplus(x_k + Q_tk) - softplus(x_k)],   x = c1 + v'W
 
     A second layer is left out.
     """
-    W, c1, Q = (getattr(machine, name).detach().numpy() for name in ("W", "c1", "Q"))
-    x = c1 + v @ W
+    x = weights["c1"] + v @ weights["W"]
     found: NDArray[np.float64] = np.sum(
-        np.logaddexp(0.0, x + Q[room]) - np.logaddexp(0.0, x), axis=1, dtype=np.float64
+        np.logaddexp(0.0, x + weights["Q"][room]) - np.logaddexp(0.0, x), axis=1, dtype=np.float64
     )
     return found

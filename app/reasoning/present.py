@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.boltzmann import MachineSpec
 from app.compiling import compiled
+from app.inference import MachineSpec
 from app.scene.scene import Scene
 
 

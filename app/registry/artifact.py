@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from app.inference import MachineSpec, Weights
+from app.inference.closed_form import ClosedForm
+from app.inference.completions import Completions
+from app.inference.scene_chains import SceneChains
+from app.inference.scoring import ContextScorer
+from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.description import Calibration, Description
 from app.registry.durable import sync_directory, write_file
@@ -21,15 +27,11 @@ from app.registry.offsets import PREFIX, Offsets
 from app.registry.slopes import RelationSlopes
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
 from app.registry.verified import read_verified
+from app.scene.scene import Scene
 from app.scene.vocabulary import Vocabulary
 
-if TYPE_CHECKING:  # importing torch takes seconds; writing and listing artifacts does without
-    from app.boltzmann import BoltzmannMachine
-    from app.boltzmann.closed_form import ClosedForm
-    from app.boltzmann.completions import Completions
-    from app.boltzmann.fantasies import Fantasies
-    from app.boltzmann.scene_chains import SceneChains
-    from app.boltzmann.scoring import ContextScorer
+_DTYPES: Final = {float: "float32", int: "int32"}
+_UNSUPPORTED: Final = "only machines in the local form with weights W between -64 and 64 are served"
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,46 +40,47 @@ class Artifact:
 
     Attributes:
         manifest: everything the trainer said about it.
-        machine: in evaluation mode, float32, without gradients.
+        weights: of the machine.
         vocabulary: the words of its V object classes and C room types.
         calibration: from log-odds to promised probabilities.
         digest: SHA-256 of the manifest's bytes, hexadecimal; it changes if any file does.
         card: the model card, Markdown.
         path: the directory it was read from.
         offsets: how far apart things stand, where training saw poses.
+        oracle: makes the posterior of a scene for machines without closed form, which training has.
     """
 
     manifest: Manifest
-    machine: BoltzmannMachine
+    weights: Weights
     vocabulary: Vocabulary
     calibration: Calibration
     digest: str
     card: str
     path: Path
     offsets: Offsets | None = None
+    oracle: Callable[[Artifact, Scene], Any] | None = None
+
+    @property
+    def spec(self) -> MachineSpec:
+        """The shape of the machine."""
+        return self.weights.spec
 
     @cached_property
     def scorer(self) -> ContextScorer:
         """Prepared scores of all objects; made when first asked for."""
-        from app.boltzmann.scoring import ContextScorer
-
-        return ContextScorer(self.machine)
+        return ContextScorer(self.weights["W"])
 
     @cached_property
-    def closed_form(self) -> ClosedForm | None:
-        """Log-odds in closed form, prepared; None for machines that have none."""
-        from app.boltzmann.closed_form import ClosedForm
-
-        return ClosedForm(self.machine) if ClosedForm.fits(self.machine) else None
+    def closed_form(self) -> ClosedForm:
+        """Log-odds in closed form, prepared."""
+        return ClosedForm(self.weights)
 
     @cached_property
     def completions(self) -> Completions | None:
         """Posterior of unlisted classes, prepared; None for machines without stored samples."""
-        from app.boltzmann.completions import Completions
-
-        if not Completions.fits(self.machine):
+        if not Completions.fits(self.weights):
             return None
-        return Completions(self.machine, self.vocabulary.structure, self.scorer)
+        return Completions(self.weights, self.vocabulary.structure, self.scorer)
 
     @cached_property
     def relation_slopes(self) -> RelationSlopes:
@@ -93,21 +96,13 @@ class Artifact:
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:
         """(V,) what the context adds to the log-odds of each class in an otherwise empty scene."""
-        return self.scorer.row_gain(self.machine.c1.detach().float().numpy())
+        gain: NDArray[np.float32] = self.scorer.gain(self.weights["c1"])
+        return gain
 
     @cached_property
-    def scene_chains(self) -> SceneChains | None:
-        """Compiled chains that draw scenes; None for machines that have none."""
-        from app.boltzmann.scene_chains import SceneChains
-
-        return SceneChains(self.machine) if SceneChains.fits(self.machine) else None
-
-    @cached_property
-    def fantasies(self) -> Fantasies:
-        """Where chains start; made when first asked for."""
-        from app.boltzmann.fantasies import Fantasies
-
-        return Fantasies(self.machine)
+    def scene_chains(self) -> SceneChains:
+        """Compiled chains that draw scenes."""
+        return SceneChains(self.weights)
 
 
 def write_artifact(
@@ -122,8 +117,7 @@ def write_artifact(
     Args:
         directory: must not exist; its parent must.
         description: the manifest but for what describes the files.
-        state: the machine's `state_dict()`, or numpy arrays of the same names, and
-            `Offsets.tensors()` where there are any.
+        state: the arrays of `layout`, and `Offsets.tensors()` where there are any.
         storage_dtype: of tensors with two axes or more; see `pack`.
 
     Raises:
@@ -164,43 +158,35 @@ def load_artifact(directory: Path, previous: Artifact | None = None) -> Artifact
     manifest = files.manifest
     tensors = unpack(files.weights, manifest.tensors)
     offsets = {name: tensors.pop(name) for name in list(tensors) if name.startswith(PREFIX)}
-    machine = _machine(manifest, tensors)
+    weights = _weights(manifest, tensors)
     return Artifact(
         manifest=manifest,
-        machine=machine,
+        weights=weights,
         vocabulary=manifest.vocabulary.vocabulary(),
         calibration=manifest.calibration,
         digest=files.digest,
         card=files.card,
         path=directory,
-        offsets=Offsets.from_tensors(offsets, machine.spec.A, machine.spec.V) if offsets else None,
+        offsets=Offsets.from_tensors(offsets, weights.spec.A, weights.spec.V) if offsets else None,
     )
 
 
-def _machine(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> BoltzmannMachine:
-    import torch
-
-    from app.boltzmann import MachineSpec, build
-
+def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights:
     try:
         spec = MachineSpec.from_dict(dict(manifest.spec))
-        # On the meta device nothing is allocated, however large a spec claims to be.
-        with torch.device("meta"):
-            machine = build(spec)
-    except (ValueError, TypeError, RuntimeError, OverflowError) as error:
+        expected = layout(spec)
+    except (ValueError, TypeError) as error:
         raise ArtifactError("invalid_manifest", f"spec: {error}") from None
-    state = {name: torch.from_numpy(array) for name, array in tensors.items()}
     require_equal(
-        {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in state.items()},
-        {
-            name: (tensor.dtype, tuple(tensor.shape))
-            for name, tensor in machine.state_dict().items()
-        },
+        {name: (array.dtype.name, array.shape) for name, array in tensors.items()},
+        {name: (_DTYPES[kind], shape) for name, (kind, shape) in expected.items()},
         "the artifact holds",
         f"a {spec.variant} of this spec needs",
     )
     try:
-        machine.load_state_dict(state, assign=True)
+        weights = Weights(spec, tensors)
     except ValueError as error:
         raise ArtifactError("invalid_tensor", str(error)) from None
-    return machine.eval().requires_grad_(False)
+    if not ClosedForm.fits(weights):
+        raise ArtifactError("unsupported", _UNSUPPORTED)
+    return weights

@@ -18,6 +18,7 @@ ArtifactCode = Literal[
     "wrong_shape",
     "not_finite",
     "invalid_tensor",
+    "unsupported",
     "wrong_place",
 ]
 StoreCode = Literal[

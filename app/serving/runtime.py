@@ -12,8 +12,6 @@ from functools import wraps
 from pathlib import Path
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 
-import torch
-
 from app.compiling import pack
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.schemas import AliasAnswer, AliasRequest, RefreshAnswer
@@ -163,8 +161,6 @@ class Runtime:
 
     async def start(self) -> None:
         """Load, verify and warm everything in the store; `models` tells what is wrong."""
-        # Serving scales by processes: threads within one would fight over the same cores.
-        torch.set_num_threads(1)
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
         # Nobody waits yet, and a thread of its own costs time and memory.
@@ -341,7 +337,7 @@ def _names(models: ServedModels, *, but_not: ServedModels) -> list[str]:
 def _settle_memory() -> None:
     """Take what is long-lived out of the collector's sight.
 
-    With torch imported a full collection stops the world for some 90 ms. What a replaced snapshot
+    A full collection stops the world for tens of milliseconds. What a replaced snapshot
     left frozen must be thawed first, or its cycles would never be freed. At the start, which the
     collector sits out, there is none. Pages that loading has left empty go back to the system,
     where the C library can do that: some 30 MB.

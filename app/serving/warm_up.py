@@ -19,7 +19,7 @@ STEPS = 1
 
 def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...]]:
     """Ask everything once, with and without given relations and with poses: the first call of a
-    compiled loop compiles it, and that of a kernel of torch costs many times the later ones.
+    compiled loop compiles it.
 
     Returns:
         The model's contexts, which never change.
@@ -31,12 +31,10 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     scene = _scene(artifact.vocabulary)
     bare = replace(scene, relations=None)
     seen = observe(bare, typical_sizes=artifact.vocabulary.sizes)
-    # Kernels of tensors are warm after one scene; compiled loops are told apart by what is given.
-    is_compiled = artifact.closed_form is not None
-    scenes = (scene, bare, seen) if is_compiled else (scene,)
+    scenes = scene, bare, seen
     stand = [reasoning.relations(artifact, one) for one in scenes]
     missing = [entry for one in scenes for entry in reasoning.missing(artifact, one)]
-    if is_compiled and len(scene.objects) > 1:
+    if len(scene.objects) > 1:
         for one in (scene, bare):
             reasoning.missing(artifact, one, at=("on-top", 0))
             reasoning.missing(artifact, one, at=("under", 0))

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from app.boltzmann.bernoulli import bernoulli
+from training.machines.bernoulli import bernoulli
 
 DRAWS = 2_000_000
 # The middle of a byte, its edges, a tie's fraction alone, and the least float32 below one.

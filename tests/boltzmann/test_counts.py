@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from app.boltzmann import MachineSpec, build
+from training.machines import MachineSpec, build
 
 CLASSES = torch.tensor([[0, 2]])
 

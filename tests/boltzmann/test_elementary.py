@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from app.boltzmann import elementary
+from app.inference import elementary
 
 
 def compiled(name):

@@ -9,9 +9,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.boltzmann import MachineSpec, build
-from app.boltzmann.fantasies import Fantasies, pack_scenes, unpack_scenes, words
-from app.boltzmann.gibbs import FREE, Clamp, initial_state
+from training.machines import MachineSpec, build
+from training.machines.fantasies import Fantasies, pack_scenes, unpack_scenes, words
+from training.machines.gibbs import FREE, Clamp, initial_state
 
 V = 35
 CHAINS = 20_000

@@ -9,13 +9,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.boltzmann import MachineSpec, Triway, build
-from app.boltzmann.draws import draw_hidden
-from app.boltzmann.gibbs import Clamp, sample_relations
-from app.boltzmann.implications import feature_count, implication_features, implied
-from app.boltzmann.log_odds import object_log_odds, relation_log_odds
-from app.boltzmann.mean_field import Evidence
+from app.inference.spec import feature_count
 from tests.enumeration.implied import features_by_hand, implied_by_hand
+from training.machines import MachineSpec, Triway, build
+from training.machines.draws import draw_hidden
+from training.machines.gibbs import Clamp, sample_relations
+from training.machines.implications import implication_features, implied
+from training.machines.log_odds import object_log_odds, relation_log_odds
+from training.machines.mean_field import Evidence
 
 
 @st.composite

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.boltzmann import philox
+from app.inference import philox
 
 
 def first_block(counter, key):

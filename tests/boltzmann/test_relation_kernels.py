@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from app.boltzmann import MachineSpec, build
-from app.boltzmann.closed_form import ClosedForm
-from app.boltzmann.relation_kernels import residual_row, to_log_odds
+from app.inference.relation_kernels import residual_row, to_log_odds
+from app.inference.shared_relations import _arrays
+from training.machines import MachineSpec, build
+from training.machines.arrays import weights_of
 
 
 def sigmoid(x):
@@ -37,7 +38,7 @@ def test_residuals_are_found_and_nothing_else():
     machine.set_triples(torch.tensor(np.stack([keys // 1600, keys // 40 % 40, keys % 40], 1)))
     with torch.no_grad():
         machine.residual.copy_(torch.arange(1.0, 501.0))
-    weights = ClosedForm(machine)._weights
+    weights, _ = _arrays(weights_of(machine))
     expected = np.zeros(4 * 40 * 40)
     expected[keys] = np.arange(1.0, 501.0)
     for pair in range(1600):

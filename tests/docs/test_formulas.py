@@ -17,12 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
-from app.boltzmann.closed_form import ClosedForm
-from app.boltzmann.draws import draw_hidden
-from app.boltzmann.log_odds import object_log_odds
-from app.boltzmann.mean_field import Evidence, mean_field
-from app.boltzmann.partition import ais, base_log_partition, independent_base
+from app.inference.closed_form import ClosedForm
 from app.reasoning.calibration import (
     exclusive,
     false_log_odds,
@@ -32,7 +27,6 @@ from app.reasoning.calibration import (
     relation_probability,
 )
 from app.reasoning.listing import likeliest_classes
-from app.reasoning.log_score import log_score
 from app.registry import Calibration
 from app.registry.description import CountSlope
 from tests.conftest import REPOSITORY
@@ -49,9 +43,15 @@ from tests.enumeration.small_machines import (
 from tests.enumeration.test_completions import exactly, machine_of
 from tests.training.test_objectives import toy_batch, toy_machine
 from training.config import ObjectiveConfig
+from training.machines import BoltzmannMachine, MachineSpec, build
+from training.machines.draws import draw_hidden
+from training.machines.log_odds import object_log_odds
+from training.machines.mean_field import Evidence, mean_field
+from training.machines.partition import ais, base_log_partition, independent_base
 from training.objectives import OBJECTIVES
 from training.objectives.composite import mask_one_class
 from training.objectives.contrastive import relation_nll
+from training.oracle.log_score import log_score
 
 LOCAL = [name for name in SMALL if name not in SEED_FORM]
 TRIWAYS = [name for name, spec in SMALL.items() if spec.variant == "triway"]

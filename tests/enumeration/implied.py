@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine
 from tests.enumeration.small_machines import Joint
+from training.machines import BoltzmannMachine
 
 
 def features_by_hand(given: Tensor) -> Tensor:

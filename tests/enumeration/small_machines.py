@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
+from training.machines import BoltzmannMachine, MachineSpec, build
 
 TRIPLES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 0)]
 

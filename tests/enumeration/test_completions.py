@@ -10,11 +10,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.boltzmann import MachineSpec, build
-from app.boltzmann.completions import Completions
-from app.boltzmann.fantasies import pack_scenes
-from app.boltzmann.scoring import ContextScorer
+from app.inference.completions import Completions
+from app.inference.scoring import ContextScorer
 from tests.enumeration.small_machines import binary
+from training.machines import MachineSpec, build
+from training.machines.arrays import weights_of
+from training.machines.fantasies import pack_scenes
 
 SPEC = MachineSpec("triway", V=7, A=1, H1=4, C=2, K=1, form="local")
 NOTHING = np.zeros(SPEC.V, dtype=bool)
@@ -63,8 +64,13 @@ def exactly(machine, listed, coverage, room=None):
     return ((p @ v) / p.sum()).numpy()
 
 
+def prepared(machine, structure, *count):
+    weights = weights_of(machine)
+    return Completions(weights, structure, ContextScorer(weights["W"]), *count)
+
+
 def estimated(machine, listed, coverage, room=None, count=16, structure=NOTHING):
-    completions = Completions(machine, structure, ContextScorer(machine), count)
+    completions = prepared(machine, structure, count)
     return ask(completions, machine, listed, coverage, room)
 
 
@@ -80,7 +86,7 @@ def ask(completions, machine, listed, coverage, room=None):
 @pytest.fixture(scope="module")
 def many():
     machine = machine_of(MANY)
-    return machine, Completions(machine, NOTHING, ContextScorer(machine), MANY)
+    return machine, prepared(machine, NOTHING, MANY)
 
 
 @pytest.mark.parametrize("listed", LISTED)
@@ -100,7 +106,7 @@ def test_the_error_falls_with_the_number_of_completions(coverage):
         differences = []
         for seed in range(6):
             machine = machine_of(samples, seed=seed)
-            completions = Completions(machine, NOTHING, ContextScorer(machine), count)
+            completions = prepared(machine, NOTHING, count)
             for listed in LISTED:
                 rest = np.setdiff1d(np.arange(SPEC.V), listed)
                 found = ask(completions, machine, listed, coverage)
@@ -114,7 +120,7 @@ def test_the_error_falls_with_the_number_of_completions(coverage):
 @pytest.mark.parametrize("rooms", [(None,), (0, 1), (None, 0, 1)])
 def test_a_room_type_counts_whatever_the_samples_were_drawn_under(rooms):
     machine = machine_of(MANY // len(rooms), rooms)
-    completions = Completions(machine, NOTHING, ContextScorer(machine), MANY)
+    completions = prepared(machine, NOTHING, MANY)
     for room in (0, 1):
         truth = exactly(machine, [2], 0.5, room)
         found = ask(completions, machine, [2], 0.5, room)
@@ -126,7 +132,7 @@ def test_a_room_type_counts_whatever_the_samples_were_drawn_under(rooms):
 def test_the_same_scene_gets_the_same_bits():
     machine = machine_of(64)
     first = estimated(machine, [1, 4], 0.5)
-    again = Completions(machine, NOTHING, ContextScorer(machine))
+    again = prepared(machine, NOTHING)
     ask(again, machine, [0], 0.3)
     np.testing.assert_array_equal(ask(again, machine, [1, 4], 0.5), first)
 
@@ -142,7 +148,7 @@ def test_the_lower_the_coverage_the_more_classes_are_expected(seed, listed, one,
     """But for the sampling error of 256 completions, of a sum of up to seven probabilities."""
     machine, listed = machine_of(1024, seed=seed), sorted(listed)
     rest = np.setdiff1d(np.arange(SPEC.V), listed)
-    completions = Completions(machine, NOTHING, ContextScorer(machine), 256)
+    completions = prepared(machine, NOTHING, 256)
     low, high = sorted((one, other))
     many, few = (ask(completions, machine, listed, c)[rest] for c in (low, high))
     assert ((many > 0) & (many < 1) & (few > 0) & (few < 1)).all()
@@ -155,10 +161,10 @@ def test_structure_is_never_added_and_tells_nothing_where_it_is_unlisted():
     machine = machine_of(512)
     structure = NOTHING.copy()
     structure[3] = True
-    plain = Completions(machine, structure, ContextScorer(machine), 64)
+    plain = prepared(machine, structure, 64)
     raised = machine_of(512)
     raised.b.data[3] += 5
-    other = Completions(raised, structure, ContextScorer(raised), 64)
+    other = prepared(raised, structure, 64)
     rest = np.delete(np.arange(SPEC.V), [0, 3])
     np.testing.assert_array_equal(
         ask(plain, machine, [0], 0.5)[rest], ask(other, raised, [0], 0.5)[rest]
@@ -167,7 +173,7 @@ def test_structure_is_never_added_and_tells_nothing_where_it_is_unlisted():
 
 def test_a_doubtful_class_weighs_less():
     machine = machine_of(MANY)
-    completions = Completions(machine, NOTHING, ContextScorer(machine), 1024)
+    completions = prepared(machine, NOTHING, 1024)
     bias, one = machine.c1.numpy(), np.array([2])
     found = [
         completions.log_odds(bias + g * machine.W[2].numpy(), one, np.array([g], np.float32), 0.5)
@@ -178,9 +184,9 @@ def test_a_doubtful_class_weighs_less():
 
 
 def test_other_machines_have_no_completions():
-    assert not Completions.fits(build(SPEC))
+    assert not Completions.fits(weights_of(build(SPEC)))
     heavy = machine_of(4)
     heavy.W.data[0, 0] = 100.0
-    assert not Completions.fits(heavy)
+    assert not Completions.fits(weights_of(heavy))
     with pytest.raises(ValueError, match="stored samples"):
-        Completions(heavy, NOTHING, ContextScorer(heavy))
+        prepared(heavy, NOTHING)

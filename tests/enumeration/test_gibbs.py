@@ -14,7 +14,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from app.boltzmann.gibbs import (
+from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+from training.machines.gibbs import (
     FREE,
     Clamp,
     State,
@@ -23,7 +24,6 @@ from app.boltzmann.gibbs import (
     present_classes,
     run,
 )
-from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
 
 CHAINS = 60_000
 

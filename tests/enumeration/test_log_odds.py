@@ -8,15 +8,6 @@ import math
 import pytest
 import torch
 
-from app.boltzmann.draws import draw_hidden
-from app.boltzmann.log_odds import (
-    context_gain,
-    object_log_odds,
-    object_log_odds_estimate,
-    relation_log_odds,
-    relation_log_odds_observed,
-)
-from app.boltzmann.mean_field import Evidence
 from tests.enumeration.implied import relation_by_definition
 from tests.enumeration.small_machines import (
     ONE_LAYER,
@@ -27,6 +18,15 @@ from tests.enumeration.small_machines import (
     same,
     small_machine,
 )
+from training.machines.draws import draw_hidden
+from training.machines.log_odds import (
+    context_gain,
+    object_log_odds,
+    object_log_odds_estimate,
+    relation_log_odds,
+    relation_log_odds_observed,
+)
+from training.machines.mean_field import Evidence
 
 LOCAL_ONE_LAYER = [n for n in ONE_LAYER if n not in SEED_FORM]
 TWO_LAYERS = [n for n in SMALL if n not in ONE_LAYER]

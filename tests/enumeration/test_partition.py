@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from app.boltzmann.gibbs import State
-from app.boltzmann.partition import ais, base_log_partition, independent_base, reverse_ais
 from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+from training.machines.gibbs import State
+from training.machines.partition import ais, base_log_partition, independent_base, reverse_ais
 
 BETAS = torch.linspace(0, 1, 41).tolist()
 CHAINS = 2000

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
 from app.registry import (
     Calibration,
     DataSource,
@@ -20,6 +19,7 @@ from app.registry import (
 )
 from app.scene.relations import CANONICAL
 from app.scene.vocabulary import ObjectClass, Vocabulary
+from training.machines import BoltzmannMachine, MachineSpec, build
 
 VOCABULARY = Vocabulary(
     [
@@ -46,8 +46,8 @@ V, A, C = len(VOCABULARY), len(CANONICAL), len(VOCABULARY.room_types)
 TRIPLES = torch.tensor([(0, 0, 1), (0, 1, 0), (1, 3, 5), (2, 2, 1), (2, 7, 5), (3, 2, 0)])
 SPECS = {
     "triway": MachineSpec("triway", V=V, A=A, H1=6, C=C, K=3, form="local"),
-    "gbm": MachineSpec("gbm", V=V, A=A, H1=6, H2=4, C=C),
-    "rbm": MachineSpec("rbm", V=V, A=A, H1=6, C=C),
+    "gbm": MachineSpec("gbm", V=V, A=A, H1=6, H2=4, C=C, form="local"),
+    "rbm": MachineSpec("rbm", V=V, A=A, H1=6, C=C, form="local"),
 }
 
 

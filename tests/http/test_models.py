@@ -336,14 +336,14 @@ async def test_a_request_keeps_the_models_it_started_with(store: Path) -> None:
 async def test_replaced_models_are_freed(store: Path, admin: dict[str, str]) -> None:
     async with serve(store) as client:
         runtime = client.app.state.runtime  # type: ignore[attr-defined]
-        replaced = weakref.ref(runtime.models.resolve("deep").artifact.machine)
-        kept = weakref.ref(runtime.models.resolve("home").artifact.machine)
+        replaced = weakref.ref(runtime.models.resolve("deep").artifact.weights)
+        kept = weakref.ref(runtime.models.resolve("home").artifact.weights)
         shutil.rmtree(store / "deep")
         await client.post("/models/refresh", headers=admin)
         await client.post("/models/refresh", headers=admin)
         assert replaced() is None
         # An unchanged artifact is verified again and not loaded twice.
-        assert runtime.models.resolve("home").artifact.machine is kept()
+        assert runtime.models.resolve("home").artifact.weights is kept()
         assert gc.get_freeze_count() > 0
 
 

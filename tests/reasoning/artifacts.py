@@ -6,11 +6,14 @@ from pathlib import Path
 
 import torch
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
+from app.inference.closed_form import ClosedForm
 from app.registry.artifact import Artifact
 from app.registry.description import Calibration, CountSlope, PairSlope, Slope, Thresholds
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.enumeration.small_machines import SMALL
+from training.machines import BoltzmannMachine, MachineSpec, build
+from training.machines.arrays import weights_of
+from training.oracle.drawn import DrawnPosterior
 
 # Three classes, so that a present one leaves two to choose from; few enough states to enumerate.
 EXACT: dict[str, MachineSpec] = {
@@ -23,13 +26,16 @@ EXACT: dict[str, MachineSpec] = {
 }
 # Too large to enumerate; with structure, four relations and two layers.
 LARGER: dict[str, MachineSpec] = {
-    "rbm": MachineSpec("rbm", V=9, A=4, H1=6, T=40, C=2),
-    "gbm": MachineSpec("gbm", V=9, A=4, H1=6, H2=3, T=40),
+    "rbm": MachineSpec("rbm", V=9, A=4, H1=6, T=40, C=2, form="local"),
+    "gbm": MachineSpec("gbm", V=9, A=4, H1=6, H2=3, T=40, form="local"),
     "product-rbm": MachineSpec("product_rbm", V=9, A=4, H1=6, K=3, T=40, form="local"),
     "triway-seed": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, form="seed"),
     "triway-local": MachineSpec("triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, form="local"),
     # Wide enough for logits that are as good as normal, and so in closed form without relations.
     "triway-wide": MachineSpec("triway", V=9, A=4, H1=90, K=3, T=60, C=2, G=2, form="local"),
+    "triway-deep": MachineSpec("triway", V=9, A=4, H1=90, H2=20, K=3, T=60, C=2, form="local"),
+    "rbm-wide": MachineSpec("rbm", V=9, A=4, H1=90, T=200, C=2, form="local"),
+    "gbm-wide": MachineSpec("gbm", V=9, A=4, H1=90, H2=20, T=200, C=2, form="local"),
     "triway-implications": MachineSpec(
         "triway", V=9, A=4, H1=6, H2=3, K=3, T=5, C=2, G=2, form="local"
     ),
@@ -54,33 +60,34 @@ def calibration(relations: int, **changes: object) -> Calibration:
 
 
 def artifact_of(machine: BoltzmannMachine, **changes: object) -> Artifact:
-    spec = machine.spec
+    spec, weights = machine.spec, weights_of(machine)
     vocabulary = Vocabulary(
         [ObjectClass(label, structure=label in STRUCTURE) for label in LABELS[: spec.V]],
         ROOMS[: spec.C],
     )
     return Artifact(
         manifest=None,
-        machine=machine,
+        weights=weights,
         vocabulary=vocabulary,
         calibration=calibration(spec.A, **changes),
         digest="",
         card="",
         path=Path(),
+        oracle=None if ClosedForm.fits(weights) else DrawnPosterior,
     )
 
 
 def exact_artifact(name: str, scale: float = 1.3, **changes: object) -> Artifact:
     """Float64, every weight drawn from N(0, scale²)."""
-    return artifact_of(_random(EXACT[name], torch.float64, scale), **changes)
+    return artifact_of(random_machine(EXACT[name], torch.float64, scale), **changes)
 
 
 def larger_artifact(name: str, scale: float = 0.7, **changes: object) -> Artifact:
     """Float32, every weight drawn from N(0, scale²)."""
-    return artifact_of(_random(LARGER[name], torch.float32, scale), **changes)
+    return artifact_of(random_machine(LARGER[name], torch.float32, scale), **changes)
 
 
-def _random(spec: MachineSpec, dtype: torch.dtype, scale: float) -> BoltzmannMachine:
+def random_machine(spec: MachineSpec, dtype: torch.dtype, scale: float) -> BoltzmannMachine:
     generator = torch.Generator().manual_seed(3)
     machine = build(spec).to(dtype)
     if spec.T:

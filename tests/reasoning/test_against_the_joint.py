@@ -13,6 +13,7 @@ from app.scene import CANONICAL, OPPOSITES
 from tests.enumeration.implied import relation_by_definition
 from tests.enumeration.small_machines import Joint, enumerate_joint
 from tests.reasoning.artifacts import EXACT, LABELS, exact_artifact, scene_of
+from training.machines.arrays import machine_of
 
 pytestmark = pytest.mark.usefixtures("the_likeliest_is_expected")
 
@@ -25,7 +26,7 @@ LOG_ODDS_TOLERANCE = 0.05
 
 @pytest.fixture(autouse=True)
 def _many_draws(monkeypatch):
-    monkeypatch.setattr("app.reasoning.evidence.DRAWS", DRAWS)
+    monkeypatch.setattr("training.oracle.evidence.DRAWS", DRAWS)
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Exact:
 @pytest.fixture(scope="module", params=EXACT)
 def case(request):
     artifact = exact_artifact(request.param)
-    return artifact, Exact(enumerate_joint(artifact.machine))
+    return artifact, Exact(enumerate_joint(machine_of(artifact.weights)))
 
 
 # Classes of a scene and the canonical triples stated of them (classes are places here).
@@ -118,7 +119,7 @@ def triples(classes, stated):
 
 
 def is_exact(artifact, stated):
-    return artifact.machine.spec.form == "local" and not stated
+    return artifact.spec.form == "local" and not stated
 
 
 @pytest.mark.parametrize(("classes", "stated"), SCENES[:5])
@@ -145,7 +146,7 @@ def test_placements(case, classes, stated):
     What the observed relations imply for those of a candidate is left out.
     """
     artifact, exact = case
-    A = artifact.machine.spec.A
+    A = artifact.spec.A
     observed = triples(classes, stated)
     for answer in missing(artifact, scene_of(classes, stated)):
         i = LABELS.index(answer.label)
@@ -188,7 +189,7 @@ def test_relations(case, classes, stated):
     answers, _ = relations(artifact, scene_of(classes, stated), top_k=100)
     observed = triples(classes, stated)
     n = len(classes)
-    assert len(answers) == n * (n - 1) * artifact.machine.spec.A
+    assert len(answers) == n * (n - 1) * artifact.spec.A
     for answer in answers:
         a = CANONICAL.index(answer.relation)
         i, j = classes[answer.subject], classes[answer.object]
@@ -207,7 +208,7 @@ def test_disagreements(case, classes, stated, complete):
     Where two relations are as likely as an estimate can tell, either may be expected.
     """
     artifact, exact = case
-    A = artifact.machine.spec.A
+    A = artifact.spec.A
     scene = scene_of(classes, stated, complete=complete)
     _, found = relations(artifact, scene, top_k=100)
     answers = {(answer.subject, answer.object): answer for answer in found}
@@ -273,7 +274,7 @@ def test_reasons(name):
     """What each other object adds to the log-odds: exact where these are, else a mean field, which
     is near for weights of .6."""
     artifact = exact_artifact(name, scale=0.6)
-    exact = Exact(enumerate_joint(artifact.machine))
+    exact = Exact(enumerate_joint(machine_of(artifact.weights)))
     classes = [0, 1, 2]
     near = 1e-9 if is_exact(artifact, None) else 0.15
     scene = scene_of(classes)
@@ -301,7 +302,7 @@ def test_reasons(name):
 def test_reasons_for_what_is_missing(name, classes):
     """As far as for outliers: what each class adds that is there, which left out is one fewer."""
     artifact = exact_artifact(name, scale=0.6)
-    exact = Exact(enumerate_joint(artifact.machine))
+    exact = Exact(enumerate_joint(machine_of(artifact.weights)))
     near = 1e-9 if is_exact(artifact, None) else 0.15
     for answer in missing(artifact, scene_of(classes)):
         i = LABELS.index(answer.label)
@@ -319,7 +320,7 @@ def test_reasons_for_what_is_missing(name, classes):
 def test_the_room_type_counts(name):
     artifact = exact_artifact(name)
     for room in range(2):
-        exact = Exact(enumerate_joint(artifact.machine, room))
+        exact = Exact(enumerate_joint(machine_of(artifact.weights), room))
         near = 1e-9 if is_exact(artifact, None) else LOG_ODDS_TOLERANCE
         for answer in missing(artifact, scene_of([0], room=room)):
             truth = UNLISTED + exact.object(LABELS.index(answer.label), [0])

@@ -16,14 +16,15 @@ import numpy as np
 import pytest
 import torch
 
-from app.boltzmann import chain_kernels, philox
-from app.boltzmann.gibbs import present_classes
-from app.boltzmann.scene_chains import Conditions
+from app.inference import chain_kernels, philox
+from app.inference.scene_chains import Conditions
 from app.reasoning import generate
-from app.reasoning.log_score import log_score
 from app.scene import CANONICAL
 from tests.enumeration.small_machines import enumerate_joint
 from tests.reasoning.artifacts import LABELS, artifact_of, exact_artifact, larger_artifact, scene_of
+from training.machines.arrays import machine_of
+from training.machines.gibbs import present_classes
+from training.oracle.log_score import log_score
 
 SCENES = {
     "nothing": (scene_of([]), {}),
@@ -43,9 +44,9 @@ def artifact():
 
 def single(name):
     """An exact artifact in float32, which has compiled chains, and its joint."""
-    made = artifact_of(exact_artifact(name).machine.float())
+    made = artifact_of(machine_of(exact_artifact(name).weights).float())
     assert made.scene_chains is not None
-    return made, enumerate_joint(copy.deepcopy(made.machine).double())
+    return made, enumerate_joint(copy.deepcopy(machine_of(made.weights)).double())
 
 
 @pytest.mark.parametrize("name", ["triway-local", "triway-implications"])
@@ -142,7 +143,7 @@ def test_scenes_are_the_same_in_another_process(artifact, repository):
 @pytest.mark.parametrize("name", SCENES)
 def test_the_score_is_that_of_the_tensors(artifact, name):
     scene, options = SCENES[name]
-    machine = artifact.machine
+    machine = machine_of(artifact.weights)
     for drawn in generate(artifact, scene, count=4, seed=2, steps=5, **options):
         v, h1 = torch.zeros(1, machine.spec.V), torch.zeros(1, machine.spec.H1)
         v[0, [LABELS.index(label) for label in drawn.objects]] = 1
@@ -187,7 +188,14 @@ def test_other_threads_go_on_while_a_chain_runs(artifact):
     """A chain of many sweeps in a thread; meanwhile this one wakes up again and again."""
     nothing = np.zeros(0, dtype=np.int64)
     bare = Conditions(
-        nothing, nothing.astype(np.float32), nothing, nothing, nothing, nothing > 0, nothing
+        nothing,
+        nothing.astype(np.float32),
+        nothing,
+        nothing,
+        nothing,
+        nothing > 0,
+        nothing,
+        nothing,
     )
     chains = artifact.scene_chains.given(bare)
     chains.draw(1, philox.stream(0, 0))
@@ -211,9 +219,9 @@ def test_fewer_sweeps_are_the_beginning_of_more(artifact, monkeypatch, name):
     states = []
     sweeps = chain_kernels.sweeps
 
-    def one_by_one(w, bias, given, held, observed, beta, count, on, h1, stream):
+    def one_by_one(w, bias, given, held, held2, observed, beta, count, on, h1, h2, stream):
         for _ in range(count):
-            sweeps(w, bias, given, held, observed, beta, 1, on, h1, stream)
+            sweeps(w, bias, given, held, held2, observed, beta, 1, on, h1, h2, stream)
             states.append((on.copy(), h1.copy()))
 
     with monkeypatch.context() as patched:

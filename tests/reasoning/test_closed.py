@@ -10,14 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.boltzmann import MachineSpec, build
-from app.boltzmann.closed_form import LEAST_UNITS, ClosedForm
+from app.inference.closed_form import ClosedForm
 from app.reasoning import missing, outliers, relations
-from app.reasoning.closed import ClosedPosterior
-from app.reasoning.drawn import DrawnPosterior
-from app.reasoning.posterior import posterior
+from app.reasoning.posterior import Posterior, posterior
 from app.scene import Scene, SceneObject
 from tests.reasoning.artifacts import larger_artifact, scene_of
+from training.machines import MachineSpec, build
+from training.machines.arrays import weights_of
+from training.oracle.drawn import DrawnPosterior
 
 ARTIFACT = larger_artifact("triway-wide")
 SCENES = [
@@ -42,9 +42,8 @@ def scene(request):
 
 @pytest.fixture
 def pair(scene, monkeypatch):
-    monkeypatch.setattr("app.reasoning.evidence.DRAWS", 1 << 15)
-    closed = posterior(ARTIFACT, scene)
-    assert isinstance(closed, ClosedPosterior)
+    monkeypatch.setattr("training.oracle.evidence.DRAWS", 1 << 15)
+    closed = Posterior(ARTIFACT, scene)
     return closed, DrawnPosterior(ARTIFACT, scene)
 
 
@@ -119,21 +118,11 @@ def test_the_same_scene_gets_the_same_bits(classes, room):
     assert ask() == first
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"variant": "rbm", "K": 0, "G": 0},
-        {"form": "seed", "G": 0},
-        {"H2": 5},
-        {"H1": LEAST_UNITS - 1},
-    ],
-)
-def test_other_machines_have_no_closed_form(changes):
-    spec = {"V": 5, "A": 2, "H1": 70, "K": 2, "form": "local", "variant": "triway"} | changes
-    machine = build(MachineSpec(**spec))
-    assert not ClosedForm.fits(machine)
-    with pytest.raises(ValueError, match="one wide layer"):
-        ClosedForm(machine)
+def test_the_seed_form_has_no_closed_form():
+    weights = weights_of(build(MachineSpec("rbm", V=5, A=2, H1=70)))
+    assert not ClosedForm.fits(weights)
+    with pytest.raises(ValueError, match="local form"):
+        ClosedForm(weights)
 
 
 @pytest.mark.parametrize("largest", [70.0, 1.0])
@@ -141,5 +130,5 @@ def test_weights_too_large_for_products_have_none_either(largest):
     machine = build(MachineSpec("triway", V=5, A=2, H1=70, K=2, form="local"))
     with torch.no_grad():
         machine.W[1, 2] = largest
-    assert ClosedForm.fits(machine) == (largest < 64)
-    assert not ClosedForm.fits(machine.double())
+    assert ClosedForm.fits(weights_of(machine)) == (largest < 64)
+    assert not ClosedForm.fits(weights_of(machine.double()))

@@ -8,6 +8,7 @@ import torch
 from app.reasoning import contexts
 from app.scene import CANONICAL
 from tests.reasoning.artifacts import LABELS, LARGER, ROOMS, STRUCTURE, larger_artifact
+from training.machines.arrays import machine_of
 
 
 def relation_weights(machine):
@@ -59,11 +60,11 @@ def test_a_unit_that_favours_nothing_has_its_number():
 @pytest.mark.parametrize("name", LARGER)
 def test_every_unit_by_its_largest_positive_weights(name):
     artifact = larger_artifact(name)
-    machine = artifact.machine
+    machine = machine_of(artifact.weights)
     layers = {"h1": (machine.W, machine.Q)}
     if machine.spec.H2:
         layers["h2"] = (machine.W @ machine.J, machine.Q @ machine.J)
-    relations = relation_weights(artifact.machine)
+    relations = relation_weights(machine_of(artifact.weights))
     found = contexts(artifact)
     assert set(found) == set(layers)
     for layer, (objects, rooms) in layers.items():

@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from app.reasoning.evidence import draw_context, observe
-from app.reasoning.units import NO_UNIT, mean_log_p, units_between
 from app.scene import Scene, SceneObject, derive_relations
 from tests.reasoning.artifacts import LARGER, exact_artifact, larger_artifact, scene_of
+from training.machines.arrays import machine_of
+from training.oracle.evidence import draw_context, observe
+from training.oracle.units import NO_UNIT, mean_log_p, units_between
 
 
 def triples_of(edges, values):
@@ -21,7 +22,7 @@ def triples_of(edges, values):
 
 @pytest.mark.parametrize("name", LARGER)
 def test_classes_counts_and_positions(name):
-    found = observe(larger_artifact(name).machine, scene_of([5, 0, 5, 3, 5]))
+    found = observe(machine_of(larger_artifact(name).weights), scene_of([5, 0, 5, 3, 5]))
     assert found.classes.tolist() == [0, 3, 5]
     assert found.counts.tolist() == [1, 1, 3]
     assert found.row.tolist() == [2, 0, 2, 1, 2]
@@ -32,7 +33,7 @@ def test_classes_counts_and_positions(name):
 
 @pytest.mark.parametrize("name", LARGER)
 def test_stated_relations_are_observed_where_the_machine_has_units(name):
-    machine = larger_artifact(name).machine
+    machine = machine_of(larger_artifact(name).weights)
     known = {(int(a), int(i), int(j)) for a, i, j in machine.triples.tolist() if i != j}
     a, i, j = sorted(known)[0]
     unseen = next(
@@ -47,12 +48,14 @@ def test_stated_relations_are_observed_where_the_machine_has_units(name):
 
 
 def test_only_classes_that_a_relation_touches_get_units_in_the_local_form():
-    machine = larger_artifact("triway-local").machine
+    machine = machine_of(larger_artifact("triway-local").weights)
     assert observe(machine, scene_of([0, 1, 2])).units is None
     found = observe(machine, scene_of([0, 1, 2, 3], [(1, 3, 0)]))
     assert found.touched.tolist() == [True, False, False, True]
     assert found.unit_count == 4 * 2 * 2
-    whole = observe(larger_artifact("triway-seed").machine, scene_of([0, 1, 2, 3], [(1, 3, 0)]))
+    whole = observe(
+        machine_of(larger_artifact("triway-seed").weights), scene_of([0, 1, 2, 3], [(1, 3, 0)])
+    )
     assert whole.unit_count == 4 * 4 * 4
 
 
@@ -60,7 +63,9 @@ def test_only_classes_that_a_relation_touches_get_units_in_the_local_form():
 def test_poses_show_what_does_not_hold(name):
     plain = scene_of([0, 1, 2])
     poses = derive_relations([[1, 0, 0], [1, 1, 0], [30, 0, 0]], [[0.5, 0.5, 0.5]] * 3)
-    found = observe(larger_artifact(name).machine, Scene(plain.objects, ((0, 1, 0),), poses=poses))
+    found = observe(
+        machine_of(larger_artifact(name).weights), Scene(plain.objects, ((0, 1, 0),), poses=poses)
+    )
     seen = triples_of(found.units.edges, found.evidence.observed)
     assert seen == {(a, i, j) for a in range(4) for i, j in ((0, 1), (1, 0))}
     assert triples_of(found.units.edges, found.evidence.r) == {(0, 1, 0)}
@@ -68,7 +73,7 @@ def test_poses_show_what_does_not_hold(name):
 
 @pytest.mark.parametrize("name", LARGER)
 def test_taking_classes_out_takes_their_relations_out(name):
-    machine = larger_artifact(name).machine
+    machine = machine_of(larger_artifact(name).weights)
     classes = [0, 1, 2]
     stated = [(0, 0, 1), (1, 1, 2), (2, 2, 0)]
     found = observe(machine, scene_of(classes, stated))
@@ -83,14 +88,14 @@ def test_taking_classes_out_takes_their_relations_out(name):
 
 
 def test_a_machine_of_fewer_relations_passes_over_the_others():
-    machine = exact_artifact("triway-local").machine
+    machine = machine_of(exact_artifact("triway-local").weights)
     assert observe(machine, scene_of([0, 1], [(2, 0, 1)])).units is None
 
 
 @pytest.mark.parametrize("name", LARGER)
 def test_units_between_any_classes(name):
     """The grid and the flat layout name the same units."""
-    machine = larger_artifact(name).machine
+    machine = machine_of(larger_artifact(name).weights)
     subjects, objects = torch.tensor([4, 1, 7]), torch.tensor([2, 4])
     units = units_between(machine, subjects, objects)
     edges = units.edges
@@ -111,7 +116,7 @@ def test_units_between_any_classes(name):
 
 
 def test_a_machine_without_any_unit():
-    machine = larger_artifact("rbm").machine
+    machine = machine_of(larger_artifact("rbm").weights)
     empty = type(machine)(type(machine.spec)("rbm", V=9, A=4, H1=6))
     units = units_between(empty, torch.arange(3), torch.arange(2))
     assert torch.equal(units.grid(torch.zeros(5, 0), NO_UNIT), torch.full((5, 4, 3, 2), NO_UNIT))
@@ -128,15 +133,15 @@ def test_both_tails_of_a_probability_keep_their_digits():
 
 
 def test_many_relations_get_fewer_draws(monkeypatch):
-    machine = larger_artifact("triway-local").machine
+    machine = machine_of(larger_artifact("triway-local").weights)
     small = observe(machine, scene_of([0, 1], [(0, 0, 1)])).evidence
     assert len(draw_context(machine, small).h1) == 64
-    monkeypatch.setattr("app.reasoning.evidence._RELATION_DRAWS", 16 * 16)
+    monkeypatch.setattr("training.oracle.evidence._RELATION_DRAWS", 16 * 16)
     assert len(draw_context(machine, small).h1) == 16
     assert len(draw_context(machine, small, rows=1000).h1) == 8
 
 
 def test_confidence_is_soft_presence():
-    machine = larger_artifact("triway-local").machine
+    machine = machine_of(larger_artifact("triway-local").weights)
     scene = Scene((SceneObject("a", "bed", 0, 0.25), SceneObject("b", "lamp", 1)))
     assert observe(machine, scene).evidence.v[0, :3].tolist() == [0.25, 1.0, 0.0]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.reasoning.drawn import DrawnPosterior
 from app.reasoning.posterior import posterior
 from app.registry.description import EvidenceWeights
 from app.scene import Scene, derive_relations
 from tests.reasoning.artifacts import LARGER, larger_artifact, scene_of
+from training.oracle.drawn import DrawnPosterior
 
 STATED = scene_of([0, 1, 2, 3], [(2, 1, 0), (0, 2, 3), (1, 0, 3)])
 PLACES = [[1, 0, 0], [1, 0.8, 0], [1.6, 0.8, 0], [30, 0, 0]]
@@ -106,7 +106,7 @@ def test_both_posteriors_agree(kind, weight, monkeypatch):
     """
     artifact = artifact_with("triway-wide", kind, weight, weight, scale=0.12)
     closed = posterior(artifact, SCENES[kind])
-    monkeypatch.setattr("app.reasoning.evidence.DRAWS", 1 << 13)
+    monkeypatch.setattr("training.oracle.evidence.DRAWS", 1 << 13)
     drawn = DrawnPosterior(artifact, SCENES[kind])
     for ask in (lambda p: p.absent_log_odds(ABSENT), lambda p: p.log_odds_given_rest()):
         assert np.abs(ask(closed) - ask(drawn)).max() < 0.12

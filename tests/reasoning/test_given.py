@@ -6,11 +6,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.boltzmann import MachineSpec
 from app.reasoning.given import given_relations
 from app.reasoning.present import present
 from app.scene import Scene, SceneObject, derive_relations
 from app.scene.evidence import class_evidence
+from training.machines import MachineSpec
 
 SPEC = MachineSpec("triway", V=5, A=4, H1=3, K=2, form="local")
 

@@ -10,6 +10,7 @@ import pytest
 from app.reasoning import misplaced, outliers
 from app.registry.description import CountSlope, Thresholds
 from tests.reasoning.artifacts import LABELS, STRUCTURE, larger_artifact, scene_of
+from training.machines.arrays import machine_of
 
 LINE = CountSlope(intercept=0.2, slope=-0.8, log_count=0.1)
 PRESETS = Thresholds(low=0.9, medium=0.6, high=0.3)
@@ -95,7 +96,7 @@ def test_a_threshold_replaces_that_of_objects_only():
 def test_companions_would_make_an_outlier_likely(name):
     """Each named class, alone with the outlier, raises the log-odds of a context without others."""
     artifact = larger_artifact(name)
-    W, c1 = artifact.machine.W.double(), artifact.machine.c1.double()
+    W, c1 = machine_of(artifact.weights).W.double(), machine_of(artifact.weights).c1.double()
     scene = scene_of([0, 1, 2])
     found = outliers(artifact, scene, threshold=0.0).outliers
     assert any(answer.usually_with for answer in found)

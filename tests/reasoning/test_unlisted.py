@@ -10,12 +10,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.boltzmann import MachineSpec, build
-from app.boltzmann.fantasies import pack_scenes
 from app.reasoning import missing
 from app.reasoning.posterior import posterior
 from app.reasoning.unlisted import FULL
 from tests.reasoning.artifacts import LABELS, artifact_of, larger_artifact, scene_of
+from training.machines import MachineSpec, build
+from training.machines.fantasies import pack_scenes
 
 SPECS = {
     "rbm": MachineSpec("rbm", V=9, A=4, H1=12, T=8, C=2, N=256, form="local"),

@@ -25,8 +25,8 @@ VOCABULARY = Vocabulary(
 
 # One of each variant; a new one is put through the round trip by an entry here.
 SPECS: dict[str, dict[str, Any]] = {
-    "rbm": {"variant": "rbm", "V": 3, "A": 4, "H1": 5, "C": 2, "T": 2},
-    "gbm": {"variant": "gbm", "V": 3, "A": 4, "H1": 5, "H2": 2, "T": 2},
+    "rbm": {"variant": "rbm", "V": 3, "A": 4, "H1": 5, "C": 2, "T": 2, "form": "local"},
+    "gbm": {"variant": "gbm", "V": 3, "A": 4, "H1": 5, "H2": 2, "T": 2, "form": "local"},
     "triway": {"variant": "triway", "V": 3, "A": 4, "H1": 5, "K": 2, "T": 2, "form": "local"},
 }
 
@@ -73,7 +73,7 @@ def description(
 
 def state(variant: str = "rbm", seed: int = 0) -> dict[str, np.ndarray]:
     """Random weights of a machine of `SPECS`, as its `state_dict` would hold them."""
-    from app.boltzmann import MachineSpec, build
+    from training.machines import MachineSpec, build
 
     generator = np.random.default_rng(seed)
     tensors = {}

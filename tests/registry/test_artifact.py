@@ -15,7 +15,7 @@ import pytest
 import torch
 from safetensors.numpy import save
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
+from app.inference.weights import layout
 from app.registry import ArtifactError, Calibration, load_artifact, write_artifact
 from app.registry.description import VocabularyEntry
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS
@@ -29,6 +29,8 @@ from tests.registry.small_artifacts import (
     rewrite_manifest,
     state,
 )
+from training.machines import VARIANTS, MachineSpec, build
+from training.machines.arrays import machine_of
 
 FILES = (WEIGHTS, MANIFEST, CARD)
 
@@ -57,26 +59,39 @@ def test_round_trip_is_exact_in_float32(variant: str, tmp_path: Path) -> None:
     manifest = write_artifact(tmp_path / "a", saying, weights)
     artifact = load_artifact(tmp_path / "a")
     assert artifact.manifest == manifest
-    assert type(artifact.machine) is type(build(MachineSpec.from_dict(SPECS[variant])))
-    assert artifact.machine.spec == MachineSpec.from_dict(SPECS[variant])
+    assert artifact.spec == MachineSpec.from_dict(SPECS[variant])
     assert artifact.vocabulary == VOCABULARY
     assert artifact.calibration == saying.calibration
     assert artifact.card == (tmp_path / "a" / CARD).read_text()
     assert artifact.path == tmp_path / "a"
-    assert not artifact.machine.training
-    assert not any(p.requires_grad for p in artifact.machine.parameters())
-    loaded = artifact.machine.state_dict()
+    loaded = artifact.weights.arrays
     assert loaded.keys() == weights.keys()
     for name, array in weights.items():
-        assert loaded[name].device.type == "cpu"
-        assert np.array_equal(loaded[name].numpy(), array), name
-        assert loaded[name].numpy().dtype == array.dtype, name
+        assert np.array_equal(loaded[name], array), name
+        assert loaded[name].dtype == array.dtype, name
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("more", [{}, {"H2": 2, "C": 3, "N": 4, "G": 1}])
+def test_the_layout_is_that_of_the_machines(variant: str, more: dict[str, int]) -> None:
+    takes = {"rbm": {"C", "N"}, "product_rbm": {"C", "N"}, "gbm": {"H2", "C", "N"}}
+    sizes = {name: n for name, n in more.items() if name in takes.get(variant, more)}
+    spec = MachineSpec(variant, V=40, A=4, H1=5, K=2, T=3, form="local", **sizes)
+    state = build(spec).state_dict()
+    kinds = {torch.float32: float, torch.int32: int}
+    assert layout(spec) == {name: (kinds[t.dtype], tuple(t.shape)) for name, t in state.items()}
+
+
+def test_the_seed_form_is_not_served(tmp_path: Path) -> None:
+    saying = description().model_copy(update={"spec": {**SPECS["rbm"], "form": "seed"}})
+    write_artifact(tmp_path / "a", saying, state("rbm"))
+    assert refusal(tmp_path / "a").code == "unsupported"
 
 
 def test_a_loaded_machine_computes(tmp_path: Path) -> None:
     weights = state("triway")
     write_artifact(tmp_path / "a", description(variant="triway"), weights)
-    loaded = load_artifact(tmp_path / "a").machine
+    loaded = machine_of(load_artifact(tmp_path / "a").weights)
     original = build(MachineSpec.from_dict(SPECS["triway"]))
     original.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
     v = torch.tensor([[1.0, 0.0, 1.0]])
@@ -91,24 +106,24 @@ def test_accepts_the_state_of_a_machine_itself(tmp_path: Path) -> None:
     machine.set_triples(torch.tensor([(0, 0, 1), (2, 1, 0)]))
     machine.initialise(torch.Generator().manual_seed(0))
     write_artifact(tmp_path / "a", description(), machine.state_dict())
-    loaded = load_artifact(tmp_path / "a").machine
+    loaded = load_artifact(tmp_path / "a").weights
     for name, tensor in machine.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], tensor), name
+        assert np.array_equal(loaded[name], tensor.numpy()), name
 
 
 def test_half_precision_keeps_biases_and_integers_whole(tmp_path: Path) -> None:
     weights = state()
     manifest = write_artifact(tmp_path / "a", description(), weights, storage_dtype="float16")
-    loaded = load_artifact(tmp_path / "a").machine.state_dict()
+    loaded = load_artifact(tmp_path / "a").weights
     for name, array in weights.items():
         stored = manifest.tensors[name].dtype
         if array.dtype == np.float32 and array.ndim > 1:
             assert stored == "float16"
-            assert loaded[name].dtype == torch.float32
-            assert np.array_equal(loaded[name].numpy(), array.astype(np.float16)), name
+            assert loaded[name].dtype == np.float32
+            assert np.array_equal(loaded[name], array.astype(np.float16)), name
         else:
             assert stored == array.dtype.name
-            assert np.array_equal(loaded[name].numpy(), array), name
+            assert np.array_equal(loaded[name], array), name
 
 
 def test_scalars_and_views_are_stored_as_they_are() -> None:
@@ -398,21 +413,6 @@ def test_refuses_a_spec_that_no_machine_has(change: dict[str, Any], written: Pat
     assert refusal(written).code in {"invalid_manifest", "wrong_shape"}
 
 
-def test_allocates_nothing_for_a_spec_before_the_tensors_fit_it(
-    written: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    devices = set()
-
-    def watched_build(spec: MachineSpec) -> BoltzmannMachine:
-        machine = build(spec)
-        devices.update(tensor.device.type for tensor in machine.state_dict().values())
-        return machine
-
-    monkeypatch.setattr("app.boltzmann.build", watched_build)
-    load_artifact(written)
-    assert devices == {"meta"}
-
-
 def test_refuses_another_variant_of_the_same_size(written: Path) -> None:
     rewrite_manifest(written, lambda members: members["spec"].update(variant="gbm"))
     assert refusal(written).code == "wrong_shape"
@@ -443,6 +443,6 @@ def test_uses_the_bytes_that_it_checked(
         return files
 
     monkeypatch.setattr(module, "read_verified", read_then_exchange)
-    loaded = load_artifact(written).machine.state_dict()
-    assert np.array_equal(loaded["W"].numpy(), state()["W"])
+    loaded = load_artifact(written).weights
+    assert np.array_equal(loaded["W"], state()["W"])
     assert refusal(written).code == "truncated"

@@ -126,7 +126,7 @@ def test_what_was_loaded_before_is_verified_again(file: str, store: Store) -> No
 
 def test_an_old_snapshot_and_a_failure_keep_nothing_alive(store: Store) -> None:
     first = load_model_set(store)
-    machine = weakref.ref(entry(first, "tiny", "2.0.0").machine)
+    machine = weakref.ref(entry(first, "tiny", "2.0.0").weights)
     (store.root / "tiny" / "2.0.0" / "model.safetensors").write_bytes(b"")
     second = load_model_set(store, first)
     del first

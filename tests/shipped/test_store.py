@@ -63,7 +63,7 @@ def test_an_artifact_loads_in_under_a_second(artifact):
 
 def test_the_structure_is_the_seed_paper_s_but_for_the_second_layer_of_the_triway(artifact):
     """Why it has gone: docs/decisions/objective.md. The seed-* configurations keep it."""
-    spec = artifact.machine.spec
+    spec = artifact.spec
     assert spec.H1 == 200
     deep = spec.variant == "gbm" or artifact.manifest.name.endswith("deep")
     assert (100 if deep else 0) == spec.H2

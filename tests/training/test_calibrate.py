@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from app.boltzmann import MachineSpec, build
 from app.reasoning import misplaced, outliers
 from app.registry import Calibration
 from tests.reasoning.artifacts import artifact_of
@@ -39,6 +38,8 @@ from training.evaluation.answers import QUESTIONS, collect
 from training.evaluation.asking import of_classes
 from training.evaluation.missing import machine_score
 from training.evaluation.outliers import IntruderScores, clean_scores, intruder_scores
+from training.machines import MachineSpec, build
+from training.machines.arrays import machine_of
 from training.objects import fit_objects, store_samples
 
 ROOM_COUNT = 400
@@ -202,7 +203,7 @@ def test_thresholds_fall_with_the_sensitivity(fitted):
 def test_thresholds_keep_their_share_of_untouched_scenes(model, fitted):
     """On the scenes that they were fitted on."""
     scenes = complete_scenes(rooms(300, 1))
-    scores = intruder_scores(scenes, STRUCTURE, machine_score(model.machine))
+    scores = intruder_scores(scenes, STRUCTURE, machine_score(machine_of(model.weights)))
     own = scores.with_prior(fitted.popularity_weight * np.array(fitted.popularity))
     p = 1 / (1 + np.exp(-fitted.outlier.log_odds(own.log_odds, own.size)))
     for name, share in ALARMS.items():
@@ -226,7 +227,7 @@ def test_lists_of_few_classes_keep_the_share_too(model, fitted):
         assert (parts <= some.v).all()
         assert (parts * STRUCTURE == some.v * STRUCTURE).all()
         assert ((some.v > 0) & ~STRUCTURE).sum(1).min() > listed
-        found = clean_scores(parts, STRUCTURE, machine_score(model.machine))
+        found = clean_scores(parts, STRUCTURE, machine_score(machine_of(model.weights)))
         assert (found.listed == listed).all()
         alarms = found.false_alarms(calibrated_alarm(fitted).raised(found)).value
         # 300 rooms: a share of .1 lies above .17 with probability 1e-4.
@@ -260,7 +261,7 @@ def test_photographs_alone_are_calibrated_on_photographs():
 
 def test_machines_without_samples_use_the_closed_form_alone():
     artifact = artifact_of(larger_machine("triway-local"))
-    V = artifact.machine.spec.V
+    V = artifact.spec.V
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     found = fit_coverage(artifact, tensors(random_scenes(40, V - 1), V), structure)
     assert found["coverage_weight"] == 0.0
@@ -276,7 +277,7 @@ def test_the_least_pull_that_is_as_good_is_taken():
 
 def test_evidence_of_no_scene_keeps_its_weight():
     artifact = artifact_of(larger_machine("triway-local"))
-    V = artifact.machine.spec.V
+    V = artifact.spec.V
     bare = tensors([scene([0, 1, 2]) for _ in range(5)], V)
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     assert fit_evidence(artifact, bare, structure) == artifact.calibration.evidence
@@ -288,7 +289,7 @@ def test_evidence_of_no_scene_keeps_its_weight():
 def test_relations_are_fitted_to_what_is_known():
     """Scenes of which nothing is known but what holds change no entry."""
     artifact = artifact_of(larger_machine("triway-local"))
-    V = artifact.machine.spec.V
+    V = artifact.spec.V
     known = random_scenes(60, V - 1)
     vague = [
         replace(one, source="coco_captions", instance_observed=one.instance_holds)
@@ -319,7 +320,7 @@ def test_a_rising_curve_follows_a_bend_and_never_falls():
 def test_misplaced_alarms_are_kept_in_untouched_scenes():
     """On the scenes that they were fitted on, of one source and of places of their own."""
     artifact = artifact_of(larger_machine("triway-local"))
-    scenes = random_scenes(120, artifact.machine.spec.V - 1)
+    scenes = random_scenes(120, artifact.spec.V - 1)
     entry, limits = fit_misplaced(artifact, scenes)
     artifact = replace(
         artifact,

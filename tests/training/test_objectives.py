@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from app.boltzmann import build
-from app.boltzmann.gibbs import State
 from app.scene.evidence import ClassEvidence
 from tests.enumeration.small_machines import SEED_FORM, SMALL, enumerate_joint, small_machine
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
 from training.evaluation.missing import machine_score
 from training.evaluation.relations import machine_score as relation_score
+from training.machines import build
+from training.machines.gibbs import State
 from training.objectives import OBJECTIVES
 from training.objectives.composite import mask_one_class, unlisted_off
 from training.objectives.contrastive import centre_gradients, energy_difference

@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from app.boltzmann import MachineSpec, build
-from app.boltzmann.fantasies import unpack_scenes
 from tests.enumeration.small_machines import binary
 from tests.training.evaluation.scenes import scene, tensors
 from training import objects
 from training.config import ObjectsConfig
+from training.machines import MachineSpec, build
+from training.machines.fantasies import unpack_scenes
 from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples
 
 V = 4

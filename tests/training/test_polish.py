@@ -7,11 +7,11 @@ import math
 import pytest
 import torch
 
-from app.boltzmann import MachineSpec, build
-from app.boltzmann.fantasies import unpack_scenes
 from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from tests.training.test_trainer import small_config
 from training.config import PolishConfig, with_settings
+from training.machines import MachineSpec, build
+from training.machines.fantasies import unpack_scenes
 from training.pipeline import prepare
 from training.polish import polish
 from training.trainer import Trainer

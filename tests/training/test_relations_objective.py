@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from app.boltzmann import MachineSpec, build
 from tests.training.evaluation.scenes import V, tensors, toy
 from training.batches import relation_units
 from training.config import ObjectiveConfig
+from training.machines import MachineSpec, build
 from training.objectives.relations import RelationLikelihood, bake_word_prior, partly_shown
 
 CONFIG = ObjectiveConfig(name="relations", room_dropout=0.0, offset_prior=0.1, weight_prior=0.1)

@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from app.boltzmann import Triway
 from training.checkpoints import CheckpointError
 from training.config import Config, ConfigError, with_settings
+from training.machines import Triway
 from training.pipeline import prepare
 from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer

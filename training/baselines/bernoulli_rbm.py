@@ -11,10 +11,10 @@ import torch
 from sklearn.neural_network import BernoulliRBM
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
 from training.baselines.fitting import Proposals
 from training.batches import SceneTensors
 from training.evaluation.missing import ObjectScore, machine_score
+from training.machines import BoltzmannMachine, MachineSpec, build
 
 _HIDDEN = 200
 # Too high a rate makes persistent CD fall back to popularity, without any error.

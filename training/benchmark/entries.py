@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from app.boltzmann import BoltzmannMachine
 from app.registry import Calibration
 from app.scene import Vocabulary
 from training.baselines import (
@@ -38,6 +37,7 @@ from training.evaluation.missing import ObjectScore
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
 from training.evaluation.tasks import Setting, floor_contender, independent_contender
+from training.machines import BoltzmannMachine
 from training.pipeline import SplitScenes
 from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer, TrainingData

@@ -165,7 +165,7 @@ def scenes_page(artifact: Artifact, held_out: Sequence[EncodedScene], title: str
     """
     rooms = Counter(scene.room_type for scene in held_out if scene.room_type >= 0)
     conditions: list[int | None] = [None]
-    if artifact.machine.spec.C:
+    if artifact.spec.C:
         conditions += [room for room, _ in rooms.most_common(_ROOM_TYPES)]
     figure = Figure(figsize=(4 * 2 * _SCENES, 3.2 * len(conditions)), layout="constrained")
     figure.suptitle(f"{title}: drawn scenes (left), held-out scenes (right)")

@@ -79,7 +79,7 @@ class Answers:
 
 def uncalibrated(artifact: Artifact) -> Artifact:
     """The artifact with log-odds taken as they are, only their signs made to fit the answers."""
-    plain = Calibration.neutral(artifact.machine.spec.A).model_copy(
+    plain = Calibration.neutral(artifact.spec.A).model_copy(
         update={"outlier": CountSlope(slope=-1.0), "misplaced": Slope(slope=-1.0)}
     )
     return replace(artifact, calibration=plain)

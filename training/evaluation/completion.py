@@ -11,11 +11,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, Triway
-from app.boltzmann.draws import draw_hidden
-from app.boltzmann.edges import Edges, find_triples, pair_edges, triple_keys
-from app.boltzmann.mean_field import Evidence
-from app.reasoning.units import NO_UNIT, mean_log_p
 from training.batches import Batch, SceneTensors
 from training.evaluation.cases import scene_rng
 from training.evaluation.relations import (
@@ -27,6 +22,11 @@ from training.evaluation.relations import (
     spread_units,
     telling,
 )
+from training.machines import BoltzmannMachine, Triway
+from training.machines.draws import draw_hidden
+from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
+from training.machines.mean_field import Evidence
+from training.oracle.units import NO_UNIT, mean_log_p
 
 
 def given_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScore:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
-from app.boltzmann import BoltzmannMachine
 from app.registry import Artifact
 from training.batches import SceneTensors
 from training.evaluation import missing
@@ -18,6 +17,8 @@ from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
 from training.evaluation.sampling import machine_sampler
 from training.evaluation.scores import machine_scores, served_placed_score
+from training.machines import BoltzmannMachine
+from training.machines.arrays import machine_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,7 @@ def artifact_contender(
 ) -> Contender:
     """A published model, with its calibration."""
     return replace(
-        machine_contender(artifact.machine, train, settings, seed),
+        machine_contender(machine_of(artifact.weights), train, settings, seed),
         placed=served_placed_score(artifact),
         alarm=calibrated_alarm(artifact.calibration),
         artifact=artifact,

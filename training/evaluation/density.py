@@ -20,13 +20,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid, softplus
 
-from app.boltzmann import BoltzmannMachine, MachineSpec, build
-from app.boltzmann.draws import fixed_uniforms
-from app.boltzmann.gibbs import initial_state, run
-from app.boltzmann.mean_field import Evidence, mean_field
-from app.boltzmann.partition import LogPartition, ais, independent_base, reverse_ais
 from training.batches import SceneTensors
 from training.evaluation.ising import Ising
+from training.machines import BoltzmannMachine, MachineSpec, build
+from training.machines.draws import fixed_uniforms
+from training.machines.gibbs import initial_state, run
+from training.machines.mean_field import Evidence, mean_field
+from training.machines.partition import LogPartition, ais, independent_base, reverse_ais
 from training.trainer import log_odds_of
 
 _BLOCK = 16

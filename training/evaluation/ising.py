@@ -5,7 +5,7 @@ independent classes with log-odds a at beta = 0, where log Z is a sum, to the mo
 log-odds are (1 - beta) a + beta b, its edges beta W. One sweep updates every class in turn.
 
 Source: Neal, "Annealed importance sampling" (2001), run in both directions as in
-`app.boltzmann.partition`.
+`training.machines.partition`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.boltzmann.partition import LogPartition
+from training.machines.partition import LogPartition
 
 Floats = NDArray[np.float64]
 

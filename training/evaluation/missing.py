@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, Triway
-from app.boltzmann.edges import Edges
-from app.boltzmann.log_odds import object_log_odds
-from app.boltzmann.mean_field import Evidence
 from training.batches import SceneTensors
 from training.evaluation.intervals import Figure
 from training.evaluation.metrics import Macro, Ratio
+from training.machines import BoltzmannMachine, Triway
+from training.machines.edges import Edges
+from training.machines.log_odds import object_log_odds
+from training.machines.mean_field import Evidence
 
 # Log-odds (B, V) of every class given presence (B, V).
 ObjectScore = Callable[[Tensor], Tensor]

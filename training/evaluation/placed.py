@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from app.boltzmann import BoltzmannMachine, Triway
-from app.boltzmann.draws import draw_hidden
-from app.boltzmann.edges import find_triples, pair_edges, triple_keys
-from app.boltzmann.mean_field import Evidence
-from app.reasoning.drawn import presence_log_odds
-from app.reasoning.units import NO_UNIT, mean_log_p
 from training.batches import SceneTensors
 from training.evaluation.cases import scene_rng
 from training.evaluation.metrics import Ratio
 from training.evaluation.missing import LeaveOneOut, rank_blocks
+from training.machines import BoltzmannMachine, Triway
+from training.machines.draws import draw_hidden
+from training.machines.edges import find_triples, pair_edges, triple_keys
+from training.machines.mean_field import Evidence
+from training.oracle.drawn import presence_log_odds
+from training.oracle.units import NO_UNIT, mean_log_p
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import torch
 
-from app.boltzmann import BoltzmannMachine
-from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, SceneTensors, relation_units
+from training.machines import BoltzmannMachine
+from training.machines.mean_field import Evidence, mean_field
 
 
 @torch.no_grad()

@@ -16,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, Triway
-from app.boltzmann.edges import Edges, find_triples, pair_edges, triple_keys
-from app.boltzmann.log_odds import relation_log_odds
-from app.boltzmann.mean_field import Evidence
 from training.batches import Batch, SceneTensors
 from training.evaluation.metrics import Ratio
+from training.machines import BoltzmannMachine, Triway
+from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
+from training.machines.log_odds import relation_log_odds
+from training.machines.mean_field import Evidence
 
 # Scores (B, A, n, n) of the relations between the classes of a batch.
 RelationScore = Callable[[Batch], Tensor]

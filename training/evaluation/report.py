@@ -278,7 +278,7 @@ def evaluate(
         everyday: folder of the everyday facts, see `Setting`.
     """
     if limit is None:
-        limit = _LIMIT if artifact.closed_form is not None else _LIMIT_OF_DRAWS
+        limit = _LIMIT if artifact.oracle is None else _LIMIT_OF_DRAWS
     contender = artifact_contender(artifact, train)
     single = [task for task in _PUBLISHED if task not in WHOLE_SET]
     sources = list(by_source(scenes))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine, Triway
-from app.boltzmann.edges import PairEdges
-from app.boltzmann.fantasies import Fantasies
-from app.boltzmann.gibbs import Clamp, State, present_classes
-from app.reasoning.chains import sweep
 from app.reasoning.generate import STEPS
 from training.evaluation.generation import Contradictions, Drawn, Sampler
 from training.evaluation.relations import spread_units
+from training.machines import BoltzmannMachine, Triway
+from training.machines.edges import PairEdges
+from training.machines.fantasies import Fantasies
+from training.machines.gibbs import Clamp, State, gibbs_step, present_classes, run
 
 _CHAINS = 256
 
@@ -33,12 +32,21 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
         for index in torch.arange(len(given)).split(_CHAINS):
             clamp = Clamp(v=given[index], room=room[index] if machine.spec.C else None)
             state = fantasies.start(given[index].to(machine.b.dtype), generator, clamp)
-            state = sweep(machine, state, generator, clamp, steps)
+            state = _sweep(machine, state, generator, clamp, steps)
             parts.append((state.v, Contradictions.of(_grid(machine, state))))
         objects, found = zip(*parts, strict=True)
         return Drawn(torch.cat(objects), Contradictions.joined(found))
 
     return sample
+
+
+def _sweep(
+    machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp, steps: int
+) -> State:
+    """Gibbs sweeps. In the local form relations do not act on the rest: the last one draws them."""
+    always = machine.spec.form == "seed"
+    state = run(machine, state, generator, steps - 1, clamp, relations=always)
+    return gibbs_step(machine, state, generator, clamp)
 
 
 def _grid(machine: BoltzmannMachine, state: State) -> Tensor:

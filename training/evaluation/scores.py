@@ -1,6 +1,6 @@
 """A machine's scores of relations and of classes at a place, by the estimate the service uses.
 
-Machines that have a closed form (see `app.boltzmann.closed_form`) are scored by it, the others by
+Machines that have a closed form (see `app.inference.closed_form`) are scored by it, the others by
 draws of the context, in the module of each task. A published model is asked for classes at a place
 as the service asks it: by its coverage and its calibration.
 """
@@ -14,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine
-from app.boltzmann.closed_form import ClosedForm, Given
-from app.boltzmann.scoring import ContextScorer
+from app.inference.closed_form import ClosedForm
+from app.inference.relation_part import Given
+from app.inference.scoring import ContextScorer
 from app.reasoning.calibration import placed_logits
 from app.reasoning.placements import place_log_p
 from app.reasoning.posterior import posterior
@@ -27,6 +27,8 @@ from training.evaluation.asking import of_classes
 from training.evaluation.completion import given_score
 from training.evaluation.placed import PlacedScore, Places
 from training.evaluation.relations import RelationScore
+from training.machines import BoltzmannMachine
+from training.machines.arrays import weights_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,17 +48,18 @@ class MachineScores:
 
 def machine_scores(machine: BoltzmannMachine) -> MachineScores:
     """In closed form where there is one."""
-    if not ClosedForm.fits(machine):
+    weights = weights_of(machine)
+    if not ClosedForm.fits(weights):
         return MachineScores(
             relations.machine_score(machine),
             given_score(machine),
             placed.machine_score(machine),
         )
-    closed = ClosedForm(machine)
+    closed = ClosedForm(weights)
     return MachineScores(
         _relation_score(closed, given=False),
         _relation_score(closed, given=True),
-        _placed_score(closed, ContextScorer(machine)),
+        _placed_score(closed, ContextScorer(weights["W"])),
     )
 
 
@@ -94,7 +97,7 @@ def _placed_score(closed: ClosedForm, scorer: ContextScorer) -> PlacedScore:
                 int(np.searchsorted(classes, int(places.anchor[row]))),
                 bool(places.outgoing[row]),
             )
-            values = -np.logaddexp(0.0, -(closed.b + scorer.row_gain(context.y))[absent])
+            values = -np.logaddexp(0.0, -(closed.b + scorer.gain(context.y))[absent])
             values -= np.logaddexp(0.0, -log_odds)
             found[row, absent] = torch.from_numpy(values).float()
         return found

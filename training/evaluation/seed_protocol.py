@@ -26,10 +26,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine
-from app.boltzmann.bernoulli import bernoulli
-from app.boltzmann.edges import Edges, PairEdges
-from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, SceneTensors, relation_units
 from training.evaluation.cases import scene_rng
 from training.evaluation.contenders import Contender
@@ -38,6 +34,10 @@ from training.evaluation.metrics import Ratio
 from training.evaluation.outliers import draw_intruders
 from training.evaluation.relations import spread_units
 from training.evaluation.tasks import Outcome, Setting, Task
+from training.machines import BoltzmannMachine
+from training.machines.bernoulli import bernoulli
+from training.machines.edges import Edges, PairEdges
+from training.machines.mean_field import Evidence, mean_field
 
 PAPER: dict[str, dict[str, float]] = {
     "T1 labelled relations switched on": {"RBM": 0.0560, "GBM": 0.1418, "Triway": 0.2335},

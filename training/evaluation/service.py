@@ -23,7 +23,6 @@ from app.reasoning.calibration import (
     relation_probability,
     sigmoid,
 )
-from app.reasoning.units import NO_UNIT
 from app.registry import Artifact
 from app.registry.slopes import RelationSlopes
 from app.scene import CANONICAL, OPPOSITES
@@ -38,6 +37,8 @@ from training.evaluation.placed import PlacedScore, Places, leave_one_out_at
 from training.evaluation.placement import placement_scores
 from training.evaluation.relations import RelationScore, candidates, rank, score_scenes
 from training.evaluation.scores import machine_scores, served_placed_score
+from training.machines.arrays import machine_of
+from training.oracle.units import NO_UNIT
 from training.trainer import subset
 
 # The most relations that one request returns, and its most pairs.
@@ -117,7 +118,7 @@ def directly(artifact: Artifact) -> Asked:
     Raises:
         ServiceError: it is of the seed form, where the two are different estimates.
     """
-    machine, calibration = artifact.machine, artifact.calibration
+    machine, calibration = machine_of(artifact.weights), artifact.calibration
     if machine.spec.form != "local":
         raise ServiceError("in the seed form the service draws contexts, the scores do not")
     objects, scores = machine_score(machine), machine_scores(machine)

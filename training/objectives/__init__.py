@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from app.boltzmann import BoltzmannMachine
 from training.config import ObjectiveConfig
+from training.machines import BoltzmannMachine
 from training.objectives.base import Objective
 from training.objectives.composite import CompositeLikelihood
 from training.objectives.contrastive import ContrastiveDivergence, PersistentCD

@@ -7,9 +7,9 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
-from app.boltzmann import BoltzmannMachine
 from training.batches import Batch
 from training.config import ObjectiveConfig
+from training.machines import BoltzmannMachine
 
 
 class Objective(ABC):

@@ -33,11 +33,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from app.boltzmann import BoltzmannMachine, Triway
-from app.boltzmann.log_odds import object_log_odds
-from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
+from training.machines import BoltzmannMachine, Triway
+from training.machines.log_odds import object_log_odds
+from training.machines.mean_field import Evidence, mean_field
 from training.objectives.base import Objective, withhold_rooms
 from training.objectives.generative import ObjectChains
 

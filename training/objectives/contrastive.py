@@ -21,10 +21,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from app.boltzmann import BoltzmannMachine
-from app.boltzmann.bernoulli import bernoulli
-from app.boltzmann.edges import Edges, PairEdges
-from app.boltzmann.gibbs import (
+from training.batches import Batch, relation_units
+from training.config import ObjectiveConfig
+from training.machines import BoltzmannMachine
+from training.machines.bernoulli import bernoulli
+from training.machines.edges import Edges, PairEdges
+from training.machines.gibbs import (
     Clamp,
     State,
     gibbs_step,
@@ -32,9 +34,7 @@ from app.boltzmann.gibbs import (
     reconstruct,
     sample_h1,
 )
-from app.boltzmann.mean_field import Evidence, mean_field
-from training.batches import Batch, relation_units
-from training.config import ObjectiveConfig
+from training.machines.mean_field import Evidence, mean_field
 from training.objectives.base import Objective, withhold_rooms
 
 _OFFSETS = ("offset_v", "offset_h1", "offset_h2")

@@ -15,10 +15,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from app.boltzmann import BoltzmannMachine
-from app.boltzmann.bernoulli import bernoulli
-from app.boltzmann.gibbs import Clamp, State, gibbs_step, initial_state
-from app.boltzmann.mean_field import Evidence, mean_field
+from training.machines import BoltzmannMachine
+from training.machines.bernoulli import bernoulli
+from training.machines.gibbs import Clamp, State, gibbs_step, initial_state
+from training.machines.mean_field import Evidence, mean_field
 
 
 class ObjectChains:

@@ -39,10 +39,10 @@ from torch.nn.utils.parametrize import (
     remove_parametrizations,
 )
 
-from app.boltzmann import BoltzmannMachine
-from app.boltzmann.mean_field import Evidence, mean_field
 from training.batches import Batch, SceneTensors, relation_units
 from training.config import ObjectiveConfig
+from training.machines import BoltzmannMachine
+from training.machines.mean_field import Evidence, mean_field
 from training.objectives.base import Objective, withhold_rooms
 
 _OBJECT_PART = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B", "usual", "d"})

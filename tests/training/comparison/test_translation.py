@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from app.boltzmann import MachineSpec, build
 from app.scene import ObjectClass, Vocabulary
 from training.batches import Batch
 from training.comparison.translation import BEYOND, Translation, same_classes
 from training.evaluation.contenders import machine_contender
 from training.evaluation.placed import Places
+from training.machines import MachineSpec, build
 
 
 def vocabulary(*labels: str, aliases: dict[str, tuple[str, ...]] | None = None) -> Vocabulary:

@@ -6,11 +6,11 @@ from functools import cache
 
 import torch
 
-from app.boltzmann import MachineSpec, build
 from app.registry import Artifact
 from training.batches import SceneTensors, scene_tensors
 from training.datasets import annotated_classes, encode, generate_rooms, rooms_vocabulary
 from training.draft import draft_artifact
+from training.machines import MachineSpec, build
 
 VOCABULARY = rooms_vocabulary()
 STRUCTURE = torch.from_numpy(VOCABULARY.structure.copy())

@@ -7,11 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from app.boltzmann import Triway, build
-from app.boltzmann.log_odds import relation_log_odds
-from app.boltzmann.mean_field import Evidence
 from app.reasoning.posterior import posterior
-from app.reasoning.units import NO_UNIT
 from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
 from tests.reasoning.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import (
@@ -28,6 +24,10 @@ from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.evaluation.completion import complete_scenes, given_score, given_units, random_half
 from training.evaluation.relations import rank, spread_units, telling
 from training.evaluation.scores import machine_scores
+from training.machines import Triway, build
+from training.machines.log_odds import relation_log_odds
+from training.machines.mean_field import Evidence
+from training.oracle.units import NO_UNIT
 
 DATA = tensors(random_scenes(20), WIDE)
 

@@ -21,6 +21,7 @@ from tests.training.evaluation.scenes import (
 from tests.training.evaluation.test_completion import larger_machine
 from training.evaluation.placed import Places, leave_one_out_at, removed_places
 from training.evaluation.scores import machine_scores, served_placed_score
+from training.machines.arrays import machine_of
 
 DATA = tensors(random_scenes(20), WIDE)
 
@@ -121,7 +122,7 @@ def asked_of(machine, outgoing):
 def answers_of(artifact, outgoing):
     things = tuple(SceneObject(str(k), "x", c) for k, c in enumerate([0, 2, 2, 5]))
     spoken = CANONICAL[2] if outgoing else OPPOSITES[CANONICAL[2]]
-    return missing(artifact, Scene(things), top_k=artifact.machine.spec.V, at=(spoken, 1))
+    return missing(artifact, Scene(things), top_k=artifact.spec.V, at=(spoken, 1))
 
 
 MISSING = CountSlope(intercept=-0.3, slope=0.8, log_count=0.4)
@@ -133,7 +134,7 @@ def test_the_score_of_a_published_model_is_the_service_s(name, outgoing):
     slopes = (PairSlope(intercept=0.2, slope=0.7, log_count=0.3, log_classes=-0.4),) * 4
     artifact = artifact_of(larger_machine(name), missing=MISSING, placement=slopes, coverage=0.7)
     answers = answers_of(artifact, outgoing)
-    values = served_placed_score(artifact)(asked_of(artifact.machine, outgoing))[0]
+    values = served_placed_score(artifact)(asked_of(machine_of(artifact.weights), outgoing))[0]
     for answer in answers:
         found = values[artifact.vocabulary.index(answer.label)]
         assert float(found.sigmoid()) == pytest.approx(answer.probability, rel=1e-5)

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from app.boltzmann.bernoulli import bernoulli
-from app.boltzmann.mean_field import Evidence, mean_field
 from tests.reasoning.artifacts import LARGER
 from tests.training.evaluation.scenes import random_scenes, scene, tensors
 from tests.training.evaluation.test_completion import larger_machine
@@ -24,6 +22,8 @@ from training.evaluation.seed_protocol import (
     switch_on_probability,
 )
 from training.evaluation.tasks import Setting
+from training.machines.bernoulli import bernoulli
+from training.machines.mean_field import Evidence, mean_field
 
 V = LARGER["triway-local"].V
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)

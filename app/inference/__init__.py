@@ -1,0 +1,12 @@
+"""A trained machine answering: arrays in, arrays out.
+
+Symbols are those of the project's model page: v, r, h1, h2; b, c1, c2, W, J, Q; d, s, o, S, O, R,
+M, P, U.
+"""
+
+from __future__ import annotations
+
+from app.inference.spec import MachineSpec
+from app.inference.weights import Weights
+
+__all__ = ["MachineSpec", "Weights"]

@@ -1,0 +1,30 @@
+"""A machine as the arrays that the service answers from, and back."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from app.inference import Weights
+from training.machines import BoltzmannMachine, build
+
+
+def weights_of(machine: BoltzmannMachine) -> Weights:
+    """Copies of the machine's tensors."""
+    arrays = {
+        name: np.array(tensor.detach().numpy(), order="C")
+        for name, tensor in machine.state_dict().items()
+    }
+    return Weights(machine.spec, arrays)
+
+
+@lru_cache(maxsize=16)
+def machine_of(weights: Weights) -> BoltzmannMachine:
+    """The machine that has these weights; it shares their memory and is not to be changed."""
+    with torch.device("meta"):
+        machine = build(weights.spec)
+    state = {name: torch.from_numpy(array) for name, array in weights.arrays.items()}
+    machine.load_state_dict(state, assign=True)
+    return machine.eval().requires_grad_(False)

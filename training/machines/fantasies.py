@@ -1,0 +1,117 @@
+"""Where chains start: scenes that the machine has dreamt before.
+
+A chain that starts at nothing needs thousands of sweeps to find all kinds of rooms, since one kind
+leads to another through scenes of neither. So a trained machine keeps N fantasies, the states of
+long chains of its own, with the room type that each was dreamt under (`BoltzmannMachine.fantasies`
+and `.fantasy_rooms`), and a new chain goes on from one of them.
+
+With evidence the fantasies are weighed by what they make of it before one is drawn for each chain,
+
+    log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
+            - 6 [dreamt under another room type than t],
+
+h1 at its mean given the fantasy: sampling importance resampling, the sweeps that follow do the
+rest. Where no fantasy was dreamt under t, the last term is h1·Q[t]. A chain does not find from one
+kind of room to another in a few sweeps, whatever Q says.
+
+Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for
+fantasy particles; Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian
+state estimation" (1993), for resampling and moving.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+
+from training.machines.bernoulli import bernoulli
+from training.machines.gibbs import FREE, Clamp, State, initial_state
+from training.machines.machine import BoltzmannMachine
+from training.machines.mean_field import Evidence, mean_field
+
+_WORD = 32
+OTHER_ROOM = 6.0
+
+
+def words(classes: int) -> int:
+    """32-bit words that a scene of so many classes takes."""
+    return -(-classes // _WORD)
+
+
+def pack_scenes(v: Tensor) -> Tensor:
+    """Presence (N, V) as bits, (N, words) int32."""
+    bits = np.zeros((len(v), words(v.shape[1]) * _WORD), dtype=np.uint8)
+    bits[:, : v.shape[1]] = v.numpy() > 0
+    packed = np.packbits(bits, axis=1, bitorder="little").view("<i4").astype(np.int32)
+    return torch.from_numpy(packed)
+
+
+def unpack_scenes(packed: Tensor, classes: int) -> Tensor:
+    """Presence (N, V) float of scenes as bits."""
+    octets = packed.numpy().astype("<i4").view(np.uint8).reshape(len(packed), -1)
+    bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
+    return torch.from_numpy(bits).float()
+
+
+class Fantasies:
+    """The fantasies of a machine whose weights do not change, and what each makes of evidence.
+
+    Args:
+        machine: read here; later changes to it are not seen.
+    """
+
+    def __init__(self, machine: BoltzmannMachine) -> None:
+        self.machine = machine
+        if not machine.spec.N:
+            return
+        with torch.no_grad():
+            self.v = unpack_scenes(machine.fantasies, machine.spec.V).to(machine.b.dtype)
+            field = mean_field(machine, Evidence(self.v))
+            self.h1, self.h2 = field.y.sigmoid(), field.h2
+            # log w of each given class, room type and held unit, a row for each fantasy.
+            self._present = logsigmoid(machine.object_logits(self.h1))
+            self._room = self.h1 @ machine.Q.T
+            self._unit = logsigmoid(field.y)
+
+    @torch.no_grad()
+    def start(self, given: Tensor, generator: torch.Generator, clamp: Clamp = FREE) -> State:
+        """A state for each chain: a fantasy that suits its evidence; without any, the evidence.
+
+        Args:
+            given: (B, V), 1 for classes that must be there.
+            clamp: room types and held units count as evidence too; see `Clamp`.
+        """
+        machine = self.machine
+        if not machine.spec.N:
+            return _held(initial_state(machine, given, generator, clamp), clamp)
+        weight = self.log_weight(given, clamp)
+        chosen = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
+        h1, h2 = bernoulli(self.h1[chosen], generator), bernoulli(self.h2[chosen], generator)
+        # No relations: in the local form, which alone has fantasies, they do not act on the rest.
+        edges = machine.edges(torch.zeros(len(given), 0, dtype=torch.int64))
+        r = given.new_zeros(len(given), edges.shape[-1])
+        return _held(State(self.v[chosen].maximum(given), h1, h2, r, edges), clamp)
+
+    def log_weight(self, given: Tensor, clamp: Clamp = FREE) -> Tensor:
+        """log w of every fantasy, (B, N); see the module."""
+        weight = given @ self._present.T
+        if clamp.room is not None and self.machine.spec.C:
+            known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
+            own = self.machine.fantasy_rooms == clamp.room.unsqueeze(1)
+            hint = self._room.T[clamp.room.clamp(min=0)]
+            hint = torch.where(own.any(1, keepdim=True), -OTHER_ROOM * ~own, hint)
+            weight = weight + known * hint
+        if clamp.h1 is not None:
+            weight = weight + clamp.h1.to(given.dtype) @ self._unit.T
+        return weight
+
+
+def _held(state: State, clamp: Clamp) -> State:
+    """The state with held units on."""
+    h1 = state.h1 if clamp.h1 is None else torch.where(clamp.h1, 1.0, state.h1)
+    h2 = state.h2 if clamp.h2 is None else torch.where(clamp.h2, 1.0, state.h2)
+    return replace(state, h1=h1, h2=h2)

@@ -1,0 +1,64 @@
+"""The general Boltzmann machine of the seed paper: two layers and two-way object–relation edges.
+
+    E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2
+                   - sum_t r_t (d_t + g_t v_i + g'_t v_j + U_t·h1)
+
+for t = (a,i,j) among the triples seen in training.
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from app.inference.spec import MachineSpec
+from training.machines.edges import Edges
+from training.machines.machine import BoltzmannMachine
+from training.machines.rbm import RBM, scale
+
+
+class GBM(RBM):
+    """ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1; relations as in the RBM otherwise."""
+
+    def __init__(self, spec: MachineSpec) -> None:
+        super().__init__(spec)
+        self.g = nn.Parameter(torch.zeros(spec.T, 2))
+
+    def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
+        """d_t + g_t v_i + g'_t v_j + U_t·h1."""
+        subject = v[..., edges.subject[0]]
+        object_ = v[..., edges.object[0]]
+        two_way = subject * self.g[:, 0] + object_ * self.g[:, 1]
+        return super().relation_logits(edges, v, h1) + two_way
+
+    def relation_input(self, edges: Edges, r: Tensor) -> Tensor:
+        """sum_t r_t (g_t [i is the subject] + g'_t [i is the object]), (..., B, V)."""
+        result = r.new_zeros(*r.shape[:-1], self.spec.V)
+        result = result.index_add(-1, edges.subject[0], r * self.g[:, 0])
+        return result.index_add(-1, edges.object[0], r * self.g[:, 1])
+
+    def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
+        """sum over R_i of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0); 0 in the local form."""
+        if self.spec.form == "local":
+            return super().attraction(v, h1, edges, candidates)
+        subject, object_ = edges.subject[0], edges.object[0]
+        bare = RBM.relation_logits(self, edges, v, h1)
+        g, g2 = self.g.unbind(1)
+        loop = (subject == object_).to(v.dtype)
+        off = bare + v[..., object_] * g2 * (1 - loop)
+        as_subject = softplus(off + g + g2 * loop) - softplus(off)
+        off = bare + v[..., subject] * g
+        as_object = (softplus(off + g2) - softplus(off)) * (1 - loop)
+        shape = torch.broadcast_shapes(as_subject.shape, as_object.shape)
+        total = bare.new_zeros(*shape[:-1], self.spec.V)
+        total = total.index_add(-1, subject, as_subject.expand(shape))
+        total = total.index_add(-1, object_, as_object.expand(shape))
+        return total.gather(-1, candidates.expand(*total.shape[:-1], candidates.shape[-1]))
+
+    @torch.no_grad()
+    def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
+        """As in the RBM; the two-way edges are scaled by beta."""
+        return scale(self, beta, base, keep=("b", "d"))

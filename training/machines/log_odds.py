@@ -1,0 +1,177 @@
+"""Log-odds of objects and of relations: what every scoring answer is made of.
+
+    object    log p(v_i = 1 | rest) - log p(v_i = 0 | rest), with all relations R_i of i unobserved
+    relation  log p(r_e = 1 | rest) - log p(r_e = 0 | rest), with e unobserved
+
+The rest may be any mixture of observed and unobserved units. See `Evidence`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from training.machines.draws import HiddenDraws, draw_hidden
+from training.machines.edges import Edges
+from training.machines.machine import BoltzmannMachine
+from training.machines.mean_field import SWEEPS, Evidence, mean_field
+
+
+class _ContextGain(torch.autograd.Function):
+    """G[b,i] = sum_k [softplus(x_bk + W_ik) - softplus(x_bk)] without a (B, V, H1) tensor.
+
+    Written as log(1 + sigmoid(x)(exp(W) - 1)): one transcendental a term, and exp(W) is shared.
+    The backward pass recomputes row by row, so memory stays at one (V, H1) block.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, W: Tensor) -> Tensor:
+        growth = torch.expm1(W)
+        mean = x.sigmoid()
+        ctx.save_for_backward(mean, growth)
+        return torch.stack([torch.log1p(growth * row).sum(1) for row in mean])
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        mean, growth = ctx.saved_tensors
+        (gradient,) = gradients
+        grad_x = torch.empty_like(mean)
+        grad_W = torch.zeros_like(growth)
+        scale = growth + 1
+        for b, row in enumerate(mean):
+            # posterior of h1 with i present: sigmoid(x + W) = s e^W / (1 + s (e^W - 1))
+            posterior = (scale * row).div_(torch.addcmul(torch.ones_like(scale), growth, row))
+            weighted = posterior.mul_(gradient[b].unsqueeze(1))
+            grad_x[b] = weighted.sum(0) - row * gradient[b].sum()
+            grad_W += weighted
+        return grad_x, grad_W
+
+
+def context_gain(x: Tensor, W: Tensor) -> Tensor:
+    """sum_k [softplus(x + W_ik) - softplus(x)] for hidden logits x (B, H1) and all i, (B, V)."""
+    gain: Tensor = _ContextGain.apply(x, W)  # type: ignore[no-untyped-call]
+    return gain
+
+
+def object_log_odds(
+    machine: BoltzmannMachine,
+    evidence: Evidence,
+    *,
+    candidates: Tensor | None = None,
+    iterations: int = SWEEPS,
+    pull: float = 1.0,
+) -> Tensor:
+    """Log-odds of candidate objects with the context at the mean-field fixed point, (B, N).
+
+    Exact for one layer where no relation is observed and the form is local; with a second layer h2
+    is held at its mean-field value; in the seed form, and with relations observed, the context is
+    replaced by its factorial approximation (`object_log_odds_estimate` weighs draws instead).
+    Candidates must be absent in `evidence.v`. Differentiable.
+
+    Args:
+        candidates: (B or 1, N) int64; all V classes by default.
+        iterations: sweeps of the mean field.
+        pull: weight of the observed relations, see `mean_field`.
+    """
+    field = mean_field(machine, evidence, iterations=iterations, pull=pull)
+    if candidates is None:
+        gain = machine.b + context_gain(field.y, machine.W)
+        candidates = torch.arange(machine.spec.V).unsqueeze(0)
+    else:
+        rows = machine.W[candidates]
+        y = field.y.unsqueeze(1)
+        gain = machine.b[candidates] + (softplus(y + rows) - softplus(y)).sum(-1)
+    if evidence.edges is None or machine.spec.form == "local":
+        return gain
+    return gain + machine.attraction(evidence.v, field.y.sigmoid(), evidence.edges, candidates)
+
+
+def object_log_odds_estimate(
+    machine: BoltzmannMachine,
+    evidence: Evidence,
+    *,
+    candidates: Tensor | None = None,
+    draws: HiddenDraws | None = None,
+    count: int = 64,
+) -> tuple[Tensor, Tensor]:
+    """Log-odds of candidate objects as log E[exp(...)] over draws, with their standard error.
+
+        log E_{h1 | rest}[ exp(b_i + W_i·h1 + attraction_i(h1)) ]
+
+    an identity (`model.md`: Rao–Blackwell estimate), so the only error is that of the draws and,
+    with a second layer, of holding h2 at its mean-field value.
+
+    Returns:
+        (B, N) log-odds and (B, N) standard errors.
+    """
+    draws = draw_hidden(machine, evidence, draws=count) if draws is None else draws
+    if candidates is None:
+        candidates = torch.arange(machine.spec.V).unsqueeze(0)
+    gain = machine.object_logits(draws.h1)
+    gain = gain.gather(-1, candidates.expand(*gain.shape[:-1], -1))
+    if evidence.edges is not None:
+        gain = gain + machine.attraction(evidence.v, draws.h1, evidence.edges, candidates)
+    log_odds = draws.log_mean_exp(gain)
+    ratio = (gain - log_odds).exp()
+    return log_odds, draws.standard_error(ratio)
+
+
+def relation_log_odds(
+    machine: BoltzmannMachine,
+    edges: Edges,
+    evidence: Evidence,
+    *,
+    draws: HiddenDraws | None = None,
+    count: int = 64,
+) -> tuple[Tensor, Tensor]:
+    """Log-odds of the units of `edges`, each unobserved in the evidence, with standard errors.
+
+    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms, x_e what the observed
+    relations imply; -inf where the gate is off.
+
+    Raises:
+        ValueError: the machine knows implications, and relations are observed in another layout
+            than `edges`.
+
+    Returns:
+        (B, E) log-odds and (B, E) standard errors of the log-odds.
+    """
+    draws = draw_hidden(machine, evidence, draws=count) if draws is None else draws
+    logits = machine.relation_logits(edges, evidence.v, draws.h1)
+    relations = evidence.relations(machine)
+    if machine.spec.G and relations is not None:
+        if relations[0] is not edges:
+            raise ValueError("what relations imply is known in the layout of the evidence only")
+        logits = logits + draws.implied(machine, edges, relations[1] * relations[2])
+    on = logits.sigmoid()
+    p = draws.mean(on)
+    error = draws.standard_error(on) / (p * (1 - p)).clamp(min=1e-12)
+    gate = machine.gate(edges, evidence.v)
+    return torch.where(gate > 0, p.logit(eps=1e-12), -torch.inf), error
+
+
+def relation_log_odds_observed(machine: BoltzmannMachine, evidence: Evidence) -> Tensor:
+    """Log-odds of every unit given all the others, in closed form (seed form), (B, E).
+
+        ℓ⁰_e + sum_k [softplus(x_k + U_ek) - softplus(x_k)],   x without e
+
+    Exact for one layer; with two, h2 is held at its mean-field value given all relations.
+
+    Raises:
+        ValueError: in the local form, or where a unit is unobserved.
+    """
+    if machine.spec.form == "local":
+        raise ValueError("the local form has no closed form with relations observed")
+    relations = evidence.relations(machine)
+    if relations is None or not bool(relations[2].all()):
+        raise ValueError("every relation unit must be observed")
+    edges, r, _ = relations
+    field = mean_field(machine, evidence)
+    context = machine.relation_context(edges)
+    x = field.y.unsqueeze(1) - r.unsqueeze(-1) * context
+    bare = machine.relation_logits(edges, evidence.v, field.y.new_zeros(field.y.shape))
+    log_odds = bare + (softplus(x + context) - softplus(x)).sum(-1)
+    return torch.where(machine.gate(edges, evidence.v) > 0, log_odds, -torch.inf)

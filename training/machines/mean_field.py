@@ -1,0 +1,138 @@
+"""Mean field: the factorial approximation of p(h1, h2 | v, observed r).
+
+Alternates, from h2 at its prior and with damping,
+
+    m2 = sigmoid(c2 + m1'J),   y = c1 + v'W + J m2 + sum_e slope_e(m1) U_e,   m1 = sigmoid(y)
+
+where slope_e is r_e for an observed unit of the seed form and the tangent of the relation term
+otherwise. With one layer and nothing but observed relations (seed) or none (local) it is exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from training.machines.edges import Edges
+from training.machines.machine import BoltzmannMachine
+
+# Enough for the slopes to settle on the machines we ship; fixed, so that answers repeat.
+SWEEPS = 10
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of some scenes.
+
+    Attributes:
+        v: (B, V) presence.
+        edges: the relation units that may be on.
+        r: (B, E) values of the observed units, 0 elsewhere.
+        observed: (B, E) bool.
+        room: (B,) int64, -1 where no room type is given; None for none at all.
+    """
+
+    v: Tensor
+    edges: Edges | None = None
+    r: Tensor | None = None
+    observed: Tensor | None = None
+    room: Tensor | None = None
+
+    def relations(self, machine: BoltzmannMachine) -> tuple[Edges, Tensor, Tensor] | None:
+        """(edges, r, observed), or None where relations say nothing about the context.
+
+        Unobserved relations drop out of the local form, so there only observed ones matter.
+        """
+        if self.edges is None or not self.edges.shape[-1]:
+            return None
+        shape = (len(self.v), self.edges.shape[-1])
+        if self.r is None or self.observed is None:
+            if machine.spec.form == "local":
+                return None
+            zeros = self.v.new_zeros(shape)
+            return self.edges, zeros, torch.zeros_like(zeros, dtype=torch.bool)
+        if machine.spec.form == "local" and not bool(self.observed.any()):
+            return None
+        return self.edges, self.r, self.observed
+
+
+class Pull(NamedTuple):
+    """How strongly observed relations act on the context, from 0 to 1, by kind of question."""
+
+    objects: float = 1.0
+    relations: float = 1.0
+
+
+FULL = Pull()
+
+
+@dataclass(frozen=True)
+class MeanField:
+    """The fixed point: logits y of h1 (B, H1), without relations x (B, H1), means of h2 (B, H2)."""
+
+    y: Tensor
+    x: Tensor
+    h2: Tensor
+
+
+def mean_field(
+    machine: BoltzmannMachine,
+    evidence: Evidence,
+    *,
+    iterations: int = SWEEPS,
+    damping: float = 0.8,
+    pull: float = 1.0,
+) -> MeanField:
+    """One fixed point of h1 and h2 given the evidence; differentiable in the weights.
+
+    Args:
+        iterations: sweeps over both layers.
+        damping: share of the old relation slopes kept in a sweep.
+        pull: weight of the observed relations: between the fixed point without any, 0, and that
+            with all, 1.
+    """
+    if pull < 1 and evidence.relations(machine) is not None:
+        without = mean_field(machine, unobserved(evidence), iterations=iterations, damping=damping)
+        with_all = mean_field(machine, evidence, iterations=iterations, damping=damping)
+        pairs = (
+            (getattr(field, name) for field in (without, with_all)) for name in ("y", "x", "h2")
+        )
+        return MeanField(*(torch.lerp(one, other, pull) for one, other in pairs))
+    base = x = machine.context_bias(evidence.room) + evidence.v @ machine.W
+    relations = evidence.relations(machine)
+    two_layers = machine.spec.H2 > 0
+    h2 = base.new_zeros(len(base), 0)
+    if relations is None and not two_layers:
+        return MeanField(base, base, h2)
+    if two_layers:
+        h2 = machine.c2.sigmoid().expand(len(base), -1)
+        x = torch.addmm(base, h2, machine.J.T)
+    # What relations add to x; linear in r, whatever h1 is, where all of a seed form are observed.
+    added = gate = base.new_zeros(())
+    slopes = None
+    if relations is not None:
+        edges, r, observed = relations
+        gate = machine.gate(edges, evidence.v)
+        if machine.spec.form == "seed" and bool((observed | (gate == 0)).all()):
+            added, relations = machine.hidden_input(edges, r * gate), None
+    for _ in range(iterations if two_layers or relations is not None else 0):
+        if relations is not None:
+            edges, r, observed = relations
+            logits = machine.relation_logits(edges, evidence.v, (x + added).sigmoid())
+            slope = machine.relation_slope(logits, gate, r, observed)
+            slopes = slope if slopes is None else damping * slopes + (1 - damping) * slope
+            added = machine.hidden_input(edges, slopes)
+        if two_layers:
+            h2 = machine.second_layer_logits((x + added).sigmoid()).sigmoid()
+            x = torch.addmm(base, h2, machine.J.T)
+    return MeanField(x + added, x, h2)
+
+
+def unobserved(evidence: Evidence) -> Evidence:
+    """The same with every relation unobserved."""
+    if evidence.observed is None:
+        return evidence
+    return replace(evidence, observed=torch.zeros_like(evidence.observed))

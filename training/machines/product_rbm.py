@@ -1,0 +1,47 @@
+"""The RBM with the Triway's shared weights: what factors alone bring, without the tri-way edges.
+
+    E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
+    U_t = P[a] + sum_k S[i,k] M[a,k] O[j,k]
+
+for t = (a,i,j) among the triples seen in training. Relations are not gated, as in the RBM; pairs
+that are alike share what they say of the context, as in the Triway. A rival for comparisons.
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from app.inference.spec import MachineSpec
+from training.machines.machine import BoltzmannMachine
+from training.machines.rbm import RBM, scale
+
+
+class ProductRBM(RBM):
+    """ℓ_t = d_t + U_t·h1 with U factorised."""
+
+    def __init__(self, spec: MachineSpec) -> None:
+        super().__init__(spec)
+        del self.U
+        self.S = nn.Parameter(torch.zeros(spec.V, spec.K))
+        self.O = nn.Parameter(torch.zeros(spec.V, spec.K))
+        self.M = nn.Parameter(torch.zeros(spec.A, spec.K, spec.H1))
+        self.P = nn.Parameter(torch.zeros(spec.A, spec.H1))
+
+    def context_weights(self) -> Tensor:
+        """U, (T, H1), formed anew from the factors."""
+        relation, subject, object_ = self.triples.long().unbind(1)
+        product = self.S[subject] * self.O[object_]
+        # The table is sorted by relation: one (T_a, K) by (K, H1) product for each.
+        sizes = torch.bincount(relation, minlength=self.spec.A).tolist()
+        rows = [
+            part @ M + P for part, M, P in zip(product.split(sizes), self.M, self.P, strict=True)
+        ]
+        return torch.cat(rows)
+
+    @torch.no_grad()
+    def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
+        """As in the RBM; U scales with M and P."""
+        return scale(self, beta, base, keep=("b", "d"), fixed=("S", "O"))

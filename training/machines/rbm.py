@@ -1,0 +1,91 @@
+"""The restricted Boltzmann machine of the seed paper: objects and relations on one hidden layer.
+
+    E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
+
+Only triples t = (a,i,j) seen in training have a unit; the other relations are off with probability
+one. Units are not gated: nothing but the context ties r_t to its two objects.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Self, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from app.inference.spec import MachineSpec
+from training.machines.edges import Edges, triple_edges
+from training.machines.machine import BoltzmannMachine
+
+
+class RBM(BoltzmannMachine):
+    """ℓ_t = d_t + U_t·h1 over the triples seen in training."""
+
+    def __init__(self, spec: MachineSpec) -> None:
+        super().__init__(spec)
+        self.d = nn.Parameter(torch.zeros(spec.T))
+        self.U = nn.Parameter(torch.zeros(spec.T, spec.H1))
+
+    def context_weights(self) -> Tensor:
+        """U, (T, H1)."""
+        return self.U
+
+    def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
+        """All T units, whatever the scene holds."""
+        return triple_edges(self.triples)
+
+    def gate(self, edges: Edges, v: Tensor) -> Tensor:
+        """No gate: every unit of the table may be on."""
+        return edges.valid.to(v.dtype).expand(*v.shape[:-1], -1)
+
+    def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
+        """d_t + U_t·h1."""
+        return self.d + h1 @ self.context_weights().T
+
+    def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
+        """weight @ U."""
+        return weight @ self.context_weights()
+
+    def relation_context(self, edges: Edges) -> Tensor:
+        """U itself."""
+        return self.context_weights().unsqueeze(0)
+
+    def relation_input(self, edges: Edges, r: Tensor) -> Tensor:
+        """What relations add to the log-odds of objects, (..., B, V): nothing."""
+        return r.new_zeros(*r.shape[:-1], self.spec.V)
+
+    def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
+        """Zero: given the context, relations do not touch objects."""
+        return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
+
+    @torch.no_grad()
+    def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
+        """beta scales every weight; d and b come from `base` at beta = 0 where one is given."""
+        return scale(self, beta, base, keep=("b", "d"))
+
+
+Machine = TypeVar("Machine", bound=BoltzmannMachine)
+
+
+def scale(
+    machine: Machine,
+    beta: float,
+    base: BoltzmannMachine | None,
+    keep: tuple[str, ...],
+    fixed: tuple[str, ...] = (),
+) -> Machine:
+    """A copy with parameters θ ← beta·θ, plus (1 - beta)·θ_base for those named in `keep`.
+
+    Parameters named in `fixed` stay: factors whose product with a scaled one must scale linearly.
+    """
+    result = copy.copy(machine)
+    result._parameters = {}
+    for name, parameter in machine.named_parameters():
+        value = parameter.detach()
+        if name not in fixed:
+            value = value * beta
+        if base is not None and name in keep:
+            value = value + (1 - beta) * base.get_parameter(name).detach()
+        result._parameters[name] = nn.Parameter(value, requires_grad=False)
+    return result

@@ -1,0 +1,241 @@
+"""The Triway machine: relations tie two present objects and the context, by shared weights.
+
+    E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_{e=(a,i,j)} r_e v_i v_j ℓ_e(h1)
+    ℓ_e(h1) = d_a + w_e + U_e·h1
+    w_e = s[a,i] + o[a,j] + sum_k S[i,k] R[a,k] O[j,k] + w_e' + n[a,0] log n_i + n[a,1] log n_j
+    U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]
+
+What differs from the published code, which gates w by v_i v_j but not the relation–context weight:
+here the state space is {r_e ≤ v_i v_j}, so a relation can be on only between objects that are
+present, and the weights are shared through the factors S, O, R, M instead of one free weight per
+(a,i,j). The residual w' exists for triples seen in training; n lets relations see how many
+instances n_i, n_j of the two classes there are, since a class-level relation is the OR over
+instance pairs; where nobody counted, the class's usual log n_i stands in.
+
+With G > 0 (local form) relations that are given also shift the logits of the others, by weights
+gamma and B: see `implications`.
+
+Forms: `seed` is the energy above (with a compensating offset κ_a per active unit, 0 in the paper);
+`local` adds softplus(ℓ_e) for every active unit.
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import embedding, softplus
+
+from app.inference.spec import MachineSpec, feature_count
+from training.machines.edges import Edges, PairEdges, find_triples, pair_edges, triple_keys
+from training.machines.implications import implied
+from training.machines.machine import BoltzmannMachine
+from training.machines.rbm import scale
+
+
+class Triway(BoltzmannMachine):
+    """Gated, factorised relations on active pairs; seed or locally normalised form."""
+
+    def __init__(self, spec: MachineSpec) -> None:
+        super().__init__(spec)
+        V, A, K, H1 = spec.V, spec.A, spec.K, spec.H1
+        self.d = nn.Parameter(torch.zeros(A))
+        self.s = nn.Parameter(torch.zeros(A, V))
+        self.o = nn.Parameter(torch.zeros(A, V))
+        self.S = nn.Parameter(torch.zeros(V, K))
+        self.O = nn.Parameter(torch.zeros(V, K))
+        self.R = nn.Parameter(torch.zeros(A, K))
+        self.M = nn.Parameter(torch.zeros(A, K, H1))
+        self.P = nn.Parameter(torch.zeros(A, H1))
+        self.n = nn.Parameter(torch.zeros(A, 2))
+        self.usual = nn.Parameter(torch.zeros(V))
+        self.residual = nn.Parameter(torch.zeros(spec.T))
+        if spec.G:
+            self.gamma = nn.Parameter(torch.zeros(1 + spec.G, A, feature_count(A)))
+            self.B = nn.Parameter(torch.zeros(spec.G, H1))
+        self.kappa = nn.Parameter(torch.zeros(A), requires_grad=False)
+
+    def edges(self, classes: Tensor, counts: Tensor | None = None) -> PairEdges:
+        """The A·n² units between the given classes; all others are off.
+
+        Args:
+            counts: 0 where nobody said how many there are: the usual number counts then.
+        """
+        if counts is None:
+            return pair_edges(classes, self.spec.A)
+        usual = self.usual[classes.clamp(min=0)]
+        logs = torch.where(counts > 0, counts.clamp(min=1).to(self.b.dtype).log(), usual)
+        return pair_edges(classes, self.spec.A, log_subjects=logs)
+
+    def gate(self, edges: Edges, v: Tensor) -> Tensor:
+        """v_i v_j."""
+        return edges.ends_present(v)
+
+    def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
+        """d_a + w_e + U_e·h1."""
+        pairs = _pairs(edges)
+        shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
+        left = embedding(pairs.subjects, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
+        product = left.flatten(-3, -2) @ embedding(pairs.objects, self.O).mT
+        product = product.unflatten(-2, left.shape[-3:-1])
+        bias = self.d + h1 @ self.P.T
+        subject, object_ = self._end_weights(pairs)
+        ends = (subject + bias.unsqueeze(-1)).unsqueeze(-1) + object_.unsqueeze(-2)
+        logits: Tensor = product + ends
+        if self.spec.T:
+            logits = logits + self._residuals(pairs)
+        return logits.flatten(-3)
+
+    def _end_weights(self, pairs: PairEdges) -> tuple[Tensor, Tensor]:
+        """s[a,i] + n[a,0] log n_i, (B, A, n), and o[a,j] + n[a,1] log n_j, (B, A, m)."""
+        counts = self.n[:, 0, None] * pairs.log_subjects.unsqueeze(1)
+        subject = self.s[:, pairs.subjects].transpose(0, 1) + counts
+        counts = self.n[:, 1, None] * pairs.log_objects.unsqueeze(1)
+        return subject, self.o[:, pairs.objects].transpose(0, 1) + counts
+
+    def _residuals(self, pairs: PairEdges) -> Tensor:
+        """w_e', (B, A, n, m); 0 for triples not seen in training."""
+        keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
+        position, found = find_triples(self.triple_keys, keys)
+        return pairs.unflatten(self.residual[position] * found)
+
+    def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
+        """By gamma and B; zero without them."""
+        if not self.spec.G:
+            return super().implied(edges, given, h1)
+        grid = _pairs(edges).unflatten(given)
+        return implied(self.gamma, self.B, grid, h1, apart=apart).flatten(-3)
+
+    def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
+        """sum_e weight_e U_e through the factors, without forming U."""
+        pairs = _pairs(edges)
+        grid = pairs.unflatten(weight)
+        return self._context_input(self._factors(pairs, grid), grid.sum((-1, -2)))
+
+    def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
+        """sum_e r_e ℓ_e(0) and sum_e r_e U_e through the factors, without forming ℓ or U."""
+        pairs = _pairs(edges)
+        grid = pairs.unflatten(r)
+        factors, outgoing, incoming = self._factors(pairs, grid), grid.sum(-1), grid.sum(-2)
+        count = outgoing.sum(-1)
+        subject, object_ = self._end_weights(pairs)
+        bare = (factors * self.R).sum((-1, -2)) + count @ self.d
+        bare = bare + (outgoing * subject).sum((-1, -2)) + (incoming * object_).sum((-1, -2))
+        if self.spec.T:
+            bare = bare + (grid * self._residuals(pairs)).sum((-1, -2, -3))
+        return bare, self._context_input(factors, count)
+
+    def _factors(self, pairs: PairEdges, weight: Tensor) -> Tensor:
+        """sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., B, A, K)."""
+        # One (A·n, m) by (m, K) product a scene: a broadcast over a would copy O for each.
+        product: Tensor = weight.flatten(-3, -2) @ embedding(pairs.objects, self.O)
+        product = product.unflatten(-2, weight.shape[-3:-1])
+        subjects = embedding(pairs.subjects, self.S).unsqueeze(-3)
+        return (product * subjects).sum(-2)
+
+    def _context_input(self, factors: Tensor, count: Tensor) -> Tensor:
+        """sum_{a,k} factors[a,k] M[a,k] + sum_a count_a P[a], (..., B, H1)."""
+        return factors.flatten(-2) @ self.M.flatten(0, 1) + count @ self.P
+
+    def held_objects(self, edges: Edges, r: Tensor) -> Tensor:
+        """(B, V) float: 1 for objects that a relation which is on holds present."""
+        pairs = _pairs(edges)
+        grid = pairs.unflatten(r).amax(-3)
+        held = r.new_zeros(len(r), self.spec.V)
+        held.scatter_reduce_(1, pairs.subjects.expand(len(r), -1), grid.amax(-1), "amax")
+        held.scatter_reduce_(1, pairs.objects.expand(len(r), -1), grid.amax(-2), "amax")
+        return held
+
+    def relation_context(self, edges: Edges) -> Tensor:
+        """U_e for each unit."""
+        pairs = _pairs(edges)
+        subject, object_ = self.S[pairs.subjects], self.O[pairs.objects]
+        product = subject.unsqueeze(-2) * object_.unsqueeze(-3)
+        rows = torch.einsum("bijk,akh->baijh", product, self.M)
+        return (rows + self.P[:, None, None]).flatten(1, 3)
+
+    def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
+        """sum over R_i of softplus(ℓ_e) + κ_a in the seed form; nothing in the local form."""
+        pairs = _pairs(edges)
+        return self._attraction(
+            v, h1, pairs.subjects, pairs.valid_subjects, pairs.log_subjects, candidates
+        )
+
+    def attraction_to_all(self, v: Tensor, h1: Tensor, candidates: Tensor) -> Tensor:
+        """`attraction` with every class an anchor, one instance each."""
+        anchors = torch.arange(self.spec.V).expand(len(h1), -1)
+        valid = torch.ones_like(anchors, dtype=torch.bool)
+        logs = torch.zeros(anchors.shape, dtype=h1.dtype)
+        return self._attraction(v, h1, anchors, valid, logs, candidates)
+
+    def _attraction(
+        self,
+        v: Tensor,
+        h1: Tensor,
+        anchors: Tensor,
+        valid: Tensor,
+        logs: Tensor,
+        candidates: Tensor,
+    ) -> Tensor:
+        if self.spec.form == "local":
+            return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
+        present = v.gather(-1, anchors.expand(*v.shape[:-1], -1)) * valid
+        candidates = candidates.expand(len(anchors), -1)
+        # A candidate that is itself an anchor counts as absent there: its own loop comes below.
+        other = (anchors.unsqueeze(-2) != candidates.unsqueeze(-1)) * present.unsqueeze(-2)
+        A = self.spec.A
+        outgoing = pair_edges(candidates, A, objects=anchors, log_objects=logs)
+        incoming = pair_edges(anchors, A, objects=candidates, log_subjects=logs)
+        forward = outgoing.unflatten(self.relation_logits(outgoing, v, h1))
+        backward = incoming.unflatten(self.relation_logits(incoming, v, h1)).mT
+        kappa = self.kappa[:, None, None]
+        both = softplus(forward) + softplus(backward) + 2 * kappa
+        total = (both * other.unsqueeze(-3)).sum((-1, -3))
+        loop = self._loop_logits(candidates, h1)
+        return total + (softplus(loop) + self.kappa).sum(-1)
+
+    def _loop_logits(self, candidates: Tensor, h1: Tensor) -> Tensor:
+        """ℓ of the units (a,i,i), (..., B, N, A)."""
+        shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
+        product = (self.S * self.O)[candidates] @ shared.mT
+        bias = (self.d + h1 @ self.P.T).unsqueeze(-2)
+        logits = product + bias + (self.s + self.o).T[candidates]
+        if not self.spec.T:
+            return logits
+        axis = torch.arange(self.spec.A, device=candidates.device)
+        ends = candidates.unsqueeze(-1)
+        position, found = find_triples(self.triple_keys, triple_keys(axis, ends, ends, self.spec.V))
+        return logits + self.residual[position] * found
+
+    @staticmethod
+    def evidence_pairs(edges: Edges | None, rows: int) -> PairEdges | None:
+        """The square frame of observed relations, one row a chain; None where there are none."""
+        if edges is None:
+            return None
+        pairs = _pairs(edges)
+        if len(pairs.subjects) != rows:
+            raise ValueError(f"observed relations need one row per chain: {rows}")
+        return pairs
+
+    def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
+        """sum of κ_a over active units."""
+        if not bool(self.kappa.any()):
+            return super().pair_offset(edges, v)
+        gate = self.gate(edges, v)
+        return _pairs(edges).unflatten(gate).sum((-1, -2)) @ self.kappa
+
+    @torch.no_grad()
+    def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
+        """beta scales every weight.
+
+        With a base, b leads to b_base and κ to -log 2: at beta = 0 the two states of a relation
+        unit weigh 1/2 each, so that relations sum out to one and objects are independent.
+        """
+        return scale(self, beta, base, keep=("b", "kappa"), fixed=("S", "O", "B", "usual"))
+
+
+def _pairs(edges: Edges) -> PairEdges:
+    if not isinstance(edges, PairEdges):
+        raise TypeError("a Triway machine needs PairEdges; build them with machine.edges(classes)")
+    return edges

@@ -1,0 +1,1 @@
+"""What scenes are like under any machine, by weighted draws of the context: slow, and unbiased."""

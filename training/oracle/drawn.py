@@ -1,0 +1,354 @@
+"""The posterior of any scene under any machine, from weighted draws of the context."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from app.reasoning.given import pull_of
+from app.reasoning.present import Present
+from app.reasoning.unlisted import with_unlisted
+from app.registry.artifact import Artifact
+from app.scene.scene import Scene
+from training.machines import BoltzmannMachine
+from training.machines.arrays import machine_of
+from training.machines.draws import HiddenDraws
+from training.machines.log_odds import object_log_odds
+from training.machines.mean_field import Evidence
+from training.oracle.evidence import DRAWS, draw_context, observe
+from training.oracle.units import NO_UNIT, Units, mean_log_p, units_between
+
+Floats = NDArray[np.floating[Any]]
+Places = NDArray[np.int64]
+
+# Rows and candidates are taken in blocks of about so many relation units times draws.
+_BLOCK = 1 << 22
+
+
+class _Between(NamedTuple):
+    """The units between the classes of a scene.
+
+    Attributes:
+        units: E of them.
+        logits: (M, E), one row a draw.
+        said: (M, E) what takes an observation out of the log-weights of the draws; or 0.
+        holds: (1, E), 1 where observed as on; None where nothing is observed.
+    """
+
+    units: Units
+    logits: Tensor
+    said: Tensor
+    holds: Tensor | None
+
+
+class DrawnPosterior:
+    """See `Posterior`. Without given relations objects are in closed form here too."""
+
+    def __init__(self, artifact: Artifact, scene: Scene) -> None:
+        self.observation = observe(machine_of(artifact.weights), scene)
+        self.present: Present = self.observation.scene
+        self._artifact, self._room = artifact, scene.room_type
+        self._pull = pull_of(scene, artifact.calibration.evidence)
+
+    @property
+    def unit_count(self) -> int:
+        """Those of the evidence; in the seed form, of all that is present."""
+        return self.observation.unit_count
+
+    @cached_property
+    def draws(self) -> HiddenDraws:
+        """Of h1 given the evidence, for questions about relations."""
+        observation, pull = self.observation, self._pull.relations
+        return draw_context(observation.machine, observation.evidence, pull=pull)
+
+    @cached_property
+    def object_draws(self) -> HiddenDraws:
+        """The same for questions about objects."""
+        observation, pull = self.observation, self._pull
+        if pull.objects == pull.relations or observation.evidence.edges is None:
+            return self.draws
+        return draw_context(observation.machine, observation.evidence, pull=pull.objects)
+
+    @torch.inference_mode()
+    def absent_log_odds(self, absent: Places) -> Floats:
+        """In closed form, prepared, in a local machine without given relations."""
+        machine, evidence = self.observation.machine, self.observation.evidence
+        where = torch.from_numpy(np.asarray(absent, dtype=np.int64))
+        if machine.spec.form == "local" and evidence.edges is None:
+            y = self.object_draws.field.y[0].numpy()
+            gain = self._artifact.scorer.gain(y)
+            return _numpy(machine.b[where] + torch.from_numpy(gain)[where])
+        draws = self.object_draws
+        return _numpy(presence_log_odds(machine, evidence, where.unsqueeze(0), draws)[0])
+
+    @torch.inference_mode()
+    def absent_posterior(self, absent: Places, coverage: float) -> Floats:
+        """See `with_unlisted`; with a second layer, h2 stays at its mean field."""
+        log_odds, y = self.absent_log_odds(absent), self.object_draws.field.y[0].numpy()
+        closed = None
+        if self._artifact.completions is not None:
+            closed = (self._artifact.weights["b"] + self._artifact.scorer.gain(y))[absent]
+        return with_unlisted(
+            *(self._artifact, log_odds, absent, y, self.present, self._room, coverage), closed
+        )
+
+    @torch.inference_mode()
+    def relation_log_odds(self) -> Floats:
+        """Log-odds of every relation between the classes of a scene, each without itself.
+
+            p(r_e = 1 | rest) = E[ sigmoid(ℓ_e(h1) + x_e) ],   h1 from p(h1 | rest)
+
+        with x_e what the observed relations imply for e. The draws are made given all that is
+        observed. An observed unit is taken out of the evidence by reweighting them:
+        w ← w / p(r_e | v, h1). A relation without a unit has log-odds `NO_UNIT`.
+        """
+        between = self._between
+        weight = torch.softmax(self.draws.log_weight + between.said, dim=0)
+        on, off = mean_log_p(weight, between.logits + self._implied(apart=False))
+        return _numpy(between.units.grid((on - off).clamp(min=NO_UNIT), NO_UNIT))
+
+    @torch.inference_mode()
+    def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
+        """Over the same draws, reweighted by all units of the pair at once, both ways."""
+        units, said = self._between.units, self._between.said
+        logits = self._between.logits + self._implied(apart=True)
+        ends = torch.from_numpy(one), torch.from_numpy(other)
+        ways = units.of_pairs(*ends), units.of_pairs(*ends[::-1])
+        log_weight = self.draws.log_weight
+        if said.dim():
+            forward, backward = (way.grid(said, 0.0).sum(1) for way in ways)
+            # Of a class with itself the two ways are one.
+            log_weight = log_weight + forward + backward * (ends[0] != ends[1])
+        weight = torch.softmax(log_weight, dim=0).unsqueeze(1)
+        found = []
+        for way in ways:
+            on, off = mean_log_p(weight, way.grid(logits, NO_UNIT))
+            log_odds = (on - off).clamp(min=NO_UNIT)
+            found.append(_numpy(torch.where(way.exists, log_odds, NO_UNIT)))
+        return found[0], found[1]
+
+    @cached_property
+    def _between(self) -> _Between:
+        observation = self.observation
+        machine, evidence = observation.machine, observation.evidence
+        classes, counts = observation.classes, observation.counts
+        units = units_between(machine, classes, classes, counts, counts)
+        logits = machine.relation_logits(units.edges, evidence.v, self.draws.h1).squeeze(1)
+        if not bool(observation.observed.any()):
+            return _Between(units, logits, logits.new_zeros(()), None)
+        observed = units.flat(observation.observed)
+        r = units.flat(observation.holds).to(logits.dtype)
+        gate = machine.gate(units.edges, evidence.v)
+        unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
+        # Where e is not observed, the difference is zero and the weights stay as they are.
+        said = self._pull.relations * (unseen - machine.relation_term(logits, gate, r, observed))
+        return _Between(units, logits, said, (r * observed).unsqueeze(0))
+
+    def _implied(self, *, apart: bool) -> Tensor:
+        """What the observed relations imply for each unit, (E,)."""
+        between = self._between
+        if between.holds is None:
+            return between.logits.new_zeros(())
+        machine, edges = self.observation.machine, between.units.edges
+        return self.draws.implied(machine, edges, between.holds, apart=apart).squeeze(0)
+
+    def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
+        """Among all of them."""
+        return self.relation_log_odds()[relation, subject, object_]
+
+    @torch.inference_mode()
+    def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
+        """Over draws weighed as if the candidate were there."""
+        size = 2 * self.observation.machine.spec.A * max(1, len(anchors)) * len(self.draws.h1)
+        places = torch.from_numpy(np.asarray(anchors, dtype=np.int64))
+        found: tuple[list[Tensor], list[Tensor]] = ([], [])
+        for part in torch.from_numpy(np.asarray(candidates, dtype=np.int64)).split(_rows(size)):
+            for outgoing, parts in zip((True, False), found, strict=True):
+                on, off = self._log_p(part, places, outgoing=outgoing)
+                parts.append((on - off).clamp(min=NO_UNIT).transpose(0, 1))
+        forward, backward = (_numpy(torch.cat(parts)) for parts in found)
+        return forward, backward
+
+    @torch.inference_mode()
+    def placed_log_p(
+        self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
+    ) -> Floats:
+        """Over draws weighed as if the candidate were there."""
+        where = torch.from_numpy(np.asarray(candidates, dtype=np.int64))
+        on, _ = self._log_p(where, torch.tensor([anchor]), outgoing=outgoing)
+        return _numpy(on[relation, :, 0].clamp(min=NO_UNIT))
+
+    def _log_p(
+        self, candidates: Tensor, anchors: Tensor, *, outgoing: bool
+    ) -> tuple[Tensor, Tensor]:
+        """log p and log (1 - p) of the units between candidates and anchors, (A, N, m)."""
+        observation, draws = self.observation, self.draws
+        machine, evidence = observation.machine, observation.evidence
+        classes, counts = observation.classes[anchors], observation.counts[anchors]
+        # Each unit is judged with its candidate present; no unit sees two candidates.
+        v = evidence.v.clone()
+        v[:, candidates] = 1.0
+        weight = weights_with(machine, evidence, draws, candidates)
+        if outgoing:
+            units = units_between(machine, candidates, classes, None, counts)
+            weight = weight[:, None, :, None]
+        else:
+            units = units_between(machine, classes, candidates, counts, None)
+            weight = weight[:, None, None, :]
+        logits = machine.relation_logits(units.edges, v, draws.h1).squeeze(1)
+        on, off = mean_log_p(weight, units.grid(logits, NO_UNIT))
+        return (on, off) if outgoing else (on.mT, off.mT)
+
+    @torch.inference_mode()
+    def log_odds_given_rest(self) -> Floats:
+        """A row for each class, with draws of its own where relations are observed."""
+        observation = self.observation
+        machine, n = observation.machine, len(observation.classes)
+        alone = torch.eye(n, dtype=torch.bool)
+        parts = []
+        for classes in torch.arange(n).split(_rows(observation.unit_count * DRAWS)):
+            rest = observation.without(alone[classes])
+            draws = None
+            if rest.edges is not None:
+                draws = draw_context(machine, rest, rows=n, pull=self._pull.objects)
+            candidates = observation.classes[classes].unsqueeze(1)
+            parts.append(presence_log_odds(machine, rest, candidates, draws).squeeze(1))
+        return _numpy(torch.cat(parts))
+
+    @torch.inference_mode()
+    def reasons(self, rows: Places) -> Floats:
+        """With the context at its mean field on both sides: the difference of two estimates from
+        draws would be lost in their noise. The scene without i and j judges i without j and j
+        without i.
+        """
+        observation = self.observation
+        machine, n = observation.machine, len(observation.classes)
+        places = torch.from_numpy(np.asarray(rows, dtype=np.int64))
+        wanted = torch.zeros(n, dtype=torch.bool)
+        wanted[places] = True
+        pairs = (wanted.unsqueeze(1) | wanted).triu().nonzero().contiguous()
+        alone = torch.eye(n, dtype=torch.bool)
+        parts = [
+            object_log_odds(
+                machine,
+                observation.without(alone[part].any(1)),
+                candidates=observation.classes[part],
+                pull=self._pull.objects,
+            )
+            for part in pairs.split(_rows(observation.unit_count))
+        ]
+        log_odds = torch.cat(parts)
+        without = log_odds.new_zeros(n, n)
+        i, j = pairs.unbind(1)
+        without[i, j], without[j, i] = log_odds.unbind(1)
+        without = without[places]
+        # The diagonal takes out nothing but the class itself: it is judged by the whole rest.
+        change = without.gather(1, places.unsqueeze(1)) - without
+        change[torch.arange(len(places)), places] = 0.0
+        return _numpy(change)
+
+    @torch.inference_mode()
+    def reasons_for_absent(self, candidates: Places) -> Floats:
+        """With the context at its mean field on both sides, as for `reasons`."""
+        observation = self.observation
+        machine, n = observation.machine, len(observation.classes)
+        where = torch.from_numpy(np.asarray(candidates, dtype=np.int64)).unsqueeze(0)
+        # The first row is the scene as it is.
+        removed = torch.eye(n + 1, dtype=torch.bool)[:, 1:]
+        size = observation.unit_count + where.shape[1] * max(1, machine.spec.H1)
+        log_odds = torch.cat(
+            [
+                object_log_odds(
+                    machine,
+                    observation.without(part),
+                    candidates=where,
+                    pull=self._pull.objects,
+                )
+                for part in removed.split(_rows(size))
+            ]
+        )
+        return _numpy((log_odds[0] - log_odds[1:]).T)
+
+
+def _rows(size: int) -> int:
+    """How many rows of that size to take at a time."""
+    return max(1, _BLOCK // max(1, size))
+
+
+def _numpy(values: Tensor) -> Floats:
+    """In the order that compiled loops are compiled for."""
+    found: Floats = values.contiguous().numpy()
+    return found
+
+
+def presence_log_odds(
+    machine: BoltzmannMachine,
+    evidence: Evidence,
+    candidates: Tensor,
+    draws: HiddenDraws | None = None,
+) -> Tensor:
+    """log p(v_i = 1 | rest) - log p(v_i = 0 | rest) for candidates absent in the evidence, (B, N).
+
+    Local form without observed relations: `object_log_odds`, exact with one layer. Otherwise
+
+        log-odds_i = b_i + G_i + log E_w[exp(W_i·h1 + attraction_i)] - log mean exp(W_i·h1)
+
+    over weighted draws of h1, with G_i = log E_q[exp(W_i·h1)] in closed form under the proposal q
+    of the draws, unweighted in the last term: a control that takes out what both err in common.
+
+    Args:
+        candidates: (B or 1, N) int64.
+        draws: of h1 given the evidence; those of `draw_context` by default.
+    """
+    if machine.spec.form == "local" and evidence.edges is None:
+        return object_log_odds(machine, evidence, candidates=candidates)
+    draws = draw_context(machine, evidence) if draws is None else draws
+    weights = machine.W[candidates]
+    y = draws.field.y.unsqueeze(1)
+    closed = (softplus(y + weights) - softplus(y)).sum(-1)
+    bare = _object_input(machine, draws.h1, candidates)
+    proposal_mean = bare.logsumexp(0) - math.log(len(draws.h1))
+    gain = bare + _attraction(machine, evidence, draws, candidates)
+    return machine.b[candidates] + closed + draws.log_mean_exp(gain) - proposal_mean
+
+
+def weights_with(
+    machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
+) -> Tensor:
+    """Weights that turn draws of h1 given the evidence into draws given it and one object more.
+
+    p(h1 | rest, v_i = 1) ∝ p(h1 | rest) exp(W_i·h1 + attraction_i(h1)), for one row of evidence.
+
+    Args:
+        candidates: (N,) int64.
+
+    Returns:
+        (M, N), normalised over M.
+    """
+    row = candidates.unsqueeze(0)
+    gain = _object_input(machine, draws.h1, row) + _attraction(machine, evidence, draws, row)
+    return torch.softmax(draws.log_weight + gain.squeeze(1), dim=0)
+
+
+def _object_input(machine: BoltzmannMachine, h1: Tensor, candidates: Tensor) -> Tensor:
+    """W_i·h1, (M, B, N)."""
+    weights = machine.W[candidates]
+    if len(weights) == 1:
+        return h1 @ weights[0].T
+    return torch.einsum("mbk,bnk->mbn", h1, weights)
+
+
+def _attraction(
+    machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
+) -> Tensor:
+    """What unobserved relations add to the log-odds, (M, B, N)."""
+    if evidence.edges is None:
+        return draws.h1.new_zeros(())
+    return machine.attraction(evidence.v, draws.h1, evidence.edges, candidates)

@@ -1,0 +1,49 @@
+"""How likely a drawn scene is, up to a constant of the model.
+
+Of objects v and relations r, at temperature 1:
+
+    local form   b·v + sum_k softplus(x_k) + log p(r | v, h1)
+    seed form    b·v + sum_k softplus(x_k + sum_e r_e U_ek) + sum_e r_e ℓ⁰_e
+
+with x = c1 + v'W + J m. Up to log Z the second is log p(v, r); the first is log p(v) and how well
+the context h1 that drew the relations explains them. A second layer enters by its mean field m,
+with c2·m and the entropy of m added: a lower bound on the sum over h2.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.special import entr
+
+from training.machines import BoltzmannMachine
+from training.machines.edges import Edges
+from training.machines.mean_field import Evidence, mean_field
+
+
+def log_score(
+    machine: BoltzmannMachine,
+    v: Tensor,
+    r: Tensor,
+    edges: Edges,
+    h1: Tensor,
+    room: Tensor | None,
+) -> Tensor:
+    """The score of each scene, (B,).
+
+    Args:
+        v: (B, V); r: (B, E) over `edges`, off wherever the gate is.
+        h1: (B, H1), the context that drew the relations.
+    """
+    known = torch.ones_like(r, dtype=torch.bool)
+    local = machine.spec.form == "local"
+    evidence = Evidence(v, room=room) if local else Evidence(v, edges, r, known, room)
+    m = mean_field(machine, evidence).h2 if machine.spec.H2 else None
+    if local:
+        gate = machine.gate(edges, v)
+        logits = machine.relation_logits(edges, v, h1)
+        explained = machine.relation_term(logits, gate, r, known).sum(-1)
+        score = explained - machine.free_energy(v, h2=m, room=room)
+    else:
+        score = -machine.free_energy(v, r, edges, h2=m, room=room)
+    return score if m is None else score + (entr(m) + entr(1 - m)).sum(-1)

@@ -1,0 +1,100 @@
+"""Relation units between classes, whatever the layout of the machine.
+
+A Triway machine has a unit for every pair of classes it is asked about; the RBM and the GBM have
+units for the triples seen in training, and all others are off with probability one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from training.machines import BoltzmannMachine, Triway
+from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
+
+# Stands for the log-odds of a unit that does not exist, and bounds those of the units that do.
+NO_UNIT = -30.0
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units between n subject classes and m object classes.
+
+    Attributes:
+        edges: (1, E) the machine's layout.
+        place: (A, n, m) int64, the place in `edges` of each unit; or (A, P), see `of_pairs`.
+        exists: (A, n, m) bool; place is arbitrary where False.
+    """
+
+    edges: Edges
+    place: Tensor
+    exists: Tensor
+
+    def grid(self, values: Tensor, missing: float) -> Tensor:
+        """Values (..., E) of the units as (..., A, n, m); `missing` where there is no unit."""
+        if not values.shape[-1]:
+            return values.new_full((*values.shape[:-1], *self.place.shape), missing)
+        return torch.where(self.exists, values[..., self.place], missing)
+
+    def of_pairs(self, subjects: Tensor, objects: Tensor) -> Units:
+        """Those of some pairs, by places (P,) among the classes: `grid` then gives (..., A, P)."""
+        place, exists = (grid[:, subjects, objects] for grid in (self.place, self.exists))
+        return Units(self.edges, place, exists)
+
+    def flat(self, grid: Tensor) -> Tensor:
+        """(..., A, n, m) as (..., E); what has no unit is lost, other units are 0."""
+        values = grid.new_zeros(*grid.shape[:-3], self.edges.shape[-1])
+        values[..., self.place[self.exists]] = grid[..., self.exists]
+        return values
+
+
+def units_between(
+    machine: BoltzmannMachine,
+    subjects: Tensor,
+    objects: Tensor,
+    subject_counts: Tensor | None = None,
+    object_counts: Tensor | None = None,
+) -> Units:
+    """The units from subject classes (n,) to object classes (m,).
+
+    Args:
+        subject_counts, object_counts: instances of each class; one each where omitted.
+    """
+    A = machine.spec.A
+    pairs = pair_edges(
+        subjects.unsqueeze(0),
+        A,
+        objects=objects.unsqueeze(0),
+        log_subjects=_logs(machine, subjects, subject_counts),
+        log_objects=_logs(machine, objects, object_counts),
+    )
+    shape = (A, len(subjects), len(objects))
+    if isinstance(machine, Triway):
+        place = torch.arange(pairs.shape[-1]).view(shape)
+        return Units(pairs, place, torch.ones(shape, dtype=torch.bool))
+    keys = triple_keys(pairs.relation, pairs.subject, pairs.object, machine.spec.V)
+    place, exists = find_triples(machine.triple_keys, keys)
+    return Units(machine.edges(subjects.unsqueeze(0)), place.view(shape), exists.view(shape))
+
+
+def _logs(machine: BoltzmannMachine, classes: Tensor, counts: Tensor | None) -> Tensor:
+    if counts is None:
+        return torch.zeros(1, len(classes), dtype=machine.b.dtype)
+    return counts.to(machine.b.dtype).log().unsqueeze(0)
+
+
+def mean_log_p(weight: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+    """log E[sigmoid(ℓ)] and log E[sigmoid(-ℓ)] over draws.
+
+    Both tails are summed by themselves: 1 - p would lose a p near one in single precision.
+
+    Args:
+        weight: (M, ...) normalised over M, broadcastable to the logits.
+        logits: (M, ...).
+    """
+    tiny = torch.finfo(logits.dtype).tiny
+    on = (weight * logits.sigmoid()).sum(0).clamp(min=tiny).log()
+    off = (weight * logits.neg().sigmoid()).sum(0).clamp(min=tiny).log()
+    return on, off
