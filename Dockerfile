@@ -10,15 +10,14 @@ WORKDIR /srv/scene
 
 # ---- packages of the service
 FROM base AS packages
-# The index for CPU builds of torch; without it the default index may bring a CUDA build.
-ARG TORCH_INDEX_URL=""
 COPY requirements.lock ./
 RUN python -m venv /opt/venv \
     && /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
-        ${TORCH_INDEX_URL:+--extra-index-url "$TORCH_INDEX_URL"} -r requirements.lock
+        -r requirements.lock
 
 # ---- packages of training, on top
 FROM packages AS training-packages
+# The index for CPU builds of torch; without it the default index may bring a CUDA build.
 ARG TORCH_INDEX_URL=""
 COPY requirements-training.lock ./
 RUN /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \

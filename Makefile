@@ -74,7 +74,7 @@ clean:  ## remove the environment and every cache
 
 $(SERVICE): requirements.lock pyproject.toml | $(BIN)/python
 	@echo "Installing the service's packages into $(VENV) ..."
-	@$(PIP) install -qq $(INDEX) -r requirements.lock
+	@$(PIP) install -qq -r requirements.lock
 	@$(PIP) install -qq --no-deps --editable .
 	@echo "Compiling loops for this machine ..."
 	@$(BIN)/python -m app.compile

@@ -164,6 +164,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     "missing_batch": _batch(_MISSING),
     "outliers_batch": _batch(_OUTLIERS),
     "list_models": {
+        "generation": "3f6d0f4be1a25c77",
         "models": [_SUMMARY],
         "aliases": {"default": "home@1.0.0"},
         "failures": [_FAILURE],
@@ -251,7 +252,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     "model_metadata": {
         "name": "home",
         "versions": ["1.0.0", "1.1.0"],
-        "platform": "torch_triway",
+        "platform": "numpy_triway",
         "inputs": [],
         "outputs": [],
     },

@@ -69,7 +69,7 @@ async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
     return ModelMetadata(
         name=reference.name,
         versions=list(models.store.versions[reference.name]),
-        platform=f"torch_{reference.variant}",
+        platform=f"numpy_{reference.variant}",
     )
 
 

@@ -139,10 +139,8 @@ class ListedRelations:
         pulls = np.zeros((P, len(y)), np.float32)
         if context.given is not None:
             n = len(context.classes)
-            pairs = np.zeros((n * n, len(y)), np.float32)
-            one, other = context.given.i, context.given.j
             pull = context.slopes[:, None] * context.units
-            np.add.at(pairs, one * n + other, pull)
+            pairs = _sums(context.given.i * n + context.given.j, pull, n * n)
             pulls = pairs[i * n + j] + np.where((i != j)[:, None], pairs[j * n + i], 0)
         found = np.empty((2, A, P), np.float32)
         for way, (start, end) in enumerate(((i, j), (j, i))):
@@ -209,25 +207,37 @@ class ListedRelations:
 
     def shares(self, context: Context, given: Given) -> Floats:
         """See `RelationPart`."""
-        found: Floats = context.presence[:, None] * self._W[context.classes]
+        n = len(context.classes)
         pull = context.object_slopes[:, None] * context.units
-        np.add.at(found, given.i, pull)
         other = given.i != given.j
-        np.add.at(found, given.j[other], pull[other])
-        return found
+        found: Floats = context.presence[:, None] * self._W[context.classes]
+        return found + _sums(given.i, pull, n) + _sums(given.j[other], pull[other], n)
 
     def common_growth(self, context: Context, given: Given, rows: Places) -> tuple[Floats, Mask]:
         """See `RelationPart`."""
         n = len(context.classes)
-        pulls = np.zeros((n * n, len(context.y)), np.float32)
-        some = np.zeros(n * n, np.bool_)
         other = given.i != given.j
+        i, j = given.i[other], given.j[other]
         pull = (context.object_slopes[:, None] * context.units)[other]
-        for one, two in ((given.i, given.j), (given.j, given.i)):
-            np.add.at(pulls, one[other] * n + two[other], pull)
-            some[one[other] * n + two[other]] = True
-        growth = np.exp(pulls.reshape(n, n, -1)[rows])
-        return growth, some.reshape(n, n)[rows]
+        some = np.zeros((n, n), np.bool_)
+        some[i, j] = some[j, i] = True
+        both = np.concatenate([i * n + j, j * n + i]), np.concatenate([pull, pull])
+        pulls = _sums(*both, n * n).reshape(n, n, -1)[rows]
+        filled = some[rows]
+        growth = np.empty(pulls.shape, np.float32)
+        growth[filled] = np.exp(pulls[filled])
+        return growth, filled
+
+
+def _sums(keys: Places, rows: Floats, size: int) -> Floats:
+    """Sums (size, H1) of the rows (E, H1) of each key."""
+    found = np.zeros((size, rows.shape[1]), np.float32)
+    if len(keys):
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+        starts = np.flatnonzero(np.diff(ordered, prepend=-1))
+        found[ordered[starts]] = np.add.reduceat(rows[order], starts, axis=0)
+    return found
 
 
 def _grid(A: int, n: int) -> tuple[Places, Places, Places]:

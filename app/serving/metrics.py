@@ -38,8 +38,8 @@ _ROWS: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _MODEL: Final = ("model", "version")
 _INFO: Final = "scene_model_info"
 
-# A second series for each one that says when it began: several processes cannot have them, and
-# Prometheus itself sees when a counter restarts.
+# A second series for each one that says when it began: Prometheus itself sees when a counter
+# restarts.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 

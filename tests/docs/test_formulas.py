@@ -44,6 +44,7 @@ from tests.enumeration.test_completions import exactly, machine_of
 from tests.training.test_objectives import toy_batch, toy_machine
 from training.config import ObjectiveConfig
 from training.machines import BoltzmannMachine, MachineSpec, build
+from training.machines.arrays import weights_of
 from training.machines.draws import draw_hidden
 from training.machines.log_odds import object_log_odds
 from training.machines.mean_field import Evidence, mean_field
@@ -451,7 +452,7 @@ def wide_machine() -> BoltzmannMachine:
 )
 def normal_logits() -> None:
     machine = wide_machine()
-    closed = ClosedForm(machine)
+    closed = ClosedForm(weights_of(machine))
     classes = np.arange(3)
     context = closed.context(classes, np.ones(3, np.float32), np.zeros(3, np.float32))
     found = closed.relation_log_odds(context)

@@ -38,7 +38,7 @@ async def test_protocol_metadata(client: httpx.AsyncClient) -> None:
     model = (await client.get("/v2/models/default")).json()
     assert model["name"] == "home"
     assert model["versions"] == ["1.0.0", "1.1.0"]
-    assert model["platform"] == "torch_triway"
+    assert model["platform"] == "numpy_triway"
 
 
 async def test_before_its_start_a_service_is_live_and_not_ready(shared_store: Path) -> None:

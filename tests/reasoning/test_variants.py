@@ -27,7 +27,7 @@ SCENES = {
     "bare": (scene_of([0, 3, 5, 6], room=1), 1e-3, 0.01),
     "two instances": (scene_of([0, 0, 3, 5]), 1e-3, 0.01),
     "one relation": (scene_of([0, 3, 5], [(2, 0, 1)]), 0.15, 0.02),
-    "poses": (with_poses(), 0.4, 0.1),
+    "poses": (with_poses(), 0.4, 0.12),
 }
 
 

@@ -1,0 +1,39 @@
+"""The service as it is installed for serving: without torch, and without training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.http.conftest import launch
+from tests.http.stores import make_store
+
+_WITHOUT = """
+import runpy, sys
+sys.modules["torch"] = sys.modules["training"] = None  # importing them fails
+runpy.run_module("app", run_name="__main__")
+"""
+
+
+def test_every_question_is_answered(tmp_path: Path) -> None:
+    """By models of every variant."""
+    service = launch(make_store(tmp_path / "store"), tmp_path / "log", program=("-c", _WITHOUT))
+    try:
+        client = service.client
+        listed = client.get("/models").json()
+        assert not listed["failures"]
+        variants = {entry["versions"][0]["variant"] for entry in listed["models"]}
+        assert variants == {"triway", "gbm", "rbm"}
+        for entry in listed["models"]:
+            body = {
+                "objects": ["bed", "lamp", "desk"],
+                "relations": [{"subject": "lamp", "relation": "on-top", "object": "desk"}],
+                "model": entry["name"],
+            }
+            for question in ("relations", "missing", "outliers", "generate"):
+                answer = client.post(f"/{question}", json=body)
+                assert answer.status_code == 200, answer.text
+            assert client.get(f"/models/{entry['name']}/contexts").status_code == 200
+    finally:
+        service.client.close()
+        service.process.terminate()
+        service.process.wait(timeout=30)
