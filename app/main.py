@@ -18,7 +18,7 @@ Ask a Boltzmann machine about a scene: how its objects stand to each other, what
 does not belong, what a scene like it would look like. Positions are metres in the axes of
 `frame_id`; objects are named by their ids, or by their labels where those are unambiguous.
 A robot whose scene changes all the time streams it: `GET /stream`, a WebSocket, takes updates and
-answers with what changed; docs/stream.md is its contract.
+answers with the newest answers; docs/stream.md is its contract.
 Every failure is a problem document (RFC 9457) whose `type` a program can branch on.
 The figures in the examples illustrate; a model's own depend on what it was trained on.
 """

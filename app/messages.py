@@ -1,43 +1,43 @@
 """Messages of ``GET /stream``: plain pydantic, shared by the service and its clients.
 
-What a client sends is as strict as a request; docs/stream.md says how messages follow each other.
+A client's messages are read as strictly as a request; docs/stream.md is the contract.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from app.schemas import (
-    Mapped,
+    Detection,
+    MissingAnswer,
     MissingOptions,
-    ModelReference,
     Name,
+    OutliersAnswer,
     OutliersOptions,
     Problem,
+    RelationsAnswer,
     RelationsOptions,
     Reply,
     Request,
     SceneObject,
     SceneRequest,
-    SceneWarning,
-    Stamp,
 )
 
 MAX_SEQ: Final = 2**53 - 1
 """Every JSON reader keeps such a number as it is: a double holds it exactly."""
 
-Seq = Annotated[int, Field(ge=1, le=MAX_SEQ, description="greater than that of any message before")]
-SessionId = Annotated[str, Field(min_length=1, max_length=64, pattern="^[A-Za-z0-9_-]+$")]
-
+Seq = Annotated[int, Field(ge=1, le=MAX_SEQ, description="greater than in any message before")]
 
 # --------------------------------------------------------------------------------- from clients
 
 
 class Ask(Request):
-    """Which questions are answered, each with what a request to its route may say."""
+    """The questions to answer, each with the options of its route."""
 
     missing: MissingOptions | None = None
     outliers: OutliersOptions | None = None
@@ -51,36 +51,31 @@ class Ask(Request):
 
 
 class SceneMessage(SceneRequest):
-    """What a scene message, an update and an opening have in common: fields of a scene.
-
-    An object without an id has its label for one; relations are kept by the ids they name.
-    """
+    """Fields of a scene; an object without an id has its label for one."""
 
     objects: list[SceneObject] = Field(default_factory=list, max_length=256)
-    ask: Annotated[Ask | None, Field(description="left out: as before")] = None
+    ask: Annotated[Ask | None, Field(description="null: missing and outliers")] = None
     timeout_ms: Annotated[
         int | None,
-        Field(ge=1, le=600_000, description="an answer not begun by then is not computed"),
+        Field(ge=1, le=600_000, description="an answer that has not begun by then is dropped"),
     ] = None
 
 
 class Open(SceneMessage):
-    """The first message: a new session, or one that is taken up again."""
+    """The first message; it may hold the scene."""
 
     type: Literal["open"]
-    session: Annotated[SessionId | None, Field(description="id of a session to resume")] = None
 
 
 class Whole(SceneMessage):
-    """A whole scene in place of the one before; `model`, `ask` and so on stay unless given."""
+    """A whole scene in place of the one before."""
 
     type: Literal["scene"]
     seq: Seq
 
 
 class Update(SceneMessage):
-    """Objects added, moved or changed (each by its id, as a whole) and removed; fields that are
-    given replace those before, and null takes them back."""
+    """Objects added or replaced by id, and removed; fields that are given replace those before."""
 
     type: Literal["update"]
     seq: Seq
@@ -89,118 +84,103 @@ class Update(SceneMessage):
     )
 
 
-class Get(Request):
-    """Asks for whole answers about the scene as it is."""
-
-    type: Literal["get"]
-
-
 class Ping(Request):
-    """Asks for a sign of life, and counts as one."""
+    """Asks for a pong, and keeps a quiet stream open."""
 
     type: Literal["ping"]
 
 
-class Close(Request):
-    """The end: the session is forgotten."""
-
-    type: Literal["close"]
-
-
-Command = Open | Whole | Update | Get | Ping | Close
+Command = Open | Whole | Update | Ping
 COMMANDS: Final[dict[str, type[Command]]] = {
     "open": Open,
     "scene": Whole,
     "update": Update,
-    "get": Get,
     "ping": Ping,
-    "close": Close,
 }
+
+# A whole scene leaves these as they are unless it names them.
+_KEPT: Final = frozenset({"model", "unknown_labels", "ask", "timeout_ms"})
+_FIELDS: Final = frozenset(SceneMessage.model_fields) - {"objects", "seed"}
+
+
+@dataclass(frozen=True, slots=True)
+class MergedScene:
+    """A scene after some messages; the service and the client keep one each.
+
+    Attributes:
+        objects: by id, in the order in which they came.
+        fields: the other fields of `SceneMessage`, as far as they were given.
+    """
+
+    objects: Mapping[str, str | Detection] = field(default_factory=dict)
+    fields: Mapping[str, Any] = field(default_factory=dict)
+
+    def after(self, message: SceneMessage) -> MergedScene:
+        """The scene with a message merged into it; ids to remove may be unknown."""
+        objects, fields = dict(self.objects), dict(self.fields)
+        if isinstance(message, Whole):
+            objects = {}
+            fields = {name: value for name, value in fields.items() if name in _KEPT}
+        elif isinstance(message, Update) and message.remove:
+            removed = set(message.remove)
+            objects = {name: thing for name, thing in objects.items() if name not in removed}
+            if fields.get("relations"):
+                fields["relations"] = [
+                    relation
+                    for relation in fields["relations"]
+                    if relation.subject not in removed and relation.object not in removed
+                ]
+        objects |= {object_id(thing): thing for thing in message.objects}
+        fields |= {name: getattr(message, name) for name in message.model_fields_set & _FIELDS}
+        return MergedScene(objects, fields)
+
+
+def object_id(thing: str | Detection) -> str:
+    """Its own id, or its label."""
+    return thing if isinstance(thing, str) else thing.id or thing.label
 
 
 # ------------------------------------------------------------------------------ from the service
 
 
 class StreamLimits(Reply):
-    """What the service allows a stream."""
+    """Limits of a stream."""
 
     max_message_bytes: int
     max_objects: int
     max_relations: int
     timeout_ms: Annotated[int, Field(description="where the client names none")]
     idle_seconds: Annotated[float, Field(description="without a message the stream is closed")]
-    resume_seconds: Annotated[float, Field(description="a session is kept so long without one")]
 
 
 class Opened(Reply):
-    """The session is there."""
+    """The stream is open."""
 
     type: Literal["opened"] = "opened"
-    session: Annotated[str, Field(description="its id: who knows it may resume it")]
-    resumed: bool
-    seq: Annotated[int, Field(description="of the newest message that the session took; 0: none")]
-    revision: Annotated[int, Field(description="how many answers the session has given")]
+    seq: Annotated[int, Field(description="0: no message is taken yet")] = 0
     request_id: str
     limits: StreamLimits
 
 
-class ListChanges(Reply):
-    """How one list of an answer became another.
-
-    Entries are told apart by their texts: an outlier by object and label, a relation by subject,
-    relation and object. Take away what is `gone`, put what is `changed` in the place of the entry
-    with its texts, append what `appeared`, and read off the result by `order`.
-    """
-
-    gone: Annotated[list[dict[str, str]] | None, Field(description="the texts of entries")] = None
-    changed: list[dict[str, Any]] | None = None
-    appeared: list[dict[str, Any]] | None = None
-    order: Annotated[
-        list[int] | None, Field(description="place k is taken by entry order[k]; absent: as it is")
-    ] = None
-
-
-class Alarms(Reply):
-    """Objects by id that are outliers and were none, and those that were and no longer are."""
-
-    raised: list[str] = Field(default_factory=list)
-    cleared: list[str] = Field(default_factory=list)
-
-
 class AnswerMessage(Reply):
-    """What has changed since the answer before."""
+    """The answers about the newest scene, each as its route gives it."""
 
     type: Literal["answer"] = "answer"
     seq: Annotated[int, Field(description="the newest message that it covers; 0: the opening")]
-    superseded: Annotated[int, Field(description="how many messages before that it covers as well")]
-    revision: Annotated[int, Field(description="number of the answer; counts from 1")]
-    full: Annotated[
-        bool, Field(description="the changes start from nothing: forget all answers before")
-    ]
-    model: ModelReference
-    frame_id: str | None = None
-    stamp: Stamp | None = None
-    ignored: list[str] = Field(default_factory=list)
-    mapped: list[Mapped] = Field(default_factory=list)
-    warnings: list[SceneWarning] = Field(default_factory=list)
-    coverage: Annotated[float | None, Field(description="as in the answer of `/missing`")] = None
-    threshold: Annotated[float | None, Field(description="as in the answer of `/outliers`")] = None
-    changes: Annotated[
-        dict[str, ListChanges], Field(description="lists by their names in the answers of POST")
-    ]
-    dropped: list[str] = Field(default_factory=list, description="lists that are no longer there")
-    alarms: Alarms = Alarms()
+    superseded: Annotated[int, Field(description="earlier messages without an answer of their own")]
+    missing: MissingAnswer | None = None
+    outliers: OutliersAnswer | None = None
+    relations: RelationsAnswer | None = None
     problems: dict[str, Problem] = Field(
-        default_factory=dict, description="questions that could not be answered, and why"
+        default_factory=dict, description="by question: why it has no answer"
     )
 
 
 class ProblemMessage(Reply):
-    """A message was refused, which changes nothing; or its answer could not be given."""
+    """A message was refused; the scene is as before."""
 
     type: Literal["problem"] = "problem"
     seq: Annotated[int | None, Field(description="of the message, where it has one")] = None
-    retry_after: Annotated[int | None, Field(description="seconds")] = None
     problem: Problem
 
 
@@ -210,17 +190,10 @@ class Pong(Reply):
     type: Literal["pong"] = "pong"
 
 
-class Closed(Reply):
-    """The answer to a close."""
-
-    type: Literal["closed"] = "closed"
-
-
-Event = Opened | AnswerMessage | ProblemMessage | Pong | Closed
+Event = Opened | AnswerMessage | ProblemMessage | Pong
 EVENTS: Final[dict[str, type[Event]]] = {
     "opened": Opened,
     "answer": AnswerMessage,
     "problem": ProblemMessage,
     "pong": Pong,
-    "closed": Closed,
 }

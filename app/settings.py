@@ -136,15 +136,6 @@ class Settings(BaseSettings):
             description="seconds a stream may be silent",
         ),
     ] = 300
-    stream_resume: Annotated[
-        float,
-        Field(
-            ge=0,
-            le=3600,
-            allow_inf_nan=False,
-            description="seconds for which a session without a connection can be resumed",
-        ),
-    ] = 60
     drain_seconds: Annotated[
         float,
         Field(ge=0, le=300, description="from SIGTERM until the listening socket is closed"),

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.stream``: a robot that tells of every tick, beside requests that ask anew.
+"""``python -m benchmarks.stream``: updates over a stream, beside requests with the whole scene.
 
 One thing of a posed room moves every tick, and all three questions are asked. Blocks of ticks go
 over a stream and as requests (three of them, on a connection kept alive) in turns, so that both see
@@ -26,7 +26,6 @@ from rich.console import Console
 from rich.table import Table
 from websockets.asyncio.client import ClientConnection, connect
 
-from app.messages import AnswerMessage
 from benchmarks.load import servers
 from benchmarks.report import describe_machine
 
@@ -168,11 +167,10 @@ class _Run:
                 found.seconds[PING].append(now - pings[ponged])
                 ponged += 1
                 continue
-            answer = AnswerMessage.model_validate(message)
             found.answers += 1
-            found.superseded += answer.superseded
+            found.superseded += message["superseded"]
             found.bytes[STREAM] += len(text)
-            answered = answer.seq
+            answered = message["seq"]
             for seq in [seq for seq in due if seq <= answered]:
                 found.seconds[STREAM].append(now - due.pop(seq))
 
@@ -231,8 +229,9 @@ def main(
         table.add_row(name, *(f"{1e3 * value:.2f}" for value in values), beside)
     console.print(table)
     share = found.bytes[STREAM] / found.bytes[REQUESTS]
+    each = found.bytes[STREAM] / found.answers
     console.print(f"answers: {found.answers}, covering {found.superseded} updates besides")
-    console.print(f"bytes received: {share:.2f} of what the requests brought")
+    console.print(f"bytes: {each:.0f} an answer; {share:.2f} of all that the requests brought")
     verdict = "met" if own < AIM else "MISSED"
     console.print(f"p99 of an update: {1e3 * own:.2f} ms; below {1e3 * AIM:.0f} ms: {verdict}")
 

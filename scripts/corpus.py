@@ -46,6 +46,8 @@ HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "l
 PATIENCE: Final = {"x-request-timeout-ms": "600000"}
 # Different in each answer, or in each process.
 VOLATILE: Final = frozenset({"request_id", "instance", "session", "seed"})
+# Lists of an answer that are about the scene.
+NOTES: Final = frozenset({"ignored", "mapped", "warnings"})
 # Chance that one of all compared shares of classes differs although nothing has changed.
 FAILURE: Final = 1e-3
 
@@ -331,32 +333,35 @@ def _in_order(header: str) -> str:
 
 
 def converse(url: str, talk: list[dict[str, Json]]) -> list[Json]:
-    """The events of a stream: after each message one, and of answers the whole lists."""
-    # The lists of streams that send differences.
-    from app.changes import applied
-    from app.messages import ListChanges
-
-    lists: dict[str, Json] = {}
+    """The events of a stream, one after each message."""
     events = []
     with connect(url.replace("http", "ws", 1) + "/stream", max_size=2**24) as socket:
         for message in talk:
             socket.send(json.dumps(message))
-            event = json.loads(socket.recv(timeout=30))
-            if event["type"] == "answer":
-                if event["full"]:
-                    lists = {}
-                changes = {
-                    name: ListChanges.model_validate(change)
-                    for name, change in event.pop("changes").items()
-                }
-                lists = applied(lists, changes, event.pop("dropped", ()))
-                for name in ("full", "revision", "superseded"):
-                    event.pop(name, None)
-                event["lists"] = lists
-            elif event["type"] == "opened":
-                event = {"type": "opened", "seq": event["seq"]}
-            events.append(event)
+            events.append(comparable(json.loads(socket.recv(timeout=30))))
     return events
+
+
+def comparable(event: dict[str, Json]) -> dict[str, Json]:
+    """An event of a stream in the form of the record, whichever service sent it.
+
+    The record holds the lists of all answers together as `lists`, and their other fields beside it.
+    """
+    event = {k: v for k, v in event.items() if k not in {"alarms", "superseded"}}
+    if event["type"] == "opened":
+        return {"type": "opened", "seq": event["seq"]}
+    if event["type"] == "problem" and event["problem"].get("errors"):
+        # The message of an unknown type lists the known ones.
+        for error in event["problem"]["errors"]:
+            error["message"] = error["message"].partition("must be open, ")[0]
+    if event["type"] == "answer" and "lists" not in event:
+        lists: dict[str, Json] = {}
+        for answer in [event.pop(name) for name in QUESTIONS if name in event]:
+            for name, value in answer.items():
+                is_list = isinstance(value, list) and name not in NOTES
+                (lists if is_list else event)[name] = value
+        event = {"problems": {}, **event, "lists": lists}
+    return event
 
 
 # ---------------------------------------------------------------------------------- comparing
@@ -483,7 +488,7 @@ def compare(url: str, file: Path, key: str) -> int:
         for entry in entries:
             request, old = entry["request"], entry["answer"]
             if entry["kind"] == "stream":
-                found = list(differences(old, converse(url, request)))
+                found = list(differences(list(map(comparable, old)), converse(url, request)))
             else:
                 new = ask(client, request, key)
                 if entry["kind"] == "drawn" and old["status"] == new["status"] == 200:

@@ -48,7 +48,7 @@ def build(
     )
     app.state.settings = settings
     app.state.runtime = runtime
-    app.state.streams = Streams(settings.max_streams, settings.stream_resume, runtime.metrics)
+    app.state.streams = Streams(settings.max_streams, runtime.metrics)
     problems.install(app)
     middleware.install(
         app,

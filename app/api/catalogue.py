@@ -223,13 +223,7 @@ STREAM_IDLE: Final = ProblemType(
     408,
     "The stream was silent for too long",
     "A stream is opened by a message within SCENE_CLIENT_TIMEOUT seconds, and then has another at "
-    "least every SCENE_STREAM_IDLE seconds; a ping will do. The session can be resumed.",
-)
-SESSION_RESUMED: Final = ProblemType(
-    "session-resumed",
-    409,
-    "The session goes on in another stream",
-    "Somebody who knows its id has resumed it. If it was not you, open a session of your own.",
+    "least every SCENE_STREAM_IDLE seconds; a ping will do.",
 )
 
 PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
@@ -263,6 +257,5 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         UPGRADE_REQUIRED,
         TOO_MANY_STREAMS,
         STREAM_IDLE,
-        SESSION_RESUMED,
     )
 }

@@ -1,27 +1,27 @@
-"""A client of ``GET /stream`` that keeps the whole answers; docs/stream.md is the contract."""
+"""A client of ``GET /stream`` that keeps the newest answer; docs/stream.md is the contract."""
 
 from __future__ import annotations
 
+import asyncio
 import json
+import random
 from collections.abc import Sequence
-from contextlib import AsyncExitStack
+from time import monotonic
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self
 from urllib.parse import urlsplit, urlunsplit
 
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
-from app.changes import Entry, applied
-from app.client.errors import ClientError, UnreachableError
+from app.client.errors import ClientError, ProblemError, UnreachableError
 from app.client.exchange import Received, problem_of
 from app.messages import (
     EVENTS,
     AnswerMessage,
-    Close,
     Event,
-    Get,
+    MergedScene,
     Open,
     Opened,
     Ping,
@@ -30,46 +30,37 @@ from app.messages import (
     Update,
     Whole,
 )
-from app.schemas import (
-    Detection,
-    Disagreement,
-    ExpectedRelation,
-    MisplacedRelation,
-    MissingObject,
-    ModelReference,
-    ObservedRelation,
-    Outlier,
-    Problem,
-)
+from app.schemas import Detection, Problem
 
-T = TypeVar("T")
 Objects = Sequence[str | dict[str, Any] | Detection]
 
-_PATH = "/stream"
-_MOST = 64 * 2**20
+_PATH: Final = "/stream"
+_MAX_EVENT: Final = 64 * 2**20
+# Of connections that broke, and of services that end or fail; others would close it again.
+_TRANSIENT: Final = frozenset({1001, 1006, 1011, 1012, 1013})
+_FIRST_PAUSE: Final = 0.1
+_LONGEST_PAUSE: Final = 5.0
 
 
 class StreamProblemError(ClientError):
-    """The service refused a message, or could not answer it; the stream goes on.
+    """The service refused a message; the stream goes on.
 
     Attributes:
-        problem: what it says of it; branch on its `type`.
-        seq: of the message, where it had one.
-        retry_after: seconds to wait before asking again, where that helps.
+        problem: branch on its `type`.
+        seq: of the message, where it has one.
     """
 
     def __init__(self, message: ProblemMessage) -> None:
         super().__init__(f"{message.problem.title}: {message.problem.detail}")
         self.problem: Problem = message.problem
         self.seq = message.seq
-        self.retry_after = message.retry_after
 
 
 class StreamClosedError(ClientError):
-    """The stream ended without having been closed from here; its session may be resumed.
+    """The stream has ended.
 
     Attributes:
-        code: of the close (RFC 6455, section 7.4); 1006 where the connection just broke.
+        code: of the close (RFC 6455, section 7.4); 1006 where the connection broke.
         reason: the last part of a problem's type, where the service gave one.
     """
 
@@ -80,35 +71,29 @@ class StreamClosedError(ClientError):
 
 
 class StreamClient:
-    """One stream: send what changed, and iterate over the answers.
+    """One stream: send changes of the scene, iterate over the newest answers.
 
         async with StreamClient("http://127.0.0.1:8000", room_type="bedroom") as scene:
             await scene.update(objects=["bed", {"id": "lamp_1", "label": "lamp"}])
             async for answer in scene:
-                print(answer.alarms.raised, scene.missing[0].label)
+                print(answer.missing.missing[0].label)
 
-    Iterating yields what has changed, after it has been worked into the whole answers that the
-    client keeps; `StreamProblemError` can be caught, and the iteration begun again.
+    The client keeps the scene. Where the connection breaks, the iteration connects again and sends
+    the whole scene. `StreamProblemError` can be caught, and the iteration begun again.
 
     Args:
         url: of the service, with http, https, ws or wss.
         api_key: of a service that asks for one.
-        session: id of a session to resume; what is left of it, `resumed` tells.
         timeout: seconds for connecting, and for closing.
+        reconnect: seconds without an answer after which the client gives up a broken stream.
         **fields: of the opening message: `model`, `ask`, `room_type`, `frame_id` and so on.
 
     Attributes:
-        session: id of the session.
-        resumed: whether the service still had it; if not, send the whole scene.
-        seq: of the newest message that was sent, or that a resumed session had taken.
-        limits: what the service allows.
-        model: which model gave the newest answer; None before.
-        revision: of the newest answer.
-        lists: the whole answers' lists by name, as JSON has them.
+        seq: of the newest message.
+        limits: of the service.
+        answer: the newest; None before the first.
     """
 
-    session: str
-    resumed: bool
     limits: StreamLimits
 
     def __init__(
@@ -116,8 +101,8 @@ class StreamClient:
         url: str,
         *,
         api_key: str | None = None,
-        session: str | None = None,
         timeout: float = 10.0,
+        reconnect: float = 60.0,
         **fields: Any,
     ) -> None:
         parts = urlsplit(url)
@@ -126,15 +111,16 @@ class StreamClient:
         self._address = urlunsplit((scheme, parts.netloc, path, "", ""))
         self._headers = {} if api_key is None else {"X-API-Key": api_key}
         self._timeout = timeout
-        if session is not None:
-            fields["session"] = session
+        self._patience = reconnect
         self._opening = Open(type="open", **fields)
+        self._scene = MergedScene().after(self._opening)
+        self._unanswered: dict[int, Update | Whole] = {}
         self._connection: ClientConnection | None = None
-        self._ending = AsyncExitStack()
+        self._ended: StreamClosedError | None = None
+        self._lost_at: float | None = None
+        self._pause = _FIRST_PAUSE
         self.seq = 0
-        self.revision = 0
-        self.model: ModelReference | None = None
-        self.lists: dict[str, list[Entry]] = {}
+        self.answer: AnswerMessage | None = None
 
     async def __aenter__(self) -> Self:
         """Connect and open.
@@ -143,39 +129,10 @@ class StreamClient:
             UnreachableError: the service cannot be reached.
             ProblemError: it refused the handshake.
             StreamProblemError: it refused the opening.
+            StreamClosedError: it closed the stream.
         """
-        async with AsyncExitStack() as stack:
-            self._connection = await self._connected(stack)
-            await self._send(self._opening)
-            opened = await self._receive()
-            if not isinstance(opened, Opened):
-                raise TypeError(f"the stream was opened with {opened.type}")
-            self._ending = stack.pop_all()
-        self.session, self.resumed = opened.session, opened.resumed
-        self.seq, self.revision, self.limits = opened.seq, opened.revision, opened.limits
+        await self._connect()
         return self
-
-    async def _connected(self, stack: AsyncExitStack) -> ClientConnection:
-        try:
-            return await stack.enter_async_context(
-                connect(
-                    self._address,
-                    additional_headers=self._headers,
-                    open_timeout=self._timeout,
-                    close_timeout=self._timeout,
-                    max_size=_MOST,
-                    compression=None,
-                    proxy=None,
-                )
-            )
-        except InvalidStatus as refused:
-            answer = refused.response
-            headers = {name.lower(): value for name, value in answer.headers.raw_items()}
-            raise problem_of(
-                Received(answer.status_code, headers, bytes(answer.body or b""))
-            ) from None
-        except (OSError, InvalidHandshake) as error:
-            raise UnreachableError(f"no stream at {self._address}: {error}") from error
 
     async def __aexit__(
         self,
@@ -183,15 +140,15 @@ class StreamClient:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Disconnect; the session stays for a while unless `close` was called."""
-        await self._ending.aclose()
+        """Close the stream."""
+        await self.close()
 
     # -- sending --------------------------------------------------------------------------------
 
     async def update(
         self, objects: Objects = (), *, remove: Sequence[str] = (), **fields: Any
     ) -> int:
-        """Tell of objects added, moved or changed, and removed; the number of the message.
+        """Send objects that were added, moved or changed, and removed; the message's number.
 
         Args:
             objects: each with an id, or its label for one.
@@ -199,17 +156,16 @@ class StreamClient:
             **fields: of the scene: `relations`, `room_type`, `stamp` and so on.
 
         Raises:
-            pydantic.ValidationError: this is no message; nothing was sent.
+            pydantic.ValidationError: the message is malformed and was not sent.
             StreamClosedError: the stream has ended.
         """
         if remove:
             fields["remove"] = list(remove)
         things: list[Any] = list(objects)
-        message = Update(type="update", seq=self.seq + 1, objects=things, **fields)
-        return await self._next(message)
+        return await self._next(Update(type="update", seq=self.seq + 1, objects=things, **fields))
 
     async def replace(self, objects: Objects, **fields: Any) -> int:
-        """Tell the whole scene anew; the number of the message.
+        """Send a whole scene in place of the one before; the message's number.
 
         Raises:
             pydantic.ValidationError, StreamClosedError: see `update`.
@@ -217,28 +173,45 @@ class StreamClient:
         things: list[Any] = list(objects)
         return await self._next(Whole(type="scene", seq=self.seq + 1, objects=things, **fields))
 
-    async def get(self) -> None:
-        """Ask for whole answers."""
-        await self._send(Get(type="get"))
-
     async def ping(self) -> None:
-        """Give a sign of life, so that a quiet stream stays."""
+        """Keep a quiet stream open.
+
+        Raises:
+            StreamClosedError: the stream has ended.
+        """
         await self._send(Ping(type="ping"))
 
     async def close(self) -> None:
-        """Let the service forget the session; the iteration ends when it has."""
-        await self._send(Close(type="close"))
+        """End the stream, and with it the iteration."""
+        self._ended = self._ended or StreamClosedError(1000, "")
+        if self._connection is not None:
+            await self._connection.close()
 
     async def _next(self, message: Update | Whole) -> int:
-        await self._send(message)
+        if self._ended is not None:
+            raise self._ended
         self.seq = message.seq
+        self._unanswered[message.seq] = message
+        if not await self._send(message):
+            self._merge(message.seq)
         return message.seq
 
-    async def _send(self, message: BaseModel) -> None:
+    async def _send(self, message: BaseModel) -> bool:
+        """Send a message; False where the connection is broken."""
+        if self._ended is not None:
+            raise self._ended
+        if self._connection is None:
+            raise RuntimeError("the stream is not open: use it with `async with`")
         try:
-            await self._there.send(message.model_dump_json(exclude_unset=True))
-        except ConnectionClosed as error:
-            raise _closed(error) from None
+            await self._connection.send(_text(message))
+        except ConnectionClosed:
+            return False
+        return True
+
+    def _merge(self, seq: int) -> None:
+        """Merge messages up to a number into the kept scene."""
+        for number in [number for number in self._unanswered if number <= seq]:
+            self._scene = self._scene.after(self._unanswered.pop(number))
 
     # -- receiving ------------------------------------------------------------------------------
 
@@ -250,78 +223,104 @@ class StreamClient:
         """The next answer.
 
         Raises:
-            StreamProblemError: the service has refused a message; see there.
-            StreamClosedError: the stream has ended, and not because it was closed.
-            StopAsyncIteration: it was closed.
+            StreamProblemError: the service refused a message.
+            StreamClosedError: the service ended the stream, or cannot be reached any more.
+            ProblemError: the service refused a new connection.
+            StopAsyncIteration: the stream was closed from here.
         """
-        while True:
-            try:
-                event = await self._receive()
-            except StreamClosedError as closed:
-                if closed.code == 1000:
-                    raise StopAsyncIteration from None
-                raise
-            if isinstance(event, AnswerMessage):
-                self._apply(event)
-                return event
-
-    async def _receive(self) -> Event:
-        try:
-            value = json.loads(await self._there.recv())
-        except ConnectionClosed as error:
-            raise _closed(error) from None
-        event = EVENTS[value["type"]].model_validate(value)
-        if isinstance(event, ProblemMessage):
-            raise StreamProblemError(event)
-        return event
-
-    def _apply(self, answer: AnswerMessage) -> None:
-        if not answer.full and answer.revision != self.revision + 1:
-            raise LookupError(f"answer {answer.revision} came after {self.revision}")
-        before = {} if answer.full else self.lists
-        self.lists = applied(before, answer.changes, answer.dropped)
-        self.revision, self.model = answer.revision, answer.model
-
-    # -- the whole answers ----------------------------------------------------------------------
-
-    @property
-    def missing(self) -> list[MissingObject]:
-        """As `POST /missing` gives them, likeliest first; empty where it was not asked."""
-        return self._parsed("missing", list[MissingObject])
-
-    @property
-    def outliers(self) -> list[Outlier]:
-        """As `POST /outliers` gives them: every object, least fitting first."""
-        return self._parsed("outliers", list[Outlier])
-
-    @property
-    def misplaced(self) -> list[MisplacedRelation]:
-        """As `POST /outliers` gives them, least likely first."""
-        return self._parsed("misplaced", list[MisplacedRelation])
-
-    @property
-    def relations(self) -> list[ExpectedRelation]:
-        """As `POST /relations` gives them, best first."""
-        return self._parsed("relations", list[ExpectedRelation])
-
-    @property
-    def disagreements(self) -> list[Disagreement]:
-        """As `POST /relations` gives them, largest ratio of the probabilities first."""
-        return self._parsed("disagreements", list[Disagreement])
-
-    @property
-    def observed_relations(self) -> list[ObservedRelation]:
-        """Those that positions show; empty where there were none."""
-        return self._parsed("observed_relations", list[ObservedRelation])
-
-    def _parsed(self, name: str, kind: type[T]) -> T:
-        return TypeAdapter(kind).validate_python(self.lists.get(name, []))
-
-    @property
-    def _there(self) -> ClientConnection:
         if self._connection is None:
             raise RuntimeError("the stream is not open: use it with `async with`")
-        return self._connection
+        while True:
+            try:
+                event = _event(await self._connection.recv())
+            except ConnectionClosed as error:
+                await self._reconnect(_closed(error))
+                continue
+            if isinstance(event, ProblemMessage):
+                self._unanswered.pop(event.seq or 0, None)
+                raise StreamProblemError(event)
+            if isinstance(event, AnswerMessage):
+                self._merge(event.seq)
+                self.answer, self._lost_at, self._pause = event, None, _FIRST_PAUSE
+                return event
+
+    async def _reconnect(self, closed: StreamClosedError) -> None:
+        """Connect again and send the whole scene, with growing pauses between attempts."""
+        self._lost_at = self._lost_at or monotonic()
+        while self._ended is None:
+            late = monotonic() + self._pause > self._lost_at + self._patience
+            if late or closed.code not in _TRANSIENT:
+                self._ended = closed
+                raise closed
+            # Many robots that lose one service do not come back at once.
+            await asyncio.sleep(self._pause * random.uniform(0.5, 1.0))  # noqa: S311
+            self._pause = min(2 * self._pause, _LONGEST_PAUSE)
+            try:
+                await self._connect()
+            except (UnreachableError, StreamClosedError):
+                continue
+            except ProblemError as refused:
+                if refused.status not in {429, 503}:
+                    raise
+            else:
+                if self._ended is None:
+                    return
+                await self.close()  # it was closed meanwhile
+        if self._ended.code != 1000:
+            raise self._ended
+        raise StopAsyncIteration
+
+    async def _connect(self) -> None:
+        connection = await self._connected()
+        try:
+            await connection.send(_text(self._opening))
+            opened = _event(await connection.recv())
+            if isinstance(opened, ProblemMessage):
+                raise StreamProblemError(opened)
+            if not isinstance(opened, Opened):
+                raise TypeError(f"the stream was opened with {opened.type}")
+            sent = 0
+            while sent != self.seq:  # messages come while the scene is sent
+                sent = self.seq
+                self._merge(sent)
+                objects = list(self._scene.objects.values())
+                scene = Whole(type="scene", seq=sent, objects=objects, **self._scene.fields)
+                await connection.send(_text(scene))
+        except BaseException as error:
+            await connection.close()
+            if isinstance(error, ConnectionClosed):
+                raise _closed(error) from None
+            raise
+        self.limits = opened.limits
+        self._connection = connection
+
+    async def _connected(self) -> ClientConnection:
+        try:
+            return await connect(
+                self._address,
+                additional_headers=self._headers,
+                open_timeout=self._timeout,
+                close_timeout=self._timeout,
+                max_size=_MAX_EVENT,
+                compression=None,
+                proxy=None,
+            )
+        except InvalidStatus as refused:
+            answer = refused.response
+            headers = {name.lower(): value for name, value in answer.headers.raw_items()}
+            body = bytes(answer.body or b"")
+            raise problem_of(Received(answer.status_code, headers, body)) from None
+        except (OSError, InvalidHandshake) as error:
+            raise UnreachableError(f"no stream at {self._address}: {error}") from error
+
+
+def _text(message: BaseModel) -> str:
+    return message.model_dump_json(exclude_unset=True)
+
+
+def _event(text: str | bytes) -> Event:
+    value = json.loads(text)
+    return EVENTS[value["type"]].model_validate(value)
 
 
 def _closed(error: ConnectionClosed) -> StreamClosedError:

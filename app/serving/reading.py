@@ -227,11 +227,6 @@ class Names:
             faults.add(Reason.INVALID, location, "names no object of the scene")
         return None
 
-    def id(self, name: str) -> str | None:
-        """The id of the one object that ``name`` names, if it names one."""
-        place = self.find(name, (), Faults())
-        return None if place is None else self._objects[place].id
-
     def is_ignored(self, name: str) -> bool:
         """Whether the name belongs to an object that was left out."""
         if name in self._by_id:
@@ -259,13 +254,13 @@ def read_scene(
     return Reading(scene, given.unknown, observed, given.names, given.flipped, warnings)
 
 
-def check_scene(request: SceneRequest, vocabulary: Vocabulary, limits: Limits) -> Names:
-    """How a scene, which may be empty, names its objects: read but for what its poses show.
+def check_scene(request: SceneRequest, vocabulary: Vocabulary, limits: Limits) -> None:
+    """Check a scene, which may be empty, without deriving relations from its poses.
 
     Raises:
-        RequestError: as `read_scene`, which then reads it without fault.
+        RequestError: as `read_scene` does.
     """
-    return _given(request, vocabulary, limits, may_be_empty=True).names
+    _given(request, vocabulary, limits, may_be_empty=True)
 
 
 class _Given(NamedTuple):

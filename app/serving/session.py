@@ -16,7 +16,7 @@ from app.serving.errors import ServingError
 from app.serving.metrics import Metrics
 from app.serving.models import ServedModel, ServedModels
 from app.serving.queue import Done, Ticket
-from app.serving.reading import Limits, Names, Reading, check_scene, read_scene
+from app.serving.reading import Limits, Reading, check_scene, read_scene
 from app.serving.record import RequestRecord
 
 P = ParamSpec("P")
@@ -67,14 +67,14 @@ class Session:
         self.record.asked(model.reference)
         return model, read_scene(request, model.vocabulary, self.limits, may_be_empty=may_be_empty)
 
-    def check(self, request: SceneRequest) -> Names:
-        """How a scene, which may be empty, names its objects, once it is found to fit.
+    def check(self, request: SceneRequest) -> None:
+        """Check a scene, which may be empty, without its poses.
 
         Raises:
             UnknownModelError, ModelUnavailableError, RequestError: see `read`.
         """
         model = self.models.resolve(request.model)
-        return check_scene(request, model.vocabulary, self.limits)
+        check_scene(request, model.vocabulary, self.limits)
 
     async def ask(
         self,

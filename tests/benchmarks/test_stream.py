@@ -33,5 +33,5 @@ async def test_every_update_ping_and_request_is_counted_once(tmp_path: Path) -> 
     }
     assert min(map(min, found.seconds.values())) > 0
     assert found.answers + found.superseded == 30
-    assert 0 < found.bytes[STREAM] < found.bytes[REQUESTS]
+    assert min(found.bytes.values()) > 0
     assert found.quantile(STREAM, 0.5) <= found.quantile(STREAM, 0.99)

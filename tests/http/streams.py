@@ -33,10 +33,6 @@ def say(stream: ClientConnection, kind: str, **fields: Any) -> None:
     stream.send(json.dumps({"type": kind, **fields}))
 
 
-NOTES = {"ignored", "mapped", "warnings"}
-"""Lists of an answer that are about the scene."""
-
-
 def hear(stream: ClientConnection) -> dict[str, Any]:
     """The next message."""
     found: dict[str, Any] = json.loads(stream.recv(timeout=30))
@@ -50,14 +46,21 @@ def talk(stream: ClientConnection, kind: str, **fields: Any) -> dict[str, Any]:
 
 
 def posted(client: httpx.Client, scene: dict[str, Any], ask: dict[str, Any]) -> dict[str, Any]:
-    """The lists that one request of each kind answers with about a scene."""
-    lists: dict[str, Any] = {}
+    """The answers to one request of each kind about a scene, by question."""
+    found = {}
     for question, options in ask.items():
         response = client.post(f"/{question}", json={**scene, **options})
         assert response.status_code == 200, response.text
-        own = response.json().items()
-        lists |= {name: value for name, value in own if isinstance(value, list)}
-    return {name: own for name, own in lists.items() if name not in NOTES}
+        found[question] = {**response.json(), "request_id": ""}
+    return found
+
+
+def answered(message: dict[str, Any]) -> dict[str, Any]:
+    """The answers of a message of a stream, by question."""
+    assert message["type"] == "answer", message
+    assert "problems" not in message
+    questions = message.keys() - {"type", "seq", "superseded"}
+    return {name: {**message[name], "request_id": ""} for name in questions}
 
 
 def updates(count: int, seed: int, *, poses: bool = True) -> Iterator[tuple[dict, dict]]:

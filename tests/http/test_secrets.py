@@ -126,13 +126,12 @@ def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> N
             stream.send(key)
             hear(stream)
             talk(stream, key, seq=1)
-            talk(stream, "open", session=key, model=key)
+            talk(stream, "open", model=key)
             talk(stream, "open", **{key: key})
         talk(stream, "open", frame_id=MISTAKEN)
         for key in SECRETS:
             talk(stream, "update", seq=1, objects=[key])
             talk(stream, "update", seq=1, remove=[key])
-        talk(stream, "close")
     assert client.get("/health/live").status_code == 200
 
     log = stop(defective)

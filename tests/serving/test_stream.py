@@ -1,4 +1,4 @@
-"""What a session keeps and answers, without a connection: what requests would say of its scene."""
+"""A stream's scene and answers, without a connection: the answers of requests with that scene."""
 
 from __future__ import annotations
 
@@ -14,24 +14,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.changes import applied
-from app.messages import Ask, Open, Update, Whole
-from app.schemas import (
-    Answer,
-    Detection,
-    MissingRequest,
-    OutliersRequest,
-    RelationsRequest,
-)
+from app.messages import Open, Update, Whole
+from app.schemas import MissingRequest, OutliersRequest, RelationsRequest
 from app.serving import questions
 from app.serving.answers import written
-from app.serving.errors import RequestError, UnknownModelError
+from app.serving.errors import DeadlinePassedError, RequestError, UnknownModelError
 from app.serving.metrics import Unmeasured
 from app.serving.queue import Ticket
 from app.serving.reading import Limits
 from app.serving.runtime import Runtime
 from app.serving.session import Session
-from app.serving.stream import PARKED_BYTES, Ending, SceneState, Streams, StreamSession
+from app.serving.stream import Streams, StreamScene, TokenBucket
 from tests.http.stores import make_store
 
 ASK = {"missing": {"top_k": 4}, "outliers": {}, "relations": {"top_k": 6}}
@@ -50,32 +43,34 @@ class Service:
     def view(self) -> Session:
         return self.runtime.session("request", Ticket(monotonic() + 60))
 
-    def answer(self, session: StreamSession) -> Any:
-        message, failures = self.runner.run(session.answer(self.view()))
-        assert not failures
-        return message
+    def answer(self, scene: StreamScene) -> dict[str, Any]:
+        message, errors = self.runner.run(scene.answer(self.view()))
+        assert not errors
+        found: dict[str, Any] = json.loads(written(message))
+        return found
 
-    def take(self, session: StreamSession, **message: Any) -> None:
+    def take(self, scene: StreamScene, **message: Any) -> None:
         forms = {"open": Open, "update": Update, "scene": Whole}
         form = forms[message["type"]].model_validate(message)
-        session.take(form, self.view())
+        scene.take(form, self.view())
 
     def asked(self, objects: list[Any], **fields: Any) -> dict[str, Any]:
-        """The lists that one request of each kind answers with."""
-        lists: dict[str, Any] = {}
-        if not objects:
-            names = ("missing", "outliers", "misplaced", "relations", "disagreements")
-            return {name: [] for name in names}
-        for kind, question, own in (
-            (MissingRequest, questions.missing, ASK["missing"]),
-            (OutliersRequest, questions.outliers, ASK["outliers"]),
-            (RelationsRequest, questions.relations, ASK["relations"]),
+        """The answers to one request of each kind, by question."""
+        found: dict[str, Any] = {}
+        for kind, question in (
+            (MissingRequest, questions.missing),
+            (OutliersRequest, questions.outliers),
+            (RelationsRequest, questions.relations),
         ):
-            request = kind.model_validate({"objects": objects, **fields, **own})
+            name = question.__name__
+            request = kind.model_validate({"objects": objects, **fields, **ASK[name]})
             answer = self.runner.run(question(self.view(), request))  # type: ignore[operator]
-            lists |= json.loads(written(answer))
-        envelope = set(Answer.model_fields) - {"observed_relations"} | {"coverage", "threshold"}
-        return {name: entries for name, entries in lists.items() if name not in envelope}
+            found[name] = json.loads(written(answer))
+        return found
+
+
+def answers(message: dict[str, Any]) -> dict[str, Any]:
+    return {name: message[name] for name in ("missing", "outliers", "relations") if name in message}
 
 
 @pytest.fixture(scope="module")
@@ -108,43 +103,50 @@ STEPS = st.lists(
 
 @settings(max_examples=60)
 @given(steps=STEPS)
-def test_any_messages_come_to_what_one_request_with_the_final_scene_says(
+def test_any_messages_come_to_the_answers_of_requests_with_the_final_scene(
     service: Service, steps: list[tuple[str, Any]]
 ) -> None:
-    session = StreamSession()
-    service.take(session, type="open", ask=ASK)
+    stream = StreamScene()
+    service.take(stream, type="open", ask=ASK)
     scene: dict[str, Any] = {}
     room: dict[str, Any] = {}
-    known: dict[str, Any] = {}
-    for step, value in [*steps, ("answer", None)]:
-        seq = session.seq + 1
+    for step, value in steps:
+        seq = stream.seq + 1
         match step:
             case "set":
-                service.take(session, type="update", seq=seq, objects=value)
+                service.take(stream, type="update", seq=seq, objects=value)
                 scene |= {thing["id"]: thing for thing in value}
             case "remove":
                 there = [name for name in value if name in scene]
-                service.take(session, type="update", seq=seq, remove=there)
+                service.take(stream, type="update", seq=seq, remove=there)
                 for name in there:
                     del scene[name]
             case "room":
-                service.take(session, type="update", seq=seq, room_type=value)
+                service.take(stream, type="update", seq=seq, room_type=value)
                 room = {"room_type": value}
             case "whole":
-                service.take(session, type="scene", seq=seq, objects=value)
+                service.take(stream, type="scene", seq=seq, objects=value)
                 scene, room = {thing["id"]: thing for thing in value}, {}
             case "answer":
-                message = service.answer(session)
-                known = applied({} if message.full else known, message.changes, message.dropped)
-                assert message.seq == session.seq
-    assert known == service.asked(list(scene.values()), **room)
+                service.answer(stream)
+    message = service.answer(stream)
+    assert message["seq"] == stream.seq
+    assert stream.pending == 0
+    if scene:
+        assert answers(message) == service.asked(list(scene.values()), **room)
+    else:
+        lists = {"missing", "outliers", "misplaced", "relations", "disagreements"}
+        found = {
+            name: own[name] for own in answers(message).values() for name in lists & own.keys()
+        }
+        assert found == {name: [] for name in lists}
 
 
 def test_a_message_that_makes_no_sense_changes_nothing(service: Service) -> None:
-    session = StreamSession()
-    service.take(session, type="open")
-    service.take(session, type="update", seq=1, objects=["bed", {"id": "a", "label": "lamp"}])
-    state = session.state
+    stream = StreamScene()
+    service.take(stream, type="open")
+    service.take(stream, type="update", seq=1, objects=["bed", {"id": "a", "label": "lamp"}])
+    before = service.answer(stream)
     for message, places in (
         ({"objects": ["bad"]}, [("objects", 0)]),
         ({"objects": [{"id": "a", "label": "bad"}]}, [("objects", 0, "label")]),
@@ -167,110 +169,123 @@ def test_a_message_that_makes_no_sense_changes_nothing(service: Service) -> None
         ({"seq": 1}, [("seq",)]),
     ):
         with pytest.raises(RequestError) as refused:
-            service.take(session, **{"type": "update", "seq": 2, **message})
+            service.take(stream, **{"type": "update", "seq": 2, **message})
         assert [fault.location for fault in refused.value.faults] == places
-        assert (session.state, session.seq, session.pending) == (state, 1, 1)
+        assert (stream.seq, stream.pending) == (1, 0)
     with pytest.raises(UnknownModelError):
-        service.take(session, type="update", seq=2, model="nowhere")
-    assert session.state is state
+        service.take(stream, type="update", seq=2, model="nowhere")
+    assert service.answer(stream) == before
 
 
-def test_what_only_the_scene_holds_is_pointed_at_there(service: Service) -> None:
-    session = StreamSession()
-    service.take(session, type="open", unknown_labels="ignore")
-    service.take(session, type="update", seq=1, objects=[{"id": "a", "label": "gizmo"}, "bed"])
+def test_a_fault_of_the_kept_scene_is_located_there(service: Service) -> None:
+    stream = StreamScene()
+    service.take(stream, type="open", unknown_labels="ignore")
+    service.take(stream, type="update", seq=1, objects=[{"id": "a", "label": "gizmo"}, "bed"])
     with pytest.raises(RequestError) as refused:
-        service.take(session, type="update", seq=2, unknown_labels="error")
+        service.take(stream, type="update", seq=2, unknown_labels="error")
     (fault,) = refused.value.faults
-    assert fault.location == ("session", "objects", "a", "label")
-    message = service.answer(session)
-    assert message.ignored == ["a"]
+    assert fault.location == ("scene", "objects", "a", "label")
+    assert service.answer(stream)["missing"]["ignored"] == ["a"]
 
 
-def test_relations_are_kept_by_ids_and_go_with_their_objects(service: Service) -> None:
-    session = StreamSession()
+def test_relations_go_with_their_objects(service: Service) -> None:
+    stream = StreamScene()
     things = [{"id": "a", "label": "lamp"}, {"id": "b", "label": "desk"}, "bed"]
     stated = [
-        {"subject": "lamp", "relation": "on-top", "object": "b"},
+        {"subject": "a", "relation": "on-top", "object": "b"},
         {"subject": "bed", "relation": "left", "object": "b"},
     ]
-    service.take(session, type="open", ask=ASK)
-    service.take(session, type="update", seq=1, objects=things, relations=stated)
-    # A second lamp: the first is meant all the same.
-    service.take(session, type="update", seq=2, objects=[{"id": "c", "label": "lamp"}])
-    message = service.answer(session)
-    by_id = [{**stated[0], "subject": "a"}, stated[1]]
-    expected = service.asked([*things, {"id": "c", "label": "lamp"}], relations=by_id)
-    assert applied({}, message.changes, message.dropped) == expected
-    service.take(session, type="update", seq=3, remove=["a"])
-    message = service.answer(session)
-    expected = service.asked([things[1], "bed", {"id": "c", "label": "lamp"}], relations=by_id[1:])
-    session.start_over()
-    assert applied({}, service.answer(session).changes, ()) == expected
+    service.take(stream, type="open", ask=ASK)
+    service.take(stream, type="update", seq=1, objects=things, relations=stated)
+    assert answers(service.answer(stream)) == service.asked(things, relations=stated)
+    service.take(stream, type="update", seq=2, remove=["a"])
+    expected = service.asked(things[1:], relations=stated[1:])
+    assert answers(service.answer(stream)) == expected
 
 
-def test_poses_are_read_again_whenever_something_moves(service: Service) -> None:
+def test_relations_are_derived_again_after_each_move(service: Service) -> None:
     def lamp(height: float) -> dict[str, Any]:
         return {"id": "lamp", "label": "lamp", "position": {"x": 2.0, "y": 0.0, "z": height}}
 
     desk = {"id": "desk", "label": "desk", "position": {"x": 2.0, "y": 0.0, "z": 0.4}}
-    session = StreamSession()
-    service.take(session, type="open", ask=ASK)
-    service.take(session, type="update", seq=1, objects=[desk, lamp(1.0)])
-    lists = applied({}, service.answer(session).changes, ())
-    assert {"subject": "lamp", "relation": "on-top", "object": "desk"} in lists[
-        "observed_relations"
-    ]
-    service.take(session, type="update", seq=2, objects=[lamp(1.8)])
-    lists = applied(lists, service.answer(session).changes, ())
-    assert lists == service.asked([desk, lamp(1.8)])
-    relations = [entry["relation"] for entry in lists["observed_relations"]]
+    stream = StreamScene()
+    service.take(stream, type="open", ask=ASK)
+    service.take(stream, type="update", seq=1, objects=[desk, lamp(1.0)])
+    observed = service.answer(stream)["missing"]["observed_relations"]
+    assert {"subject": "lamp", "relation": "on-top", "object": "desk"} in observed
+    service.take(stream, type="update", seq=2, objects=[lamp(1.8)])
+    found = answers(service.answer(stream))
+    assert found == service.asked([desk, lamp(1.8)])
+    relations = [entry["relation"] for entry in found["missing"]["observed_relations"]]
     assert "above" in relations
     assert "on-top" not in relations
 
 
-def test_one_answer_covers_all_that_came_before_it(service: Service) -> None:
-    session = StreamSession()
-    service.take(session, type="open")
+def test_one_answer_covers_all_messages_before_it(service: Service) -> None:
+    stream = StreamScene()
+    service.take(stream, type="open")
     for seq in (3, 4, 9):
-        service.take(session, type="update", seq=seq, objects=["bed"])
-    message = service.answer(session)
-    assert (message.seq, message.superseded, message.revision, message.full) == (9, 2, 1, True)
-    message = service.answer(session)
-    assert (message.seq, message.superseded, message.revision, message.full) == (9, 0, 2, False)
-    assert message.changes == {}
+        service.take(stream, type="update", seq=seq, objects=["bed"])
+    message = service.answer(stream)
+    assert (message["seq"], message["superseded"]) == (9, 2)
+    message = service.answer(stream)
+    assert (message["seq"], message["superseded"]) == (9, 0)
 
 
-def test_alarms_tell_who_became_an_outlier_and_who_no_longer_is_one(service: Service) -> None:
-    session = StreamSession()
-    service.take(session, type="open", ask={"outliers": {"threshold": 0.0}})
-    service.take(session, type="update", seq=1, objects=["bed", "lamp"])
-    assert sorted(service.answer(session).alarms.raised) == ["bed", "lamp"]
-    service.take(session, type="update", seq=2, objects=["desk"], remove=["bed"])
-    alarms = service.answer(session).alarms
-    assert (alarms.raised, alarms.cleared) == (["desk"], ["bed"])
-    service.take(session, type="update", seq=3, ask={"outliers": {"threshold": 1.0}})
-    alarms = service.answer(session).alarms
-    assert (alarms.raised, sorted(alarms.cleared)) == ([], ["desk", "lamp"])
+def test_what_is_asked_holds_until_something_else_is(service: Service) -> None:
+    stream = StreamScene()
+    service.take(stream, type="open", objects=["bed"])
+    assert answers(service.answer(stream)).keys() == {"missing", "outliers"}
+    service.take(stream, type="update", seq=1, ask={"relations": {}})
+    service.take(stream, type="scene", seq=2, objects=["lamp"])
+    assert answers(service.answer(stream)).keys() == {"relations"}
+    service.take(stream, type="update", seq=3, ask=None)
+    assert answers(service.answer(stream)).keys() == {"missing", "outliers"}
 
 
 def test_a_question_that_fails_leaves_the_others_their_answers(service: Service) -> None:
-    session = StreamSession()
+    stream = StreamScene()
     ask = {"missing": {"at": {"relation": "on-top", "object": "desk"}}, "outliers": {}}
-    service.take(session, type="open", ask=ask)
-    service.take(session, type="update", seq=1, objects=["desk", "bed"])
-    lists = applied({}, service.answer(session).changes, ())
-    assert set(lists) == {"missing", "outliers", "misplaced"}
-    service.take(session, type="update", seq=2, remove=["desk"])
-    message, failures = service.runner.run(session.answer(service.view()))
-    (fault,) = failures["missing"].faults
-    assert fault.location == ("ask", "missing", "at", "object")
-    assert message.dropped == ["missing"]
-    lists = applied(lists, message.changes, message.dropped)
-    assert [entry["object"] for entry in lists["outliers"]] == ["bed"]
+    service.take(stream, type="open", ask=ask)
+    service.take(stream, type="update", seq=1, objects=["desk", "bed"])
+    assert answers(service.answer(stream)).keys() == {"missing", "outliers"}
+    service.take(stream, type="update", seq=2, remove=["desk"])
+    message, errors = service.runner.run(stream.answer(service.view()))
+    error = errors["missing"]
+    assert isinstance(error, RequestError)
+    assert error.faults[0].location == ("ask", "missing", "at", "object")
+    assert answers(message).keys() == {"outliers"}
+    assert [entry["object"] for entry in message["outliers"]["outliers"]] == ["bed"]
 
 
-def test_no_number_that_is_not_finite_is_told(
+def test_a_late_answer_covers_its_messages(service: Service) -> None:
+    stream = StreamScene()
+    service.take(stream, type="open", objects=["bed"])
+    service.take(stream, type="update", seq=1, objects=["lamp"])
+    late = service.runtime.session("request", Ticket(monotonic() - 1))
+    message, errors = service.runner.run(stream.answer(late))
+    assert message == {"type": "answer", "seq": 1, "superseded": 0}
+    assert {name: type(error) for name, error in errors.items()} == {
+        "missing": DeadlinePassedError,
+        "outliers": DeadlinePassedError,
+    }
+    assert stream.pending == 0
+
+
+def test_a_label_that_another_model_lacks_is_a_problem_of_each_question(service: Service) -> None:
+    stream = StreamScene()
+    service.take(stream, type="open", objects=[{"id": "a", "label": "lamp"}])
+    scene = stream._scene
+    stream._scene = scene.after(Update(type="update", seq=1, objects=["no such class"]))
+    message, errors = service.runner.run(stream.answer(service.view()))
+    assert answers(message) == {}
+    assert errors.keys() == {"missing", "outliers"}
+    for error in errors.values():
+        assert isinstance(error, RequestError)
+        assert error.faults[0].location == ("scene", "objects", "no such class")
+
+
+def test_an_answer_with_a_number_that_is_not_finite_is_not_written(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = questions.reasoning.outliers
@@ -280,125 +295,56 @@ def test_no_number_that_is_not_finite_is_told(
         first, *others = found.outliers
         return found._replace(outliers=(first._replace(probability=math.nan), *others))
 
-    session = StreamSession()
-    service.take(session, type="open", ask=ASK)
-    service.take(session, type="update", seq=1, objects=["desk", "bed"])
-    with monkeypatch.context() as patch:
-        patch.setattr(questions.reasoning, "outliers", broken)
-        with pytest.raises(ValueError, match="not finite"):
-            service.answer(session)
-    # In the order of the schemas, whatever the hashes of their names are.
-    lists = applied({}, service.answer(session).changes, ())
-    assert list(lists) == ["missing", "outliers", "misplaced", "relations", "disagreements"]
+    stream = StreamScene()
+    service.take(stream, type="open", objects=["desk", "bed"], ask=ASK)
+    monkeypatch.setattr(questions.reasoning, "outliers", broken)
+    with pytest.raises(ValueError, match="not finite"):
+        service.answer(stream)
 
 
-def test_another_model_starts_from_nothing(service: Service) -> None:
-    session = StreamSession()
-    service.take(session, type="open")
-    service.take(session, type="update", seq=1, objects=["bed", "lamp"])
-    service.answer(session)
-    service.take(session, type="update", seq=2, model="candidate")
-    message = service.answer(session)
-    assert message.full
-    assert message.model.version == "1.1.0"
+def test_another_model_answers_from_the_next_message_on(service: Service) -> None:
+    stream = StreamScene()
+    service.take(stream, type="open", objects=["bed", "lamp"])
+    assert service.answer(stream)["missing"]["model"]["version"] == "1.0.0"
+    service.take(stream, type="update", seq=2, model="candidate")
+    assert service.answer(stream)["missing"]["model"]["version"] == "1.1.0"
 
 
 def test_no_scene_is_larger_than_the_service_allows(tmp_path: Path) -> None:
     small = Service(make_store(tmp_path / "store"), Limits(objects=3, relations=1))
     try:
-        session = StreamSession()
-        small.take(session, type="open", objects=["bed", "lamp"])
+        stream = StreamScene()
+        small.take(stream, type="open", objects=["bed", "lamp"])
         with pytest.raises(RequestError) as refused:
-            small.take(session, type="update", seq=1, objects=["desk", "chair"])
+            small.take(stream, type="update", seq=1, objects=["desk", "chair"])
         assert refused.value.faults[0].location == ("objects",)
-        small.take(session, type="update", seq=1, objects=["desk", "chair"], remove=["bed"])
-        assert list(session.state.objects) == ["lamp", "desk", "chair"]
+        small.take(stream, type="update", seq=1, objects=["desk", "chair"], remove=["bed"])
+        outliers = small.answer(stream)["outliers"]["outliers"]
+        assert {entry["object"] for entry in outliers} == {"lamp", "desk", "chair"}
     finally:
         small.runtime.stop()
         small.runner.close()
 
 
-def test_a_scene_that_is_put_away_comes_back_the_same(service: Service) -> None:
-    session = StreamSession()
-    service.take(
-        session,
-        type="open",
-        ask={"missing": {"top_k": 3}, "relations": {}},
-        timeout_ms=500,
-        room_type="bedroom",
-        objects=["bed", {"label": "lamp", "position": {"x": 0.1, "y": 0.2, "z": 0.3}}],
-        relations=[{"subject": "lamp", "relation": "left", "object": "bed"}],
-    )
-    found = SceneState.load(session.state.dump())
-    assert found == session.state
-    assert found.ask.missing is not None
-    assert found.ask.missing.model_fields_set == {"top_k"}
-    assert isinstance(found.ask, Ask)
+def test_a_rate_limit_lets_bursts_pass_and_slows_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+    monkeypatch.setattr("app.serving.stream.monotonic", lambda: now)
+    bucket = TokenBucket(rate=10, burst=3)
+    assert [bucket.take() for _ in range(5)] == pytest.approx([0, 0, 0, 0.1, 0.2])
+    now += 0.25
+    assert bucket.take() == pytest.approx(0.05)
+    now += 60
+    assert [bucket.take() for _ in range(4)] == pytest.approx([0, 0, 0, 0.1])
 
 
-def ends() -> tuple[list[Ending], Any]:
-    said: list[Ending] = []
-    return said, said.append
-
-
-def test_sessions_are_kept_for_a_while_and_only_so_many(service: Service) -> None:
-    async def run() -> None:
-        streams = Streams(2, 0.2, Unmeasured())
-        sessions = [StreamSession() for _ in range(3)]
-        for session in sessions:
-            _, end = ends()
-            streams.bind(session, end)
-            streams.part(session, end, keep=True)
-        # The oldest made room.
-        assert list(streams.parked) == [session.id for session in sessions[1:]]
-        assert streams.find(sessions[0].id) is None
-        found = streams.find(sessions[2].id)
-        assert found is not None
-        streams.bind(found, ends()[1])
-        assert list(streams.parked) == [sessions[1].id]
-        await asyncio.sleep(0.4)
-        assert streams.parked == {}
-        assert streams.find(sessions[1].id) is None
-
-    service.runner.run(run())
-
-
-def test_sessions_that_are_kept_take_only_so_much_memory(service: Service) -> None:
-    async def run() -> None:
-        streams = Streams(1000, 60, Unmeasured())
-        # Of the largest scenes there are: some hundred kilobytes each.
-        text = "x" * 100
-        relation = [
-            {"subject": f"{k}{text}"[:100], "relation": "left", "object": f"{k + 1}{text}"[:100]}
-            for k in range(250)
-        ]
-        message = Whole.model_validate({"type": "scene", "seq": 1, "relations": relation * 10})
-        things = {
-            f"{k}{text}"[:100]: Detection(id=f"{k}{text}"[:100], label="bed") for k in range(256)
-        }
-        for _ in range(100):
-            session = StreamSession()
-            session.state = SceneState(things, {"relations": message.relations})
-            streams.bind(session, print)
-            streams.part(session, print, keep=True)
-            assert sum(streams.parked.values()) <= PARKED_BYTES
-        assert 2 < len(streams.parked) < 100
-
-    service.runner.run(run())
-
-
-def test_a_session_has_one_stream(service: Service) -> None:
-    async def run() -> None:
-        streams = Streams(2, 60, Unmeasured())
-        session = StreamSession()
-        (said, end), (_, other) = ends(), ends()
-        streams.bind(session, end)
-        assert streams.find(session.id) is session
-        streams.bind(session, other)
-        assert said == [Ending.REPLACED]
-        streams.part(session, end, keep=False)
-        assert streams.find(session.id) is session
-        streams.part(session, other, keep=False)
-        assert streams.find(session.id) is None
-
-    service.runner.run(run())
+def test_places_are_counted_and_drained_once() -> None:
+    streams = Streams(2, Unmeasured())
+    ended: list[str] = []
+    with streams.place(lambda: ended.append("first")):
+        assert not streams.is_full
+        with streams.place(lambda: ended.append("second")):
+            assert streams.is_full
+            streams.drain()
+            streams.drain()
+    assert sorted(ended) == ["first", "second"]
+    assert not streams.is_full
