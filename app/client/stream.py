@@ -263,9 +263,7 @@ class StreamClient:
                 if refused.status not in {429, 503}:
                     raise
             else:
-                if self._ended is None:
-                    return
-                await self.close()  # it was closed meanwhile
+                return
         if self._ended.code != 1000:
             raise self._ended
         raise StopAsyncIteration
@@ -293,6 +291,8 @@ class StreamClient:
             raise
         self.limits = opened.limits
         self._connection = connection
+        if self._ended is not None:  # closed meanwhile
+            await connection.close()
 
     async def _connected(self) -> ClientConnection:
         try:

@@ -172,18 +172,18 @@ async def _answers(
 
 
 class TokenBucket:
-    """A rate limit: ``burst`` messages at once, then ``rate`` a second."""
+    """A rate limit: ``burst`` tokens at once, then ``rate`` a second."""
 
-    def __init__(self, rate: float, burst: int) -> None:
+    def __init__(self, rate: float, burst: float) -> None:
         self._rate = rate
         self._burst = burst
-        self._tokens = float(burst)
+        self._tokens = burst
         self._at = monotonic()
 
-    def take(self) -> float:
-        """Take a token; the seconds to wait until there is one."""
+    def take(self, count: float) -> float:
+        """Take tokens; the seconds to wait until they are there."""
         now = monotonic()
-        self._tokens = min(self._burst, self._tokens + (now - self._at) * self._rate) - 1
+        self._tokens = min(self._burst, self._tokens + (now - self._at) * self._rate) - count
         self._at = now
         return max(0.0, -self._tokens / self._rate)
 

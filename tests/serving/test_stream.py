@@ -330,11 +330,12 @@ def test_a_rate_limit_lets_bursts_pass_and_slows_the_rest(monkeypatch: pytest.Mo
     now = 1000.0
     monkeypatch.setattr("app.serving.stream.monotonic", lambda: now)
     bucket = TokenBucket(rate=10, burst=3)
-    assert [bucket.take() for _ in range(5)] == pytest.approx([0, 0, 0, 0.1, 0.2])
+    assert [bucket.take(1) for _ in range(5)] == pytest.approx([0, 0, 0, 0.1, 0.2])
     now += 0.25
-    assert bucket.take() == pytest.approx(0.05)
+    assert bucket.take(0.5) == pytest.approx(0)
+    assert bucket.take(0.5) == pytest.approx(0.05)
     now += 60
-    assert [bucket.take() for _ in range(4)] == pytest.approx([0, 0, 0, 0.1])
+    assert [bucket.take(1) for _ in range(4)] == pytest.approx([0, 0, 0, 0.1])
 
 
 def test_places_are_counted_and_drained_once() -> None:
