@@ -28,7 +28,7 @@ from app.serving.metrics import Metrics
 from app.serving.reading import Faults
 from app.serving.session import Session
 
-# Fields of a message that are no part of the scene.
+# Fields of a message beside the scene.
 _NOT_REQUESTED: Final = frozenset({"ask", "timeout_ms"})
 _DEFAULT_ASK: Final = Ask(missing=MissingOptions(), outliers=OutliersOptions())
 _FORMS: Final[dict[str, type[SceneRequest]]] = {
