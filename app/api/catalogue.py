@@ -218,13 +218,6 @@ TOO_MANY_STREAMS: Final = ProblemType(
     "The process has as many streams as SCENE_MAX_STREAMS allows. Retry-After says when to ask "
     "again; POST answers meanwhile.",
 )
-STREAM_IDLE: Final = ProblemType(
-    "stream-idle",
-    408,
-    "The stream was silent for too long",
-    "A stream is opened by a message within SCENE_CLIENT_TIMEOUT seconds, and then has another at "
-    "least every SCENE_STREAM_IDLE seconds; a ping will do.",
-)
 
 PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
     kind.slug: kind
@@ -256,6 +249,5 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         DEADLINE_PASSED,
         UPGRADE_REQUIRED,
         TOO_MANY_STREAMS,
-        STREAM_IDLE,
     )
 }

@@ -149,7 +149,7 @@ class _Conversation:
                 async with asyncio.timeout(patience):
                     event = await self._socket.receive()
             except TimeoutError:
-                return 1008, catalogue.STREAM_IDLE.slug
+                return 1008, "stream-idle"
             if event["type"] == "websocket.disconnect":
                 self._counts["close_code"] = event["code"]
                 return None

@@ -61,7 +61,7 @@ class StreamClosedError(ClientError):
 
     Attributes:
         code: of the close (RFC 6455, section 7.4); 1006 where the connection broke.
-        reason: the last part of a problem's type, where the service gave one.
+        reason: a word, where the service gave one: `draining`, `stream-idle`.
     """
 
     def __init__(self, code: int, reason: str) -> None:
