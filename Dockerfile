@@ -43,7 +43,8 @@ COPY app ./app
 # Owned by the service, which moves aliases; publishing adds versions beside those shipped.
 COPY --chown=10001:10001 model_store ./model_store
 # Compiled for the CPU that builds the image; on another kind the first start compiles anew.
-RUN NUMBA_CACHE_DIR=compiled python -m app.compile
+# The folder is private to its owner, here root; the service copies it.
+RUN NUMBA_CACHE_DIR=compiled python -m app.compile && chmod -R a+rX compiled
 ENV HOME=/tmp \
     NUMBA_CACHE_DIR=/tmp/compiled \
     SCENE_HOST=0.0.0.0 \

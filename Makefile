@@ -69,7 +69,7 @@ lock: $(BIN)/python  ## resolve pyproject.toml anew into requirements*.lock
 	$(BIN)/python scripts/lock.py $(INDEX) $(ARGS)
 
 clean:  ## remove the environment and every cache
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .numba_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SERVICE): requirements.lock pyproject.toml | $(BIN)/python

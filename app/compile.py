@@ -1,7 +1,7 @@
 """``python -m app.compile``: compile loops for this machine, and sources, before they are run.
 
-The service does so by itself where it finds nothing compiled, and starts a minute or so later;
-where it must not write, at every start.
+The service compiles by itself where it finds nothing compiled, and starts a minute or so later;
+where it cannot keep the result, it does so at every start.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ from __future__ import annotations
 import asyncio
 import compileall
 import sys
+from logging.config import dictConfig
 from pathlib import Path
 
+from app.serving.logs import log_config
 from app.serving.metrics import Unmeasured
 from app.serving.reading import Limits
 from app.serving.runtime import Runtime
@@ -24,14 +26,13 @@ def main() -> int:
         The exit status: 1 where one of them cannot be used.
     """
     settings = Settings()
+    dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))
     runtime = Runtime(settings.store, Limits(), settings.queue_rows, Unmeasured(), poll=0)
     asyncio.run(runtime.start())
     runtime.stop()
     compileall.compile_dir(Path(__file__).parent, quiet=1)
-    failures = runtime.models.failures
-    for failure in failures.values():
-        sys.stderr.write(f"{failure.subject}: {failure.reason}: {failure.detail}\n")
-    return 1 if failures else 0
+    # The runtime has logged each of them.
+    return 1 if runtime.models.failures else 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Compiled loops between processes: what was loaded from disk is packed, and is of use still."""
+"""Compiled loops between processes: never those of other sources, and in a folder of our own."""
 
 from __future__ import annotations
 
@@ -9,74 +9,218 @@ import sys
 from pathlib import Path
 from typing import Any
 
-LOOPS = """
+import pytest
+
+from app import loop_cache
+
+# A package with loops whose results depend on other files in every way that there is.
+FILES = {
+    "__init__": "",
+    "numbers": "WEIGHT = 2.0\n",
+    "tuples": """
+from typing import NamedTuple
+class Pair(NamedTuple):
+    a: float
+    b: float
+""",
+    "helper": """
+from app.compiling import compiled, inlined
+@compiled
+def called(x):
+    return x + 1.0
+@inlined
+def pasted(x):
+    return x * 3.0
+""",
+    "kernel": """
 from app.compiling import compiled
-
+from app.helper import called, pasted
+from app.numbers import WEIGHT
 @compiled
-def inner(x):
-    total = 0.0
-    for value in x:
-        total += value**1.5
-    return total
-
-@compiled
-def outer(x):
-    return inner(x) + 1.0
-"""
-
-PROGRAM = """
-import json
-import numpy as np
-from app.compiling import compiled, pack
-from loops import inner, outer
-
-x = np.full(3, 4.0)
-found = [inner(x), outer(x)]
-libraries = [loop.overloads[loop.signatures[0]].library for loop in (inner, outer)]
-unpacked = [library._shared_module is not None for library in libraries]
-pack()
-pack()
-packed = [library._shared_module is None for library in libraries]
-
-@compiled
-def both(x):
-    return inner(x) + 10.0 * outer(x)
-
-found.append(both(x))
-found.append(inner(x.astype(np.float32)))
-hits = [sum(loop.stats.cache_hits.values()) for loop in (inner, outer)]
-print(json.dumps({"found": found, "hits": hits, "unpacked": unpacked, "packed": packed}))
-"""
+def loop(x, pair):
+    return called(x) + 100.0 * pasted(x) + 10000.0 * WEIGHT * x + 1000000.0 * pair.a
+""",
+    "other": "UNUSED = 1\n",
+    "program": """
+import json, logging, sys
+from app import compiling
+from app.helper import called
+from app.kernel import loop
+from app.tuples import Pair
+logging.basicConfig(format="%(message)s", level="INFO")
+compiling.check_cache()
+with compiling.progress():
+    result = loop(1.0, Pair(a=1.0, b=2.0))
+compiled = [sum(one.stats.cache_misses.values()) for one in (loop, called)]
+print(json.dumps({"result": result, "compiled": compiled, "path": loop.stats.cache_path}))
+""",
+}
+EXPECTED = 1_020_302.0
 
 
-def run(folder: Path) -> Any:
+@pytest.fixture
+def package(tmp_path: Path, repository: Path) -> Path:
+    """The package `app` in a folder of its own, with the real compiling and little else."""
+    folder = tmp_path / "service" / "app"
+    folder.mkdir(parents=True)
+    for name, text in FILES.items():
+        (folder / f"{name}.py").write_text(text)
+    for name in ("compiling", "loop_cache"):
+        (folder / f"{name}.py").write_text((repository / "app" / f"{name}.py").read_text())
+    return folder
+
+
+def begin(package: Path, **variables: str) -> subprocess.Popen[str]:
     environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(Path.cwd()), str(folder)]),
-        "NUMBA_CACHE_DIR": str(folder / "cache"),
+        name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")
     }
-    # A file, since numba keeps nothing of functions that have none.
-    done = subprocess.run(
-        [sys.executable, folder / "program.py"],
+    home = package.parent.parent / "home"
+    environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), **variables}
+    return subprocess.Popen(
+        [sys.executable, "-m", "app.program"],
+        cwd=package.parent,
         env=environment,
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        check=True,
-        timeout=120,
     )
-    return json.loads(done.stdout)
 
 
-def test_what_was_loaded_is_packed_and_can_still_be_part_of_other_loops(tmp_path: Path) -> None:
-    (tmp_path / "loops.py").write_text(LOOPS)
-    (tmp_path / "program.py").write_text(PROGRAM)
-    expected = [24.0, 25.0, 274.0, 24.0]
-    first = run(tmp_path)
-    assert first["found"] == expected
-    assert first["hits"] == [0, 0]
-    second = run(tmp_path)
-    assert second["found"] == expected
-    assert second["hits"][1] == 1
-    # Else there is nothing to pack any more, and nothing shows that packing does no harm.
-    assert second["unpacked"] == [True, True]
-    assert second["packed"] == [True, True]
+def end(process: subprocess.Popen[str]) -> tuple[Any, str]:
+    """The program's answer, and its log."""
+    output, log = process.communicate(timeout=120)
+    assert process.returncode == 0, log
+    return json.loads(output), log
+
+
+def start(package: Path, **variables: str) -> tuple[Any, str]:
+    return end(begin(package, **variables))
+
+
+def test_a_second_start_compiles_nothing(package: Path) -> None:
+    answer, log = start(package)
+    assert (answer["result"], answer["compiled"]) == (EXPECTED, [1, 1])
+    assert "compiling loop 1 of 2" in log
+    (folder,) = (package.parent / ".numba_cache").glob("loops-*")
+    assert Path(answer["path"]).is_relative_to(folder)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert folder.parent.stat().st_mode & 0o777 == 0o700
+    assert not list(package.rglob("*.nbi"))
+
+    answer, log = start(package)
+    assert (answer["result"], answer["compiled"]) == (EXPECTED, [0, 0])
+    assert log == ""
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "expected"),
+    [
+        ("helper", "x + 1.0", "x + 2.0", EXPECTED + 1),
+        ("helper", "x * 3.0", "x * 4.0", EXPECTED + 100),
+        ("numbers", "2.0", "3.0", EXPECTED + 10_000),
+        ("tuples", "a: float\n    b: float", "b: float\n    a: float", EXPECTED),
+    ],
+)
+def test_a_change_of_another_file_is_compiled_in(
+    package: Path, file: str, old: str, new: str, expected: float
+) -> None:
+    start(package)
+    path = package / f"{file}.py"
+    path.write_text(path.read_text().replace(old, new))
+    answer, _ = start(package)
+    assert (answer["result"], answer["compiled"]) == (expected, [1, 1])
+
+
+def test_a_change_that_no_loop_can_see_compiles_nothing(package: Path) -> None:
+    start(package)
+    (package / "other.py").write_text("UNUSED = 2\n")
+    assert start(package)[0]["compiled"] == [0, 0]
+
+
+def test_the_operator_chooses_the_root(package: Path, tmp_path: Path) -> None:
+    answer, _ = start(package, NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
+    assert Path(answer["path"]).is_relative_to(tmp_path / "chosen")
+    assert not (package.parent / ".numba_cache").exists()
+    # A child process with the same variable finds the same folder.
+    answer, _ = start(package, NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
+    assert answer["compiled"] == [0, 0]
+
+
+def test_a_folder_that_others_can_change_is_refused(package: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    start(package, NUMBA_CACHE_DIR=str(root))
+    (folder,) = root.glob("loops-*")
+    folder.chmod(0o777)
+    answer, log = start(package, NUMBA_CACHE_DIR=str(root))
+    assert (answer["result"], answer["compiled"], answer["path"]) == (EXPECTED, [1, 1], None)
+    assert f"other users can write to {folder}" in log
+    folder.chmod(0o700)
+    root.chmod(0o777)
+    assert "other users can write to" in start(package, NUMBA_CACHE_DIR=str(root))[1]
+    root.chmod(0o1777)
+    assert "other users" not in start(package, NUMBA_CACHE_DIR=str(root))[1]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
+def test_a_folder_of_another_user_is_refused(package: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    start(package, NUMBA_CACHE_DIR=str(root))
+    (folder,) = root.glob("loops-*")
+    os.chown(folder, 10001, 10001)
+    answer, log = start(package, NUMBA_CACHE_DIR=str(root))
+    assert (answer["result"], answer["path"]) == (EXPECTED, None)
+    assert f"{folder} belongs to another user" in log
+
+
+def test_without_a_folder_beside_the_package_the_users_own_is_used(
+    package: Path, tmp_path: Path
+) -> None:
+    (package.parent / ".numba_cache").write_text("in the way")
+    answer, log = start(package)
+    assert Path(answer["path"]).is_relative_to(tmp_path / "home" / "cache" / "scene-boltzmann")
+    assert "compiled loops are kept in" in log
+
+
+def test_only_old_folders_of_ours_are_removed(package: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    old = [root / f"loops-{number:016x}" for number in range(5)]
+    foreign = [root / "app_0123", root / "loops-mine", root / "loops-0123456789abcdefg"]
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "kept").touch()
+    (root / f"loops-{9:016x}").symlink_to(elsewhere)
+    for age, folder in enumerate([*old, *foreign]):
+        folder.mkdir()
+        (folder / "file").touch()
+        os.utime(folder, (1000 - age, 1000 - age))
+    recent = root / f"loops-{8:016x}"
+    recent.mkdir()
+    start(package, NUMBA_CACHE_DIR=str(root))
+    # The two newest others stay: the recent one, and one of the old.
+    assert [folder.exists() for folder in (recent, *old)] == [True, True, *[False] * 4]
+    assert all((folder / "file").exists() for folder in foreign)
+    assert (elsewhere / "kept").exists()
+
+
+def test_two_that_start_at_once_compile_once(package: Path) -> None:
+    both = [begin(package), begin(package)]
+    answers, logs = zip(*map(end, both), strict=True)
+    assert [answer["result"] for answer in answers] == [EXPECTED, EXPECTED]
+    # The second has begun its first loop by the time it waits; it loads all others.
+    assert sum(answer["compiled"][1] for answer in answers) == 1, logs
+    assert start(package)[0]["compiled"] == [0, 0]
+
+
+def test_the_digest_holds_every_file_that_is_compiled_in(repository: Path) -> None:
+    found = loop_cache.sources(repository / "app").keys()
+    assert {
+        "app.compiling",
+        "app.boltzmann.elementary",
+        "app.boltzmann.closed_form",  # named tuples of weights
+        "app.boltzmann.scene_chains",
+        "app.scene.footprints",
+        "app.scene.relations",  # numbers of relations
+        "app.serving.answers",
+    } <= found
+    assert not {"app.main", "app.schemas", "app.serving.runtime", "app.settings"} & found

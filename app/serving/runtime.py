@@ -12,7 +12,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 
-from app.compiling import pack
+from app.compiling import check_cache, progress
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 from app.serving.errors import (
@@ -163,6 +163,7 @@ class Runtime:
         """Load, verify and warm everything in the store; `models` tells what is wrong."""
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
+        check_cache()
         # Nobody waits yet, and a thread of its own costs time and memory.
         self._serve(self._load(None))
         for failure in self.models.failures.values():
@@ -285,7 +286,8 @@ class Runtime:
         # Before anything is read: what changes meanwhile is seen by the next look.
         self._seen = self._store.state()
         known = None if previous is None else previous.store
-        return prepare(load_model_set(self._store, known), self._new_queue, previous)
+        with progress():
+            return prepare(load_model_set(self._store, known), self._new_queue, previous)
 
     def _new_queue(self) -> WorkQueue:
         return WorkQueue(self._queue_rows, self._threads)
@@ -342,7 +344,6 @@ def _settle_memory() -> None:
     collector sits out, there is none. Pages that loading has left empty go back to the system,
     where the C library can do that: some 30 MB.
     """
-    pack()
     gc.unfreeze()
     if gc.isenabled():
         gc.collect()

@@ -141,6 +141,8 @@ def test_a_service_that_would_fail_in_a_container_fails_here(
         ("app/main.py", False),
         ("app/deep/er/x.py", False),
         ("app/deep/__pycache__/x.cpython-311.pyc", True),
+        ("app/.numba_cache/loops-0123456789abcdef/app/x.nbc", True),
+        (".numba_cache/loops-0123456789abcdef/app/x.nbc", True),
         ("application/main.py", True),
         (".git/config", True),
         ("requirements.lock", False),
