@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
+import socket
 import sys
 from contextlib import suppress
+from time import monotonic
 
 from pydantic import ValidationError
 
@@ -18,6 +21,7 @@ def main() -> int:
     Returns:
         The exit status: 2 where the settings make no sense.
     """
+    began = monotonic()
     try:
         settings = Settings()
     except ValidationError as error:
@@ -25,7 +29,7 @@ def main() -> int:
             variable = "SCENE_" + "_".join(str(part) for part in fault["loc"]).upper()
             sys.stderr.write(f"{variable}: {fault['msg'].removeprefix('Value error, ')}\n")
         return 2
-    return serve(settings)
+    return serve(settings, began)
 
 
 # Containers made until the collector looks at the youngest. An answer is some two hundred, all of
@@ -48,12 +52,59 @@ def _give_back_what_is_large() -> None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
 
 
-def serve(settings: Settings) -> int:
+def _bind(host: str, port: int) -> list[socket.socket]:
+    """Sockets for all addresses of a host; a connection is refused until the server listens.
+
+    Raises:
+        OSError: the host has no usable address, or the port is not free.
+    """
+    bound: list[socket.socket] = []
+    problem: OSError | None = None
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    for family, kind, protocol, _, address in dict.fromkeys(found):
+        try:
+            place = socket.socket(family, kind, protocol)
+            place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if family == socket.AF_INET6:
+                place.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            place.bind(address)
+        except OSError as error:
+            # A name such as localhost may have an address of a kind that the machine lacks.
+            if error.errno not in {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT}:
+                raise
+            problem = error
+        else:
+            bound.append(place)
+    if problem is not None and not bound:
+        raise problem
+    return bound
+
+
+def _refuse_address(settings: Settings, error: OSError) -> int:
+    """Say why the service cannot listen where it should; the exit status."""
+    place = f"{settings.host}:{settings.port}"
+    if error.errno == errno.EADDRINUSE:
+        reason = f"SCENE_PORT: {place} is in use by another program; set SCENE_PORT to a free one"
+    else:
+        variable = "SCENE_PORT" if error.errno == errno.EACCES else "SCENE_HOST"
+        reason = f"{variable}: the service cannot listen on {place}: {error.strerror or error}"
+    sys.stderr.write(f"{reason}\n")
+    return 3
+
+
+def serve(settings: Settings, began: float) -> int:
     """Serve from this process until it is stopped.
+
+    Args:
+        began: `time.monotonic()` when the start began.
 
     Returns:
         The exit status: not 0 where the service did not start.
     """
+    try:
+        sockets = _bind(settings.host, settings.port)
+    except OSError as error:
+        return _refuse_address(settings, error)
     # What starting makes stays: looking through it for garbage takes a fifth of the time. The
     # runtime turns the collector on again when it serves.
     gc.disable()
@@ -61,10 +112,16 @@ def serve(settings: Settings) -> int:
     _give_back_what_is_large()
     from app.server import build
 
-    server = build(settings)
+    server = build(settings, began)
     # Ctrl-C has ended the server in order by the time it comes up here.
     with suppress(KeyboardInterrupt):
-        server.run()
+        try:
+            server.run(sockets)
+        except OSError as error:
+            # Two services that start at once can both bind; one of them listens first.
+            if server.started or error.errno != errno.EADDRINUSE:
+                raise
+            return _refuse_address(settings, error)
     return 0 if server.started else 3
 
 

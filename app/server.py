@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import logging
+import os
 import signal
+from socket import SO_ACCEPTCONN, SOL_SOCKET, socket
 from time import monotonic
 from types import FrameType
 
@@ -10,10 +14,13 @@ import uvicorn
 
 from app.api import connections, sockets
 from app.main import create_app
+from app.serving.errors import ServingError
 from app.serving.logs import log_config
 from app.serving.runtime import Runtime
 from app.serving.stream import Streams
 from app.settings import Settings
+
+_logger = logging.getLogger("app.server")
 
 
 class Server(uvicorn.Server):
@@ -22,16 +29,55 @@ class Server(uvicorn.Server):
     At once nothing new is taken, readiness says so, and streams take their leave; after
     ``drain_seconds``, in which a load balancer may notice, the listening socket is closed; then
     what is under way is finished. A second signal, or Ctrl-C, leaves the first step out.
+
+    Args:
+        began: `time.monotonic()` when the start began.
     """
 
     def __init__(
-        self, config: uvicorn.Config, runtime: Runtime, streams: Streams, drain_seconds: float
+        self,
+        config: uvicorn.Config,
+        runtime: Runtime,
+        streams: Streams,
+        drain_seconds: float,
+        began: float,
     ) -> None:
         super().__init__(config)
         self._runtime = runtime
         self._streams = streams
         self._drain_seconds = drain_seconds
         self._closing_at: float | None = None
+        self._began = began
+
+    async def startup(self, sockets: list[socket] | None = None) -> None:
+        """Load the models, accept connections from then on, and say where.
+
+        Raises:
+            OSError: another program began to listen on the same port in the meantime.
+        """
+        try:
+            await super().startup(sockets)
+            # uvloop does not report that a socket cannot listen.
+            if not all(map(_listens, sockets or [])):
+                raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE))
+        except OSError:
+            self.started = False
+            await self.lifespan.shutdown()
+            raise
+        self._log_addresses(sockets or [])
+
+    def _log_addresses(self, sockets: list[socket]) -> None:
+        places = [place.getsockname() for place in sockets]
+        pages = ", ".join(_page(host, port) for host, port, *_ in places)
+        count = len(self._runtime.models.served)
+        models = "1 model" if count == 1 else f"{count} models"
+        details = f"{pages} ({models}, {monotonic() - self._began:.1f} s)"
+        try:
+            self._runtime.check_ready()
+        except ServingError as error:
+            _logger.warning("not ready: %s: %s", details, error)
+        else:
+            _logger.info("ready: %s", details)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Uvicorn's handler of signals."""
@@ -53,8 +99,25 @@ class Server(uvicorn.Server):
         return await super().on_tick(counter)
 
 
-def build(settings: Settings) -> Server:
-    """The service behind a server of its own, not started yet."""
+def _listens(place: socket) -> bool:
+    try:
+        return place.getsockopt(SOL_SOCKET, SO_ACCEPTCONN) == 1
+    except OSError:  # closed
+        return False
+
+
+def _page(host: str, port: int) -> str:
+    """The address of the page, as a browser on the same machine takes it."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 # compared only
+    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+
+
+def build(settings: Settings, began: float) -> Server:
+    """The service behind a server of its own, not started yet.
+
+    Args:
+        began: `time.monotonic()` when the start began.
+    """
     app = create_app(settings)
     config = uvicorn.Config(
         app,
@@ -71,4 +134,4 @@ def build(settings: Settings) -> Server:
         server_header=False,
         timeout_graceful_shutdown=settings.drain_timeout,
     )
-    return Server(config, app.state.runtime, app.state.streams, settings.drain_seconds)
+    return Server(config, app.state.runtime, app.state.streams, settings.drain_seconds, began)

@@ -73,6 +73,20 @@ class LiveService:
     log: Path
 
 
+def begin(
+    store: Path, log: Path, *, program: tuple[str, ...] = ("-m", "app"), **variables: str
+) -> subprocess.Popen[str]:
+    """Start ``python -m app`` (or another program) and do not wait for it."""
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
+    }
+    environment |= {"SCENE_STORE": str(store), "SCENE_ADMIN_KEY": ADMIN_KEY, **variables}
+    with log.open("w") as stream:
+        return subprocess.Popen(
+            [sys.executable, *program], env=environment, stderr=stream, text=True
+        )
+
+
 def launch(
     store: Path,
     log: Path,
@@ -89,19 +103,7 @@ def launch(
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
-    environment = {
-        name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
-    }
-    environment |= {
-        "SCENE_STORE": str(store),
-        "SCENE_PORT": str(port),
-        "SCENE_ADMIN_KEY": ADMIN_KEY,
-        **variables,
-    }
-    with log.open("w") as stream:
-        process = subprocess.Popen(
-            [sys.executable, *program], env=environment, stderr=stream, text=True
-        )
+    process = begin(store, log, program=program, **{"SCENE_PORT": str(port), **variables})
     client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30)
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
