@@ -216,9 +216,9 @@ def test_the_digest_holds_every_file_that_is_compiled_in(repository: Path) -> No
     found = loop_cache.sources(repository / "app").keys()
     assert {
         "app.compiling",
-        "app.boltzmann.elementary",
-        "app.boltzmann.closed_form",  # named tuples of weights
-        "app.boltzmann.scene_chains",
+        "app.inference.elementary",
+        "app.inference.shared_relations",  # named tuples of weights
+        "app.inference.scene_chains",
         "app.scene.footprints",
         "app.scene.relations",  # numbers of relations
         "app.serving.answers",

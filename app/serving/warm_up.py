@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from app import reasoning
-from app.boltzmann import completions  # noqa: F401 # else its loops are declared after the first
 from app.registry import Artifact
 from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
