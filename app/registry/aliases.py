@@ -16,6 +16,8 @@ from app.registry.durable import replace_file
 from app.registry.errors import StoreError, cause
 from app.registry.references import AliasTarget, ModelName
 
+MAX_ALIASES_BYTES: Final = 256 * 2**10
+
 _TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
 
 
@@ -28,7 +30,12 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(descriptor, "rb") as file:
-            return _TABLE.validate_json(file.read())
+            text = file.read(MAX_ALIASES_BYTES + 1)
+        if len(text) > MAX_ALIASES_BYTES:
+            raise StoreError(
+                "invalid_aliases", f"{path.name} has more than {MAX_ALIASES_BYTES} bytes"
+            )
+        return _TABLE.validate_json(text)
     except FileNotFoundError:
         return {}
     except OSError as error:

@@ -26,7 +26,7 @@ from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
 from app.registry.offsets import PREFIX, Offsets
 from app.registry.slopes import RelationSlopes
 from app.registry.tensors import StorageDtype, pack, require_equal, unpack
-from app.registry.verified import read_verified
+from app.registry.verified import MAX_WEIGHTS_BYTES, read_verified
 from app.scene.scene import Scene
 from app.scene.vocabulary import Vocabulary
 
@@ -141,18 +141,23 @@ def write_artifact(
     return manifest
 
 
-def load_artifact(directory: Path, previous: Artifact | None = None) -> Artifact:
+def load_artifact(
+    directory: Path,
+    previous: Artifact | None = None,
+    max_weights_bytes: int = MAX_WEIGHTS_BYTES,
+) -> Artifact:
     """Read and verify an artifact.
 
     Args:
         directory: holds the three files and nothing else.
         previous: an artifact loaded before. The files are verified all the same, but where their
             digest is unchanged, `previous` itself is returned instead of a second copy.
+        max_weights_bytes: a larger weights file is refused before it is read.
 
     Raises:
         ArtifactError: with the code and reason of the first thing found wrong.
     """
-    files = read_verified(directory)
+    files = read_verified(directory, max_weights_bytes)
     if previous is not None and previous.digest == files.digest:
         return previous
     manifest = files.manifest

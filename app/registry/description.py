@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from pydantic import (
     AwareDatetime,
     BaseModel,
     ConfigDict,
+    FailFast,
     Field,
     JsonValue,
     StringConstraints,
@@ -29,9 +30,16 @@ Text = Annotated[str, StringConstraints(min_length=1)]
 Count = Annotated[int, Field(ge=0)]
 Floats = NDArray[np.floating[Any]]
 
+ItemT = TypeVar("ItemT")
+Many = Annotated[tuple[ItemT, ...], FailFast()]
+"""Validation stops at the first invalid item: errors of a million take gigabytes."""
+
 
 def _in_utc(moment: datetime) -> datetime:
-    return moment.astimezone(UTC)
+    try:
+        return moment.astimezone(UTC)
+    except OverflowError:
+        raise ValueError("must lie in the years 1 to 9999 in UTC too") from None
 
 
 Timestamp = Annotated[AwareDatetime, AfterValidator(_in_utc)]
@@ -73,7 +81,10 @@ class PairSlope(CountSlope):
     """
 
     log_classes: float = 0.0
-    bends: tuple[tuple[float, float], ...] = ()
+    bends: Many[tuple[float, float]] = ()
+
+
+PairSlopes = Annotated[Many[PairSlope], Field(max_length=len(CANONICAL))]
 
 
 class Slope(Frozen):
@@ -146,18 +157,18 @@ class Calibration(Frozen):
     coverage_weight: Annotated[float, Field(ge=0, le=1)] = 0.5
     missing: CountSlope = CountSlope()
     evidence: EvidenceWeights = EvidenceWeights()
-    popularity: tuple[float, ...] = ()
+    popularity: Many[float] = ()
     popularity_weight: Annotated[float, Field(ge=0, le=1)] = 0.0
     outlier_thresholds: Thresholds = Thresholds()
-    short_list_thresholds: tuple[Thresholds, ...] = ()
+    short_list_thresholds: Annotated[Many[Thresholds], Field(max_length=256)] = ()
     misplaced_thresholds: Thresholds = Thresholds()
-    smallest: tuple[Count, ...] = ()
-    room_fit: tuple[float, ...] = ()
+    smallest: Many[Count] = ()
+    room_fit: Many[float] = ()
     outlier: CountSlope = CountSlope()
-    relation: tuple[PairSlope, ...]
-    relation_given: tuple[PairSlope, ...] = ()
-    placement: tuple[PairSlope, ...] = ()
-    asked_place: tuple[PairSlope, ...] = ()
+    relation: PairSlopes
+    relation_given: PairSlopes = ()
+    placement: PairSlopes = ()
+    asked_place: PairSlopes = ()
     misplaced: Slope = Slope()
 
     @model_validator(mode="before")
@@ -178,7 +189,7 @@ class ClassEntry(Frozen):
     """One object class; `size` is its typical extent in metres, x, y, z."""
 
     label: Text
-    aliases: tuple[Text, ...] = ()
+    aliases: Many[Text] = ()
     structure: bool = False
     size: tuple[float, float, float] | None = None
 
@@ -186,9 +197,9 @@ class ClassEntry(Frozen):
 class VocabularyEntry(Frozen):
     """The words of a model, in the order of its units."""
 
-    objects: tuple[ClassEntry, ...]
-    relations: tuple[str, ...] = CANONICAL
-    room_types: tuple[Text, ...] = ()
+    objects: Many[ClassEntry]
+    relations: Many[str] = CANONICAL
+    room_types: Many[Text] = ()
 
     @model_validator(mode="after")
     def _is_a_vocabulary(self) -> Self:
@@ -258,8 +269,8 @@ class Description(Frozen):
     vocabulary: VocabularyEntry
     calibration: Calibration
     training: dict[str, JsonValue]
-    data: tuple[DataSource, ...]
-    metrics: tuple[Metric, ...]
+    data: Many[DataSource]
+    metrics: Many[Metric]
     terms: Text
     libraries: dict[str, str]
 

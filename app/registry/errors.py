@@ -10,6 +10,7 @@ ArtifactCode = Literal[
     "missing_file",
     "unexpected_file",
     "unreadable",
+    "too_large",
     "truncated",
     "checksum_mismatch",
     "unknown_format",
@@ -20,6 +21,7 @@ ArtifactCode = Literal[
     "invalid_tensor",
     "unsupported",
     "wrong_place",
+    "unexpected_error",
 ]
 StoreCode = Literal[
     "invalid_reference",

@@ -10,17 +10,18 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from typing import Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator
 
-from app.registry.description import Count, Description, Frozen, Sha256, to_json
+from app.registry.description import Count, Description, Frozen, Many, Sha256, to_json
 from app.registry.errors import ArtifactError
 from app.registry.offsets import PREFIX
 
 FORMAT: Final = 2
 READABLE: Final = (1, FORMAT)
 """Format 1 knows no offsets; a version of either may lack them."""
+MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
 MANIFEST: Final = "manifest.json"
@@ -32,7 +33,7 @@ class TensorEntry(Frozen):
     """A tensor as it is stored."""
 
     dtype: Literal["float16", "float32", "int32", "int64", "bool"]
-    shape: tuple[Count, ...]
+    shape: Many[Count]
 
 
 class FileEntry(Frozen):
@@ -46,7 +47,7 @@ class Manifest(Description):
     """A description, the tensors as stored, and the checksum of every other file."""
 
     format: Literal[1, 2] = FORMAT
-    tensors: dict[str, TensorEntry]
+    tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
     files: dict[str, FileEntry]
 
     @property

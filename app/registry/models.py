@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +12,8 @@ from app.registry.artifact import Artifact
 from app.registry.errors import ArtifactCode, ArtifactError, RegistryError, StoreCode, StoreError
 from app.registry.references import AliasTarget, resolve_reference, version_key
 from app.registry.store import Store
+
+_logger = logging.getLogger("app.registry")
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,3 +136,9 @@ def _load(
         return ArtifactFailure(error.code, error.reason)
     except StoreError as error:  # removed by hand since it was listed
         return ArtifactFailure("missing_file", error.reason)
+    except Exception as error:
+        # MemoryError is one of them: this version needs more than there is, the others do not.
+        _logger.exception("%s@%s could not be loaded", name, version)
+        return ArtifactFailure(
+            "unexpected_error", f"loading failed with {type(error).__name__}; the log says why"
+        )

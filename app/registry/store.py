@@ -39,6 +39,7 @@ from app.registry.references import (
     version_key,
 )
 from app.registry.tensors import StorageDtype
+from app.registry.verified import MAX_WEIGHTS_BYTES
 
 _ALIASES: Final = "aliases.json"
 _LOCK: Final = ".lock"
@@ -54,11 +55,19 @@ class Store:
     Args:
         root: need not exist before the first publication.
         lock_timeout: seconds that a writer waits for another.
+        max_weights_bytes: versions with a larger weights file are refused.
     """
 
-    def __init__(self, root: str | os.PathLike[str], *, lock_timeout: float = 60.0) -> None:
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        *,
+        lock_timeout: float = 60.0,
+        max_weights_bytes: int = MAX_WEIGHTS_BYTES,
+    ) -> None:
         self.root = Path(root)
         self._lock_timeout = lock_timeout
+        self._max_weights_bytes = max_weights_bytes
 
     # -- reading --------------------------------------------------------------------------------
 
@@ -73,7 +82,8 @@ class Store:
     def versions(self, name: str) -> tuple[str, ...]:
         """Published versions of a model, ascending; none where there is no such model.
 
-        Whatever stands under a version's name counts, so that a broken one is seen and reported.
+        A folder without a manifest is unfinished and does not count: the manifest is written last.
+        Anything else under a version's name counts, so that a broken one is seen and reported.
 
         Raises:
             StoreError: `invalid_reference`, or `unreadable`.
@@ -82,7 +92,7 @@ class Store:
         if not _is_directory(folder):
             return ()
         try:
-            found = [entry.name for entry in folder.iterdir()]
+            found = [entry.name for entry in folder.iterdir() if not _is_unfinished(entry)]
         except OSError as error:
             raise StoreError("unreadable", f"model '{name}': {cause(error)}") from None
         return tuple(sorted(filter(is_version, found), key=version_key))
@@ -126,7 +136,8 @@ class Store:
         """
         if check_version(version) not in self.versions(name):
             raise StoreError("unknown_version", f"model '{name}' has no version {version}")
-        artifact = load_artifact(self.root / name / version, previous)
+        folder = self.root / name / version
+        artifact = load_artifact(folder, previous, self._max_weights_bytes)
         manifest = artifact.manifest
         if (manifest.name, manifest.version) != (name, version):
             raise ArtifactError(
@@ -186,7 +197,7 @@ class Store:
             temporary = folder / f"{_TEMPORARY}{version}-{token_hex(8)}"
             try:
                 write_artifact(temporary, description, state, storage_dtype=storage_dtype)
-                artifact = load_artifact(temporary)
+                artifact = load_artifact(temporary, None, self._max_weights_bytes)
                 rename(temporary, place)
             finally:
                 shutil.rmtree(temporary, ignore_errors=True)
@@ -302,6 +313,17 @@ def _appearance(path: Path) -> tuple[int, ...]:
     except OSError:
         return ()
     return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _is_unfinished(version: Path) -> bool:
+    """A folder that can be read and holds no manifest."""
+    try:
+        (version / MANIFEST).lstat()
+    except FileNotFoundError:
+        return _is_directory(version)
+    except OSError:
+        pass
+    return False
 
 
 def _is_directory(path: Path) -> bool:

@@ -15,6 +15,9 @@ from app.registry.manifest import WEIGHTS, TensorEntry
 
 StorageDtype = Literal["float16", "float32"]
 
+MAX_HEADER_BYTES: Final = 2**20
+"""Of the description of the tensors at the head of the file: about 10,000 tensors."""
+
 _DTYPES: Final = {
     "F16": "float16",
     "F32": "float32",
@@ -50,9 +53,14 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
     """The tensors of a safetensors file, floating ones as float32; writable copies.
 
     Raises:
-        ArtifactError: `not_safetensors`; `wrong_shape` where names, dtypes or shapes differ from
-            the manifest's; `not_finite`.
+        ArtifactError: `not_safetensors`; `too_large` where the header is; `wrong_shape` where
+            names, dtypes or shapes differ from the manifest's; `not_finite`.
     """
+    # The file begins with the length of its header, 64 bits little-endian.
+    if MAX_HEADER_BYTES < int.from_bytes(data[:8], "little") <= len(data):
+        raise ArtifactError(
+            "too_large", f"{WEIGHTS}: the header has more than {MAX_HEADER_BYTES} bytes"
+        )
     try:
         stored = dict(deserialize(data))  # type: ignore[no-untyped-call]
     except SafetensorError:

@@ -11,12 +11,16 @@ import os
 import stat
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
 
-# A vocabulary of 100,000 classes needs about 10 MB.
-_LARGEST_MANIFEST = 32 * 1024 * 1024
+MAX_MANIFEST_BYTES: Final = 4 * 2**20
+"""Enough for about 20,000 classes: the manifest of 785 classes has 162 kB."""
+MAX_CARD_BYTES: Final = 2**20
+MAX_WEIGHTS_BYTES: Final = 2**30
+"""Default of the largest weights file; an operator may choose another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +38,16 @@ class VerifiedFiles:
     card: str
 
 
-def read_verified(directory: Path) -> VerifiedFiles:
+def read_verified(directory: Path, max_weights_bytes: int = MAX_WEIGHTS_BYTES) -> VerifiedFiles:
     """Read an artifact's files.
 
+    Args:
+        directory: holds them.
+        max_weights_bytes: a larger weights file is refused before it is read.
+
     Raises:
-        ArtifactError: a file is missing, unexpected, unreadable, truncated or altered, or the
-            manifest is not one that this release reads.
+        ArtifactError: a file is missing, unexpected, unreadable, too large, truncated or altered,
+            or the manifest is not one that this release reads.
     """
     try:
         folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -49,12 +57,11 @@ def read_verified(directory: Path) -> VerifiedFiles:
         raise ArtifactError("unreadable", f"the artifact's directory: {cause(error)}") from None
     try:
         _require_no_other_file(folder)
-        text = _read(folder, MANIFEST, _LARGEST_MANIFEST)
-        if len(text) > _LARGEST_MANIFEST:
-            raise ArtifactError("invalid_manifest", f"{MANIFEST} is over {_LARGEST_MANIFEST} bytes")
+        text = _read(folder, MANIFEST, MAX_MANIFEST_BYTES)
+        _require_size(MANIFEST, len(text), MAX_MANIFEST_BYTES)
         manifest = Manifest.from_bytes(text)
-        weights = _read_checked(folder, WEIGHTS, manifest.files[WEIGHTS])
-        card = _read_checked(folder, CARD, manifest.files[CARD])
+        weights = _read_checked(folder, WEIGHTS, manifest.files[WEIGHTS], max_weights_bytes)
+        card = _read_checked(folder, CARD, manifest.files[CARD], MAX_CARD_BYTES)
     finally:
         os.close(folder)
     try:
@@ -73,6 +80,11 @@ def _require_no_other_file(folder: int) -> None:
     if extra:
         names = ", ".join(sorted(ascii(name) for name in extra))
         raise ArtifactError("unexpected_file", f"not part of an artifact: {names}")
+
+
+def _require_size(name: str, size: int, limit: int) -> None:
+    if size > limit:
+        raise ArtifactError("too_large", f"{name} is over {limit} bytes")
 
 
 def _read(folder: int, name: str, limit: int) -> bytes:
@@ -98,7 +110,8 @@ def _read(folder: int, name: str, limit: int) -> bytes:
         os.close(descriptor)
 
 
-def _read_checked(folder: int, name: str, entry: FileEntry) -> bytes:
+def _read_checked(folder: int, name: str, entry: FileEntry, limit: int) -> bytes:
+    _require_size(name, entry.bytes, limit)
     data = _read(folder, name, entry.bytes)
     if len(data) < entry.bytes:
         raise ArtifactError("truncated", f"{name} has {len(data)} bytes of {entry.bytes}")

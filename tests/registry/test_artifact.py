@@ -420,7 +420,7 @@ def test_refuses_another_variant_of_the_same_size(written: Path) -> None:
 
 def test_refuses_a_size_that_no_file_has(written: Path) -> None:
     rewrite_manifest(written, lambda members: members["files"][CARD].update(bytes=10**18))
-    assert refusal(written).code == "truncated"
+    assert refusal(written).code == "too_large"
 
 
 def test_the_manifest_describes_the_files(written: Path) -> None:
@@ -437,8 +437,8 @@ def test_uses_the_bytes_that_it_checked(
 
     original = module.read_verified
 
-    def read_then_exchange(directory: Path) -> object:
-        files = original(directory)
+    def read_then_exchange(directory: Path, max_weights_bytes: int) -> object:
+        files = original(directory, max_weights_bytes)
         (directory / WEIGHTS).write_bytes(b"exchanged")
         return files
 

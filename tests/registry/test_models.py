@@ -92,10 +92,11 @@ def test_a_broken_latest_version_answers_with_its_failure(store: Store) -> None:
 
 def test_whatever_stands_in_a_versions_place_is_reported(store: Store) -> None:
     (store.root / "tiny" / "3.0.0").mkdir()
+    (store.root / "tiny" / "3.0.0" / "manifest.json").mkdir()
     (store.root / "tiny" / "4.0.0").write_text("not a directory")
     shutil.copytree(store.root / "other" / "1.0.0", store.root / "tiny" / "5.0.0")
     codes = {version: f.code for (_, version), f in load_model_set(store).failures.items()}
-    assert codes == {"3.0.0": "missing_file", "4.0.0": "unreadable", "5.0.0": "wrong_place"}
+    assert codes == {"3.0.0": "unreadable", "4.0.0": "unreadable", "5.0.0": "wrong_place"}
 
 
 def test_reuses_what_did_not_change(store: Store) -> None:

@@ -1,0 +1,228 @@
+"""A store with one hostile version: it is refused, the others serve, and memory stays bounded."""
+
+from __future__ import annotations
+
+import json
+import os
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from app.registry import ArtifactError, Store, StoreError, load_model_set
+from app.registry.artifact import load_artifact
+from app.registry.tensors import MAX_HEADER_BYTES, unpack
+from app.registry.verified import MAX_MANIFEST_BYTES
+from tests.http.conftest import ADMIN_KEY, serve
+from tests.registry.small_artifacts import (
+    description,
+    replace_file,
+    resign,
+    rewrite_manifest,
+    state,
+)
+
+TERABYTE = 2**40
+ADMIN = {"X-Admin-Key": ADMIN_KEY}
+
+
+@contextmanager
+def at_most(megabytes: int) -> Iterator[None]:
+    """Python's own allocations inside stay below this."""
+    tracemalloc.start()
+    try:
+        yield
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < megabytes * 2**20, f"{peak / 2**20:.0f} MB"
+
+
+@pytest.fixture
+def published(tmp_path: Path) -> Path:
+    """A store whose default is healthy, and a second version of another name to be spoilt."""
+    store = Store(tmp_path / "store")
+    store.publish(description("healthy"), state(), alias="default")
+    store.publish(description("hostile"), state())
+    return tmp_path / "store"
+
+
+def hostile(root: Path) -> Path:
+    return root / "hostile" / "1.0.0"
+
+
+def grow(file: Path, size: int) -> None:
+    """Make a sparse file of this size."""
+    os.truncate(file, size)
+
+
+def claim(folder: Path, name: str, size: int) -> None:
+    """Let the manifest say that a file has this size."""
+    rewrite_manifest(folder, lambda members: members["files"][name].update(bytes=size))
+
+
+def extreme_date(root: Path) -> None:
+    rewrite_manifest(
+        hostile(root), lambda members: members.update(created="0001-01-01T00:00:00+14:00")
+    )
+
+
+def large_card(root: Path) -> None:
+    grow(hostile(root) / "card.md", TERABYTE)
+    claim(hostile(root), "card.md", TERABYTE)
+
+
+def large_weights(root: Path) -> None:
+    grow(hostile(root) / "model.safetensors", TERABYTE)
+    claim(hostile(root), "model.safetensors", TERABYTE)
+
+
+def large_manifest(root: Path) -> None:
+    grow(hostile(root) / "manifest.json", TERABYTE)
+
+
+def many_tensors(root: Path) -> None:
+    header = b'{"a":{"dtype":"F32","shape":[0],"data_offsets":[0,0]}' + b" " * MAX_HEADER_BYTES
+    header += b"}"
+    replace_file(hostile(root), "model.safetensors", len(header).to_bytes(8, "little") + header)
+
+
+SPOILED = [
+    (extreme_date, "invalid_manifest"),
+    (large_card, "too_large"),
+    (large_weights, "too_large"),
+    (large_manifest, "too_large"),
+    (many_tensors, "too_large"),
+]
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(("spoil", "code"), SPOILED)
+async def test_a_hostile_version_is_refused_and_the_others_serve(
+    published: Path, spoil: Callable[[Path], None], code: str
+) -> None:
+    spoil(published)
+    async with serve(published, store_poll=0) as client:
+        assert (await client.get("/health/ready")).status_code == 200
+        refresh = await client.post("/models/refresh", headers=ADMIN)
+        # It failed before already, so it keeps nothing else back.
+        assert refresh.status_code == 200, refresh.text
+        assert [(f["subject"], f["reason"]) for f in refresh.json()["failures"]] == [
+            ("hostile@1.0.0", code)
+        ]
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(("spoil", "code"), SPOILED)
+async def test_a_version_that_turns_hostile_is_named_by_the_refresh(
+    published: Path, spoil: Callable[[Path], None], code: str
+) -> None:
+    async with serve(published, store_poll=0) as client:
+        spoil(published)
+        refresh = await client.post("/models/refresh", headers=ADMIN)
+        assert refresh.status_code == 409
+        failures = {f["subject"]: f["reason"] for f in refresh.json()["failures"]}
+        assert failures == {"hostile@1.0.0": code}
+        assert (await client.get("/health/ready")).status_code == 200
+
+
+@pytest.mark.parametrize("error", [OverflowError, MemoryError, RecursionError, KeyError])
+def test_any_failure_of_one_version_is_that_version_s(
+    published: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+) -> None:
+    load = Store.load
+
+    def fail(self: Store, name: str, *rest: object) -> object:
+        if name == "hostile":
+            raise error
+        return load(self, name, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Store, "load", fail)
+    models = load_model_set(Store(published))
+    assert models.ready
+    assert {key: failure.code for key, failure in models.failures.items()} == {
+        ("hostile", "1.0.0"): "unexpected_error"
+    }
+    assert error.__name__ in models.failures["hostile", "1.0.0"].reason
+
+
+@pytest.mark.parametrize("spoil", [large_card, large_weights, large_manifest])
+def test_sizes_are_checked_before_files_are_read(
+    published: Path, spoil: Callable[[Path], None]
+) -> None:
+    spoil(published)
+    with at_most(32), pytest.raises(ArtifactError) as refused:
+        load_artifact(hostile(published))
+    assert refused.value.code == "too_large"
+
+
+def test_the_operator_limits_the_weights(published: Path) -> None:
+    models = load_model_set(Store(published, max_weights_bytes=100))
+    assert {failure.code for failure in models.failures.values()} == {"too_large"}
+
+
+def test_a_large_alias_table_is_not_read(published: Path) -> None:
+    grow(published / "aliases.json", TERABYTE)
+    with at_most(4), pytest.raises(StoreError) as refused:
+        Store(published).aliases()
+    assert refused.value.code == "invalid_aliases"
+
+
+def test_a_header_of_a_million_tensors_is_not_parsed() -> None:
+    entry = '"{}":{{"dtype":"F32","shape":[0],"data_offsets":[0,0]}}'
+    header = ("{" + ",".join(map(entry.format, range(10**6))) + "}").encode()
+    data = len(header).to_bytes(8, "little") + header
+    with at_most(1), pytest.raises(ArtifactError) as refused:
+        unpack(data, {})
+    assert refused.value.code == "too_large"
+
+
+@pytest.mark.parametrize(
+    "place", ["data", "metrics", "vocabulary.objects", "calibration.relation", "training.x"]
+)
+def test_a_manifest_of_a_million_empty_objects_is_refused_in_little_memory(
+    published: Path, place: str
+) -> None:
+    """Listing what is wrong with each of them took 8 GB."""
+    folder = hostile(published)
+    rewrite_manifest(folder, lambda members: insert(members, place, "@"))
+    body = json.loads((folder / "manifest.json").read_bytes())
+    del body["checksum"]
+    many = "[" + ",".join(["{}"] * (MAX_MANIFEST_BYTES // 3 - 100_000)) + "]"
+    data = resign(json.dumps(body).replace('"@"', many).encode())
+    assert len(data) < MAX_MANIFEST_BYTES
+    (folder / "manifest.json").write_bytes(data)
+    with at_most(400):
+        models = load_model_set(Store(published))
+    assert models.ready
+    # Free JSON of the trainer may hold anything.
+    assert bool(models.failures) == (place != "training.x")
+
+
+def insert(members: dict[str, object], place: str, value: object) -> None:
+    *path, last = place.split(".")
+    for step in path:
+        members = members[step]  # type: ignore[assignment]
+    members[last] = value
+
+
+@pytest.mark.anyio
+async def test_an_unfinished_version_is_not_listed_and_keeps_nothing_back(published: Path) -> None:
+    (published / "broken" / "1.0.0").mkdir(parents=True)
+    (published / "healthy" / "2.0.0").mkdir()
+    (published / "healthy" / "2.0.0" / "model.safetensors").write_bytes(b"half")
+    async with serve(published, store_poll=0) as client:
+        refresh = await client.post("/models/refresh", headers=ADMIN)
+        assert (refresh.status_code, refresh.json()["failures"]) == (200, [])
+        listed = (await client.get("/models")).json()["models"]
+        assert {model["name"] for model in listed} == {"healthy", "hostile"}
+        assert (await client.get("/models/healthy/versions/2.0.0")).status_code == 404
+
+
+@pytest.mark.anyio
+async def test_an_unfinished_version_that_appears_is_no_failure(published: Path) -> None:
+    async with serve(published, store_poll=0) as client:
+        (published / "broken" / "1.0.0").mkdir(parents=True)
+        assert (await client.post("/models/refresh", headers=ADMIN)).status_code == 200
