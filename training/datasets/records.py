@@ -14,6 +14,8 @@ Point = tuple[float, float, float]
 Box2d = tuple[float, float, float, float]
 
 MAX_COUNT: Final = 1_000_000
+MAX_PROBLEM: Final = 500
+"""Characters of what is wrong."""
 
 
 class DatasetError(ValueError):
@@ -26,6 +28,8 @@ class DatasetError(ValueError):
     """
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
+        if len(problem) > MAX_PROBLEM:  # it may quote a value of megabytes
+            problem = problem[:MAX_PROBLEM] + "…"
         super().__init__(f"{path}, {where}: {problem}" if where else f"{path}: {problem}")
         self.path = path
         self.where = where
