@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import zlib
 from collections.abc import Callable
 
 import httpx
@@ -272,6 +274,18 @@ def test_a_link_holds_the_scene(open_board: OpenBoard) -> None:
 def test_a_link_that_is_broken_says_so(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board(scene=None, url=f"{api.base_url}/#scene=nonsense")
     expect(board.page.get_by_role("alert").first).to_contain_text("cannot be read")
+    assert board.things
+
+
+def test_a_link_that_unpacks_without_limit_says_so(
+    open_board: OpenBoard, api: httpx.Client
+) -> None:
+    """300 MB of blanks in a link of 400 kB: the page neither hangs nor fills the memory."""
+    packer = zlib.compressobj(9, wbits=-15)
+    packed = b"".join([packer.compress(b" " * 2**20) for _ in range(300)]) + packer.flush()
+    link = "#scene=" + base64.urlsafe_b64encode(packed).decode().rstrip("=")
+    board = open_board(scene=None, url=f"{api.base_url}/{link}")
+    expect(board.page.get_by_role("alert").first).to_contain_text("at most 512 KiB", timeout=5_000)
     assert board.things
 
 
