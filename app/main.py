@@ -36,10 +36,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     settings = settings or Settings()
     runtime = Runtime(
         settings.store,
-        Limits(objects=settings.max_objects, relations=settings.max_relations),
+        Limits(settings.max_objects, settings.max_relations, settings.max_answer_bytes),
         settings.queue_rows,
         Metrics() if settings.metrics else Unmeasured(),
         settings.store_poll,
+        settings.max_weights_bytes,
     )
 
     @asynccontextmanager

@@ -109,6 +109,12 @@ class Settings(BaseSettings):
     max_relations: Annotated[
         int, Field(ge=0, le=MAX_RELATIONS, description="most relations given in one scene")
     ] = 4096
+    max_answer_bytes: Annotated[
+        int, Field(ge=2**16, le=2**30, description="largest answer to one request")
+    ] = 16 * 2**20
+    max_weights_bytes: Annotated[
+        int, Field(ge=1024, le=2**40, description="largest weights file of a version")
+    ] = 2**30
     queue_rows: Annotated[
         int,
         Field(
@@ -124,6 +130,10 @@ class Settings(BaseSettings):
         int,
         Field(ge=1, le=600_000, description="of requests that send no X-Request-Timeout-Ms"),
     ] = 10_000
+    max_request_timeout_ms: Annotated[
+        int,
+        Field(ge=1, le=600_000, description="longest deadline that a client may choose"),
+    ] = 60_000
     max_streams: Annotated[
         int, Field(ge=0, le=4096, description="most streams a process has at once")
     ] = 64
@@ -180,6 +190,15 @@ class Settings(BaseSettings):
     def _is_directory(cls, value: Path) -> Path:
         if not value.is_dir():
             raise ValueError(f"SCENE_STORE must be an existing directory, and {value} is none")
+        return value
+
+    @field_validator("max_request_timeout_ms")
+    @classmethod
+    def _covers_the_default(cls, value: int, info: ValidationInfo) -> int:
+        if value < info.data.get("request_timeout_ms", 0):
+            raise ValueError(
+                "SCENE_MAX_REQUEST_TIMEOUT_MS must not be below SCENE_REQUEST_TIMEOUT_MS"
+            )
         return value
 
     @field_validator("opentelemetry")

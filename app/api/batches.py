@@ -57,17 +57,20 @@ async def _answer_each(
         session.metrics.entry_answered(question.__name__, outcome)
 
     results: list[bytes] = []
+    left = session.limits.answer_bytes
     with session.for_batch([_reference(scene) for scene in batch.scenes]) as held:
         for place, scene in enumerate(batch.scenes):
             try:
                 held.ticket.check()
-                result = await question(held, _validated(scene, place, kind))
+                asked = held.with_answer_bytes(left)
+                result = await question(asked, _validated(scene, place, kind))
                 results.append(entry(result))
                 count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
                 outcome, failed = _failed(error, place, session.request_id)
                 count(outcome)
                 results.append(failed)
+            left = max(0, left - len(results[-1]))
             # Others are served between two scenes, health checks first of all.
             await asyncio.sleep(0)
     return respond_all(session.request_id, results)

@@ -41,7 +41,7 @@ BAD_REQUEST: Final = ProblemType(
     400,
     "The request could not be read",
     "The connection broke off, the request breaks HTTP, or its X-Request-Timeout-Ms is no whole "
-    "number of milliseconds from 1 to 600000.",
+    "number of milliseconds from 1 to SCENE_MAX_REQUEST_TIMEOUT_MS.",
 )
 REQUEST_TIMEOUT: Final = ProblemType(
     "request-timeout",
@@ -161,6 +161,14 @@ CONTRADICTORY_EVIDENCE: Final = ProblemType(
     "No scene can be like that: an object stands in a relation to itself, or a pair stands both in "
     "a relation and in its opposite (left and right, on-top and under).",
 )
+ANSWER_TOO_LARGE: Final = ProblemType(
+    "answer-too-large",
+    422,
+    "The answer would be too large",
+    "The answer would exceed SCENE_MAX_ANSWER_BYTES. `errors` points at the parameter to lower: "
+    "`top_k` or `count`, or the number of `objects`. Shorter ids help too. All scenes of a batch "
+    "share one limit: send the refused scenes in another request.",
+)
 QUEUE_FULL: Final = ProblemType(
     "queue-full",
     429,
@@ -240,6 +248,7 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         INVALID_REQUEST,
         UNKNOWN_LABELS,
         CONTRADICTORY_EVIDENCE,
+        ANSWER_TOO_LARGE,
         HEAD_TOO_LARGE,
         INTERNAL_ERROR,
         NOT_READY,

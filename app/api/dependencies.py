@@ -7,6 +7,9 @@ from typing import Annotated, cast
 from fastapi import Depends
 from starlette.requests import Request
 
+from app.api import catalogue
+from app.api.middleware.turnstile import TIMEOUT_HEADER
+from app.api.problems import ProblemError
 from app.serving.queue import Ticket
 from app.serving.runtime import Runtime
 from app.serving.session import Session
@@ -24,6 +27,12 @@ async def _request_id(request: Request) -> str:
 
 async def _session(request: Request) -> Session:
     state = request.state
+    most = request.app.state.settings.max_request_timeout_ms
+    # The middleware has checked that it is a number.
+    if int(request.headers.get(TIMEOUT_HEADER, 1)) > most:
+        raise ProblemError(
+            catalogue.BAD_REQUEST, f"{TIMEOUT_HEADER} must not be above {most} milliseconds."
+        )
     ticket = Ticket(state.deadline, request.is_disconnected)
     return (await _runtime(request)).session(state.request_id, ticket, state.record)
 

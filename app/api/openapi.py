@@ -10,7 +10,7 @@ from fastapi.routing import APIRoute
 from app.api import catalogue, examples, keys
 from app.api.catalogue import ProblemType
 from app.api.example_requests import REQUESTS
-from app.api.middleware.turnstile import MAX_TIMEOUT_MS, TIMEOUT_HEADER
+from app.api.middleware.turnstile import TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE, ProblemError
 from app.schemas import MAX_SEED, FieldError, Problem
 
@@ -35,15 +35,6 @@ _ERRORS: Final = {
             message="contradicts an earlier relation, which says the opposite of this pair",
         )
     ],
-}
-_TIMEOUT_PARAMETER: Final = {
-    "name": TIMEOUT_HEADER,
-    "in": "header",
-    "required": False,
-    "description": "milliseconds after which nobody waits for the answer: work that has not begun "
-    "by then is dropped (504)",
-    "schema": {"type": "integer", "minimum": 1, "maximum": MAX_TIMEOUT_MS},
-    "examples": {"second": {"summary": "a second", "value": 1000}},
 }
 _KEY_SCHEMES: Final = {
     "api-key": {"type": "apiKey", "in": "header", "name": keys.API_KEY},
@@ -124,6 +115,7 @@ class DocumentedAPI(FastAPI):
             schemas = document["components"]["schemas"]
             problem = Problem.model_json_schema(mode="serialization", ref_template=_REFERENCE)
             schemas |= problem.pop("$defs") | {"Problem": problem}
+            timeout = _timeout_parameter(self.state.settings.max_request_timeout_ms)
             for path in document["paths"].values():
                 for operation in path.values():
                     (ok,) = operation["responses"]["200"]["content"].values()
@@ -133,7 +125,7 @@ class DocumentedAPI(FastAPI):
                         cases = REQUESTS[operation["operationId"]].items()
                         body["examples"] = {name: case.describe() for name, case in cases}
                     if "504" in operation["responses"]:
-                        operation.setdefault("parameters", []).append(_TIMEOUT_PARAMETER)
+                        operation.setdefault("parameters", []).append(timeout)
                     content = operation["responses"].get("422", {}).get("content", {})
                     if "application/json" in content:
                         del operation["responses"]["422"]
@@ -143,6 +135,18 @@ class DocumentedAPI(FastAPI):
                 _ask_for_keys(document)
             _state_whole_numbers(document)
         return super().openapi()
+
+
+def _timeout_parameter(most: int) -> dict[str, Any]:
+    return {
+        "name": TIMEOUT_HEADER,
+        "in": "header",
+        "required": False,
+        "description": "milliseconds after which nobody waits for the answer: work that has not "
+        "begun by then is dropped (504)",
+        "schema": {"type": "integer", "minimum": 1, "maximum": most},
+        "examples": {"second": {"summary": "a second", "value": min(1000, most)}},
+    }
 
 
 def _ask_for_keys(document: dict[str, Any]) -> None:

@@ -55,6 +55,7 @@ _OF_REASON: Final = {
     Reason.INVALID: catalogue.INVALID_REQUEST,
     Reason.UNKNOWN_LABELS: catalogue.UNKNOWN_LABELS,
     Reason.CONTRADICTION: catalogue.CONTRADICTORY_EVIDENCE,
+    Reason.ANSWER_TOO_LARGE: catalogue.ANSWER_TOO_LARGE,
 }
 
 

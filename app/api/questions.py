@@ -33,6 +33,7 @@ PROBLEMS: Final = queued(
     catalogue.INVALID_REQUEST,
     catalogue.UNKNOWN_LABELS,
     catalogue.CONTRADICTORY_EVIDENCE,
+    catalogue.ANSWER_TOO_LARGE,
     catalogue.NOT_READY,
     catalogue.MODEL_UNAVAILABLE,
 )

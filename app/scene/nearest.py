@@ -28,6 +28,10 @@ misspelt names of the `indoor` vocabulary together: 2724 of 2895; of held-out al
 727.
 """
 
+LONGEST: Final = 64
+"""Characters of a name whose spelling is compared, after folding: one character may become 18. No
+class has a name half as long, and the cost of a comparison grows with the length."""
+
 _LEAST: Final = 0.6  # "asdf" is not a misspelt "scarf"
 _BY_KIND: Final = 0.95  # of a name without its words for looks
 _BY_REST: Final = 0.9  # people rarely mistype the first letter: a pocket is no socket
@@ -80,16 +84,18 @@ class NameIndex:
         best: dict[int, float] = {}
         if not words:
             return best
-        found = process.extract(
-            "".join(words),
-            self._keys,
-            scorer=OSA.normalized_similarity,
-            limit=None,
-            score_cutoff=_LEAST,
-        )
-        for key, similarity, place in found:
-            begins_alike = key[:1] == words[0][:1]
-            _keep(best, self._entries[place], similarity * (1 if begins_alike else _BY_REST))
+        joined = "".join(words)
+        if len(joined) <= LONGEST:
+            found = process.extract(
+                joined,
+                self._keys,
+                scorer=OSA.normalized_similarity,
+                limit=None,
+                score_cutoff=_LEAST,
+            )
+            for key, similarity, place in found:
+                begins_alike = key[:1] == words[0][:1]
+                _keep(best, self._entries[place], similarity * (1 if begins_alike else _BY_REST))
         kin = self._by_head.get(_head(words), ())
         is_only = len({self._entries[place] for place in kin}) == 1
         for place in kin:

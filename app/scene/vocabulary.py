@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -113,6 +114,12 @@ class Vocabulary:
     def labels(self) -> tuple[str, ...]:
         """The canonical labels, by class index."""
         return tuple(entry.label for entry in self._objects)
+
+    @cached_property
+    def longest_label(self) -> int:
+        """Bytes of the longest label or room type as JSON."""
+        names = [*self.labels, *self._room_types]
+        return max(len(json.dumps(name, ensure_ascii=False).encode()) for name in names)
 
     @cached_property
     def structure(self) -> NDArray[np.bool_]:

@@ -33,6 +33,7 @@ class Reason(Enum):
     INVALID = "invalid"
     UNKNOWN_LABELS = "unknown labels"
     CONTRADICTION = "contradiction"
+    ANSWER_TOO_LARGE = "answer too large"
 
 
 class ServingError(Exception):

@@ -16,7 +16,7 @@ from app.schemas import (
     RelationsRequest,
     SceneRequest,
 )
-from app.serving import answers
+from app.serving import answer_size, answers
 from app.serving.answers import Answer
 from app.serving.errors import Location, Reason
 from app.serving.models import ServedModel
@@ -32,6 +32,7 @@ async def relations(session: Session, request: RelationsRequest) -> Answer:
 
     Raises:
         RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
+        RequestError: the answer would be too large.
         QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request)
@@ -46,6 +47,7 @@ async def relations(session: Session, request: RelationsRequest) -> Answer:
         pairs=pairs,
         include_opposites=request.include_opposites,
     )
+    _require(session, answer_size.of_relations(found, disagreements, reading), "top_k")
     return answers.relations(
         _envelope(session, request, model, reading),
         found,
@@ -60,6 +62,7 @@ async def missing(session: Session, request: MissingRequest) -> Answer:
 
     Raises:
         RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
+        RequestError: the answer would be too large.
         QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request)
@@ -84,6 +87,7 @@ async def missing(session: Session, request: MissingRequest) -> Answer:
         axes=viewer_axes(request.frame_id, None if viewpoint is None else viewpoint.yaw),
         coverage=request.coverage,
     )
+    _require(session, answer_size.of_missing(found, reading), "top_k")
     coverage = request.coverage
     if coverage is None:
         coverage = model.artifact.calibration.coverage
@@ -95,6 +99,7 @@ async def outliers(session: Session, request: OutliersRequest) -> Answer:
 
     Raises:
         RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
+        RequestError: the answer would be too large.
         QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request)
@@ -105,6 +110,7 @@ async def outliers(session: Session, request: OutliersRequest) -> Answer:
         sensitivity=request.sensitivity,
         threshold=request.threshold,
     )
+    _require(session, answer_size.of_outliers(found, reading), "objects")
     return answers.outliers(_envelope(session, request, model, reading), found, reading)
 
 
@@ -113,6 +119,7 @@ async def generate(session: Session, request: GenerateRequest) -> Answer:
 
     Raises:
         RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
+        RequestError: the answer would be too large.
         QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
     """
     model, reading = session.read(request, may_be_empty=True)
@@ -132,7 +139,12 @@ async def generate(session: Session, request: GenerateRequest) -> Answer:
         )
 
     drawn = await session.draw(request.count, model, "generate", draw)
+    _require(session, answer_size.of_generated(drawn, reading), "count")
     return answers.generate(_envelope(session, request, model, reading), seed, drawn)
+
+
+def _require(session: Session, size: int, parameter: str) -> None:
+    answer_size.require(size, session.limits.answer_bytes, parameter)
 
 
 def _envelope(

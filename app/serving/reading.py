@@ -32,7 +32,10 @@ from app.serving.errors import Fault, Location, Reason, RequestError
 from app.serving.warnings import scene_warnings
 
 MAX_SUGGESTED: Final = 32
-"""How many unknown labels of one request are looked up, to suggest or to take the nearest class."""
+"""How many unknown labels of one scene are looked up, to suggest or to take the nearest class; and
+of one request, with all its scenes, to suggest."""
+MAX_MAPPED: Final = 256
+"""How many of one request are looked up to take the nearest class."""
 
 
 Triple = tuple[int, int, int]
@@ -40,10 +43,11 @@ Triple = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one scene may hold, as the operator chose."""
+    """What one scene and its answer may hold, as the operator chose."""
 
     objects: int = 256
     relations: int = 4096
+    answer_bytes: int = 16 * 2**20
 
 
 @dataclass(slots=True)
@@ -72,6 +76,32 @@ class Faults:
 
 
 @dataclass(slots=True)
+class LookUps:
+    """The unknown labels that one request has looked up, in all its scenes.
+
+    A look-up takes .2 ms, and a batch may hold ten thousand unknown labels.
+
+    Attributes:
+        suggestions: how many faults with suggestions it has named.
+    """
+
+    suggestions: int = 0
+    _found: dict[tuple[int, str, bool], tuple[Match, ...]] = field(default_factory=dict)
+
+    def nearest(
+        self, vocabulary: Vocabulary, label: str, *, is_room: bool, limit: int
+    ) -> tuple[Match, ...] | None:
+        """The entries like an unknown label; None where so many have been looked up already."""
+        key = id(vocabulary), label, is_room  # the request keeps its models
+        if key not in self._found:
+            if len(self._found) >= limit:
+                return None
+            look_up = vocabulary.nearest_room if is_room else vocabulary.nearest
+            self._found[key] = look_up(label)
+        return self._found[key]
+
+
+@dataclass(slots=True)
 class Unknown:
     """What becomes of the labels of one request that the model does not know.
 
@@ -79,10 +109,12 @@ class Unknown:
         treatment: `SceneRequest.unknown_labels`.
         ignored: names of what was left out.
         mapped: labels by the class that stands for each.
+        look_ups: those of the whole request.
     """
 
     vocabulary: Vocabulary
     treatment: UnknownLabels
+    look_ups: LookUps
     ignored: list[str] = field(default_factory=list)
     mapped: dict[str, Mapped] = field(default_factory=dict)
     _looked_up: dict[tuple[str, bool], tuple[Match, ...]] = field(default_factory=dict)
@@ -116,9 +148,14 @@ class Unknown:
             if not known:
                 message = "this model knows no room types"
         if self.treatment == "nearest" and (label, is_room) not in self._looked_up:
-            message += f"; a request looks up the nearest class of {MAX_SUGGESTED} labels at most"
-        few = len(faults.found.get(Reason.UNKNOWN_LABELS, ())) < MAX_SUGGESTED
-        suggestions = [known[match.entry] for match in matches] if few else ()
+            message += (
+                f"; the nearest class is looked up for {MAX_SUGGESTED} labels of a scene and "
+                f"{MAX_MAPPED} of a batch at most"
+            )
+        suggestions = [known[match.entry] for match in matches]
+        if self.look_ups.suggestions >= MAX_SUGGESTED:
+            suggestions = []
+        self.look_ups.suggestions += bool(suggestions)
         faults.add(Reason.UNKNOWN_LABELS, location, message, suggestions)
         return None
 
@@ -127,13 +164,15 @@ class Unknown:
         return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
 
     def _nearest(self, label: str, *, is_room: bool) -> tuple[Match, ...]:
-        # A look-up takes about 0.1 ms, and a request may hold hundreds of unknown labels.
         key = label, is_room
         if key not in self._looked_up:
             if len(self._looked_up) >= MAX_SUGGESTED:
                 return ()
-            look_up = self.vocabulary.nearest_room if is_room else self.vocabulary.nearest
-            self._looked_up[key] = look_up(label)
+            limit = MAX_SUGGESTED if self.treatment == "error" else MAX_MAPPED
+            found = self.look_ups.nearest(self.vocabulary, label, is_room=is_room, limit=limit)
+            if found is None:
+                return ()
+            self._looked_up[key] = found
         return self._looked_up[key]
 
 
@@ -235,14 +274,22 @@ class Names:
 
 
 def read_scene(
-    request: SceneRequest, vocabulary: Vocabulary, limits: Limits, *, may_be_empty: bool = False
+    request: SceneRequest,
+    vocabulary: Vocabulary,
+    limits: Limits,
+    look_ups: LookUps | None = None,
+    *,
+    may_be_empty: bool = False,
 ) -> Reading:
     """The scene of a request, in the classes of ``vocabulary``.
+
+    Args:
+        look_ups: those of the whole request, where it holds more than this scene.
 
     Raises:
         RequestError: everything that is wrong with it, of the gravest kind found.
     """
-    given = _given(request, vocabulary, limits, may_be_empty=may_be_empty)
+    given = _given(request, vocabulary, limits, look_ups or LookUps(), may_be_empty=may_be_empty)
     scene = observe(
         given.scene,
         frame_id=request.frame_id,
@@ -260,7 +307,7 @@ def check_scene(request: SceneRequest, vocabulary: Vocabulary, limits: Limits) -
     Raises:
         RequestError: as `read_scene` does.
     """
-    _given(request, vocabulary, limits, may_be_empty=True)
+    _given(request, vocabulary, limits, LookUps(), may_be_empty=True)
 
 
 class _Given(NamedTuple):
@@ -273,7 +320,12 @@ class _Given(NamedTuple):
 
 
 def _given(
-    request: SceneRequest, vocabulary: Vocabulary, limits: Limits, *, may_be_empty: bool
+    request: SceneRequest,
+    vocabulary: Vocabulary,
+    limits: Limits,
+    look_ups: LookUps,
+    *,
+    may_be_empty: bool,
 ) -> _Given:
     faults = Faults()
     if len(request.objects) > limits.objects:
@@ -289,7 +341,7 @@ def _given(
     faults.raise_any()
 
     ids = _ids(request.objects, faults)
-    unknown = Unknown(vocabulary, request.unknown_labels)
+    unknown = Unknown(vocabulary, request.unknown_labels, look_ups)
     objects: list[SceneObject] = []
     left_out: list[tuple[str, str]] = []
     optical = request.frame_id is not None and is_optical(request.frame_id)

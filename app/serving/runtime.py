@@ -14,6 +14,7 @@ from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 from app.compiling import check_cache, progress
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
+from app.registry.verified import MAX_WEIGHTS_BYTES
 from app.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 from app.serving.errors import (
     AliasConflictError,
@@ -89,6 +90,7 @@ class Runtime:
         queue_rows: what may wait for one model.
         metrics: what the service counts.
         poll: seconds between two looks for changes of the store; 0 for none.
+        max_weights_bytes: versions with a larger weights file are refused.
 
     Attributes:
         draining: nothing new is taken.
@@ -101,10 +103,11 @@ class Runtime:
         queue_rows: int,
         metrics: Metrics,
         poll: float,
+        max_weights_bytes: int = MAX_WEIGHTS_BYTES,
     ) -> None:
         self.metrics = metrics
         self.draining = False
-        self._store = Store(store, lock_timeout=_LOCK_TIMEOUT)
+        self._store = Store(store, lock_timeout=_LOCK_TIMEOUT, max_weights_bytes=max_weights_bytes)
         self._limits = limits
         self._queue_rows = queue_rows
         self._threads = Threads()

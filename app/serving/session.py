@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -16,7 +16,7 @@ from app.serving.errors import ServingError
 from app.serving.metrics import Metrics
 from app.serving.models import ServedModel, ServedModels
 from app.serving.queue import Done, Ticket
-from app.serving.reading import Limits, Reading, check_scene, read_scene
+from app.serving.reading import Limits, LookUps, Reading, check_scene, read_scene
 from app.serving.record import RequestRecord
 
 P = ParamSpec("P")
@@ -39,6 +39,7 @@ class Session:
         holding: whether rows of the models' queues are held for it already.
         known: what `read` found, where several questions are asked about one scene.
         gives_way: its questions let those of others go first.
+        look_ups: of labels that the models do not know.
     """
 
     models: ServedModels
@@ -50,6 +51,7 @@ class Session:
     holding: bool = False
     known: tuple[ServedModel, Reading] | None = None
     gives_way: bool = False
+    look_ups: LookUps = field(default_factory=LookUps)
 
     def read(
         self, request: SceneRequest, *, may_be_empty: bool = False
@@ -65,7 +67,9 @@ class Session:
             return self.known
         model = self.models.resolve(request.model)
         self.record.asked(model.reference)
-        return model, read_scene(request, model.vocabulary, self.limits, may_be_empty=may_be_empty)
+        return model, read_scene(
+            request, model.vocabulary, self.limits, self.look_ups, may_be_empty=may_be_empty
+        )
 
     def check(self, request: SceneRequest) -> None:
         """Check a scene, which may be empty, without its poses.
@@ -92,13 +96,14 @@ class Session:
         # Pairs of objects are what the relation part is computed for, stated relations or not.
         size = (1 + len(scene.objects)) ** 2
         name = question.__name__
+        kind = _kind_of_cost(name, scene, kwargs)
         rows = 0 if self.holding else 1
         self._take(model, rows)
         try:
             done = await model.queue.run(
                 partial(question, model.artifact, scene, *args, **kwargs),
                 self.ticket,
-                kind=name,
+                kind=kind,
                 size=size,
                 gives_way=self.gives_way,
             )
@@ -141,6 +146,10 @@ class Session:
         model.queue.give_back(rows)
         self.metrics.pending(model.reference, model.queue.rows)
 
+    def with_answer_bytes(self, left: int) -> Session:
+        """The view whose next answer may have so many bytes."""
+        return replace(self, limits=replace(self.limits, answer_bytes=left))
+
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Session]:
         """The view of a batch, for whose scenes there is room in all the queues at once.
@@ -160,3 +169,26 @@ class Session:
                 self._take(model, rows)
                 held.callback(self._give_back, model, rows)
             yield replace(self, holding=True)
+
+
+def _kind_of_cost(name: str, scene: Scene, parameters: Mapping[str, object]) -> str:
+    """The same for questions that cost alike, whatever the number of objects.
+
+    Without it a costly question would be taken for a cheap one of that size: of the same number of
+    objects, one class is cheap and thirty are not, and so are relations of one pair and of all.
+    """
+    of = [thing.class_index for thing in scene.objects]
+    pairs = {(of[subject], of[object_]) for _, subject, object_ in scene.relations or ()}
+    related = {end for pair in pairs for end in pair}
+    orders = [len(found).bit_length() for found in (set(of), related, pairs)]
+    asked = [f"{key}={_order(value)}" for key, value in parameters.items()]
+    return " ".join((name, *map(str, orders), *asked))
+
+
+def _order(value: object) -> object:
+    """What a parameter's value may mean for the cost."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        return value.bit_length()
+    if isinstance(value, float):
+        return round(value, 2)
+    return len(value).bit_length() if isinstance(value, Sized) else value

@@ -46,13 +46,15 @@ def hold(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], threading.Eve
 @pytest.mark.anyio
 @pytest.mark.parametrize("question", QUESTIONS)
 async def test_the_header_sets_the_deadline(client: httpx.AsyncClient, question: str) -> None:
-    for given in ("1000", "600000"):
+    for given in ("1000", "60000"):
         headers = {"X-Request-Timeout-Ms": given}
         assert (await client.post(f"/{question}", json=SCENE, headers=headers)).is_success
 
 
 @pytest.mark.anyio
-@pytest.mark.parametrize("given", ["0", "-1", "1.5", "1e3", "600001", "10000000", "", " ", "soon"])
+@pytest.mark.parametrize(
+    "given", ["0", "-1", "1.5", "1e3", "60001", "600001", "10000000", "", " ", "soon"]
+)
 async def test_a_deadline_that_is_none_is_refused(client: httpx.AsyncClient, given: str) -> None:
     headers = {"X-Request-Timeout-Ms": given}
     response = await client.post("/relations", json=SCENE, headers=headers)
