@@ -2,9 +2,11 @@
 
 What arrives within one tick is computed in the next, each job by itself, so an answer never depends
 on what it waited beside. Cheap jobs run where they stand: a hop to a thread costs as much as most
-of them. A job that is expected to take longer than `CHEAP` goes to a worker thread of the process,
-where compiled loops and tensor kernels let the event loop go on. Drawings, which may take seconds,
-have a thread of their own: nobody who asks about a scene waits for them.
+of them. A job that is expected to take longer than `CHEAP`, or whose like was never measured, goes
+to the worker thread of its model, where compiled loops let the event loop go on.
+The system shares the processors fairly among these threads: no model waits for the costly work of
+another. Drawings, which may take seconds, have a thread of their own: nobody who asks about a scene
+waits for them.
 
 Questions of streams give way to those of requests: a stream has an answer under way all the time,
 and what it says next is about the newest state anyway.
@@ -24,6 +26,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, thread_time
 from typing import Any, Final, Generic, TypeVar
+from weakref import WeakSet
 
 from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
 
@@ -36,6 +39,8 @@ CHEAP: Final = 1e-3
 _LOOK: Final = 0.25
 # So long a tick computes before others get their turn: health checks, and requests to be read.
 _TICK: Final = 2e-3
+# So many kinds and orders of size are remembered.
+_MAX_COSTS: Final = 4096
 # Share of the newest measurement in the expected cost.
 _NEWEST: Final = 0.2
 
@@ -109,14 +114,12 @@ class _Costs:
         self._per_unit: dict[tuple[str, int], float] = {}
 
     def expected(self, kind: str, size: int) -> float:
-        """Seconds; where none of this order has been measured, as the largest below; else 0."""
-        for order in range(size.bit_length(), 0, -1):
-            known = self._per_unit.get((kind, order))
-            if known is not None:
-                return known * size
-        return 0.0
+        """Seconds; infinite where none of this kind and order has been measured."""
+        return self._per_unit.get((kind, size.bit_length()), math.inf) * size
 
     def learn(self, kind: str, size: int, seconds: float) -> None:
+        if len(self._per_unit) >= _MAX_COSTS:
+            self._per_unit.clear()  # clients choose the kinds; all are soon measured again
         key, measured = (kind, size.bit_length()), seconds / size
         known = self._per_unit.get(key, measured)
         # One that was held up by something else must not send its like to the thread.
@@ -125,22 +128,24 @@ class _Costs:
 
 @dataclass(frozen=True, slots=True)
 class Threads:
-    """The worker threads of a process, shared by the queues of all its models.
+    """The worker threads of a process.
 
     Attributes:
-        costly: for questions that would hold up the event loop.
-        drawing: for drawings.
-        turn: of those that give way, one is given to `costly` at a time: whoever does not waits for
-            one of them at most.
+        drawing: for drawings, shared by all models.
     """
 
-    costly: Executor = field(default_factory=partial(_one_thread, "costly work"))
     drawing: Executor = field(default_factory=partial(_one_thread, "drawing"))
-    turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _costly: WeakSet[Executor] = field(default_factory=WeakSet)
+
+    def for_model(self) -> Executor:
+        """A thread for the costly questions to one model; it ends when nothing refers to it."""
+        executor = _one_thread("costly work")
+        self._costly.add(executor)
+        return executor
 
     def stop(self) -> None:
         """Let go of them; what they have not begun is dropped."""
-        for executor in (self.costly, self.drawing):
+        for executor in (self.drawing, *self._costly):
             executor.shutdown(wait=False, cancel_futures=True)
 
 
@@ -164,6 +169,12 @@ class WorkQueue:
     _giving_way: deque[_Job] = field(default_factory=deque)
     _draining: bool = False
     _costs: _Costs = field(default_factory=_Costs)
+    _costly: Executor = field(init=False)
+    # Of those that give way, one is in the thread at a time: all others wait for one at most.
+    _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    def __post_init__(self) -> None:
+        self._costly = self.threads.for_model()
 
     def take(self, rows: int) -> None:
         """Take room for so many rows, until they are given back.
@@ -213,8 +224,8 @@ class WorkQueue:
         self.backlog += counted
         try:
             if self._costs.expected(kind, size) > CHEAP:
-                async with _turn(self.threads.turn, ticket) if gives_way else nullcontext():
-                    return await _in_thread(lambda _: learnt(), ticket, self.threads.costly)
+                async with _turn(self._turn, ticket) if gives_way else nullcontext():
+                    return await _in_thread(lambda _: learnt(), ticket, self._costly)
             line = self._giving_way if gives_way else self._waiting
             return await self._in_tick(learnt, ticket, line)
         finally:

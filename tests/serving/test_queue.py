@@ -38,8 +38,10 @@ async def queue(threads: Threads) -> WorkQueue:
         while thread_time() < end:
             pass
 
-    # From now on this kind is known to be costly.
+    # From now on these kinds are known.
     await queue.run(busy, ENDLESS, kind="costly", size=1)
+    for kind in ("cheap", *map(str, range(40))):
+        await queue.run(lambda: None, ENDLESS, kind=kind, size=1)
     return queue
 
 
@@ -73,7 +75,7 @@ async def test_jobs_run_in_order_each_with_its_result(queue: WorkQueue) -> None:
         order.append(number)
         return number * number
 
-    jobs = [queue.run(lambda k=k: job(k), ENDLESS, kind="q", size=1) for k in range(20)]
+    jobs = [queue.run(lambda k=k: job(k), ENDLESS, kind="cheap", size=1) for k in range(20)]
     assert [done.result for done in await asyncio.gather(*jobs)] == [k * k for k in range(20)]
     assert order == list(range(20))
 
@@ -84,7 +86,8 @@ async def test_what_arrives_in_one_tick_is_computed_in_the_next(queue: WorkQueue
 
     async def ask(name: str) -> None:
         order.append(f"{name} queued")
-        await queue.run(lambda: order.append(f"{name} computed"), ENDLESS, kind="q", size=1)
+        computed = partial(order.append, f"{name} computed")
+        await queue.run(computed, ENDLESS, kind="cheap", size=1)
 
     await asyncio.gather(ask("first"), ask("second"))
     assert order == ["first queued", "second queued", "first computed", "second computed"]
@@ -306,13 +309,21 @@ def took(queue: WorkQueue, monkeypatch: pytest.MonkeyPatch) -> Any:
     return took
 
 
-async def test_a_kind_that_turns_out_costly_moves_to_the_thread(took: Any) -> None:
-    """In proportion to its size where that is new, and back again for small ones."""
+async def test_an_unmeasured_question_never_holds_up_the_event_loop(took: Any) -> None:
+    """Neither a new kind does nor a new order of size, whatever is known of smaller ones."""
+    assert not await took(100 * CHEAP, size=1, kind="new")
+    assert not await took(0, size=1)
+    assert await took(0, size=1)
+    for size in (2, 4, 100, 10_000):
+        assert not await took(100 * CHEAP, size=size)
+
+
+async def test_a_kind_is_put_where_its_cost_belongs(took: Any) -> None:
+    await took(CHEAP / 10, size=1)
     assert await took(CHEAP / 10, size=1)
+    await took(CHEAP * 10, size=100)
     assert not await took(CHEAP * 10, size=100)
     assert await took(CHEAP / 10, size=1)
-    assert not await took(CHEAP * 10, size=100)
-    assert await took(0, size=100, kind="another")
 
 
 async def test_small_questions_do_not_make_large_ones_look_costly(took: Any) -> None:
@@ -325,12 +336,32 @@ async def test_small_questions_do_not_make_large_ones_look_costly(took: Any) -> 
 
 
 async def test_one_that_was_held_up_sends_none_to_the_thread(took: Any) -> None:
+    await took(CHEAP / 3, size=100)
     for seconds in (CHEAP / 3, CHEAP / 3, 100 * CHEAP, CHEAP / 3):
         assert await took(seconds, size=100)
     # What stays so is believed.
     for _ in range(20):
         await took(3 * CHEAP, size=100)
     assert not await took(3 * CHEAP, size=100)
+
+
+async def test_clients_cannot_fill_the_memory_with_kinds(took: Any, queue: WorkQueue) -> None:
+    for number in range(5_000):
+        await took(0, size=1, kind=str(number))
+    assert len(queue._costs._per_unit) <= 4096
+
+
+async def test_no_model_waits_for_the_costly_work_of_another(
+    queue: WorkQueue, threads: Threads
+) -> None:
+    release = threading.Event()
+    costly = [asyncio.ensure_future(in_thread(queue, lambda: release.wait(30))) for _ in range(8)]
+    other = WorkQueue(limit=8, threads=threads)
+    # Only its answer lets them end.
+    assert (await in_thread(other, lambda: "fine")).result == "fine"
+    assert not any(job.done() for job in costly)
+    release.set()
+    await asyncio.gather(*costly)
 
 
 async def test_a_long_queue_lets_others_have_their_turn(queue: WorkQueue) -> None:
