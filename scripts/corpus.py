@@ -43,7 +43,7 @@ MODELS: Final = (
 RELATIONS: Final = ("left", "right", "front", "behind", "on-top", "under", "above", "below")
 HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "location")
 # No deadline passes on a busy machine.
-PATIENCE: Final = {"x-request-timeout-ms": "600000"}
+PATIENCE: Final = {"x-request-timeout-ms": "60000"}
 # Different in each answer, or in each process.
 VOLATILE: Final = frozenset({"request_id", "instance", "session", "seed"})
 # Lists of an answer that are about the scene.

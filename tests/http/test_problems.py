@@ -579,6 +579,13 @@ async def test_an_answer_that_is_not_finite_is_a_defect(
     assert batch.json()["results"][0]["problem"]["type"] == "/problems/internal-error"
 
 
+async def test_a_large_answer_is_refused(shared_store: Path) -> None:
+    async with serve(shared_store, max_answer_bytes=2**16) as client:
+        body = {"objects": [{"id": f"{k:0128}", "label": "bed"} for k in range(64)], "top_k": 4096}
+        document = problem(await client.post("/relations", json=body), 422, "answer-too-large")
+        assert document["errors"][0]["pointer"] == "#/top_k"
+
+
 # ------------------------------------------------------------------------------------- pages
 
 
