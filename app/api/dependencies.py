@@ -27,14 +27,23 @@ async def _request_id(request: Request) -> str:
 
 async def _session(request: Request) -> Session:
     state = request.state
+    ticket = Ticket(state.deadline, request.is_disconnected)
+    return (await _runtime(request)).session(state.request_id, ticket, state.record)
+
+
+async def limit_deadline(request: Request) -> None:
+    """Refuse a request whose deadline is later than the operator allows.
+
+    Raises:
+        ProblemError: of kind `catalogue.BAD_REQUEST`.
+    """
     most = request.app.state.settings.max_request_timeout_ms
-    # The middleware has checked that it is a number.
-    if int(request.headers.get(TIMEOUT_HEADER, 1)) > most:
+    # The middleware has checked that it is a number, and gives health checks no deadline.
+    has_deadline = hasattr(request.state, "deadline")
+    if has_deadline and int(request.headers.get(TIMEOUT_HEADER, 1)) > most:
         raise ProblemError(
             catalogue.BAD_REQUEST, f"{TIMEOUT_HEADER} must not be above {most} milliseconds."
         )
-    ticket = Ticket(state.deadline, request.is_disconnected)
-    return (await _runtime(request)).session(state.request_id, ticket, state.record)
 
 
 RuntimeDep = Annotated[Runtime, Depends(_runtime)]
