@@ -721,10 +721,6 @@ class ModelSummary(Reply):
 class ModelList(Reply):
     """What the service has, and the aliases that lead to it."""
 
-    generation: Annotated[
-        str,
-        Field(description="the same in all replicas that serve the same versions and aliases"),
-    ]
     models: list[ModelSummary]
     aliases: Annotated[
         dict[str, str], Field(description="alias to `name@version`, or to `name` for its newest")
@@ -732,6 +728,10 @@ class ModelList(Reply):
     failures: Annotated[
         list[Failure], Field(description="what of the store cannot be used, and why")
     ] = []
+    generation: Annotated[
+        str,
+        Field(description="the same in all replicas that serve the same versions and aliases"),
+    ] = ""
 
 
 class VersionDetails(VersionSummary):

@@ -57,7 +57,7 @@ def log_odds(
         rounds=rounds,
     )
     absent = v[0] == 0
-    difference = prepared()[0, absent] - torch.from_numpy(two_copies())[absent]
+    difference = prepared()[absent] - torch.from_numpy(two_copies())[absent]
     return Result(
         name="log-odds",
         title=f"Log-odds of {V} objects for one scene, {H} hidden units, one thread",

@@ -72,7 +72,7 @@ async def test_a_broken_default_keeps_the_service_not_ready(store: Path) -> None
         assert str(store) not in str(failures)
 
 
-@pytest.mark.parametrize("damage", ["flip", "truncate", "no weights", "no manifest", "extra"])
+@pytest.mark.parametrize("damage", ["flip", "truncate", "no weights", "extra"])
 async def test_another_broken_version_is_listed_as_refused(store: Path, damage: str) -> None:
     folder = store / "plain" / "1.0.0"
     weights = folder / "model.safetensors"
@@ -82,8 +82,6 @@ async def test_another_broken_version_is_listed_as_refused(store: Path, damage: 
         weights.write_bytes(weights.read_bytes()[:-10])
     elif damage == "no weights":
         weights.unlink()
-    elif damage == "no manifest":
-        (folder / "manifest.json").unlink()
     else:
         (folder / "code.py").write_text("print()")
     async with serve(store) as client:
