@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 
@@ -47,6 +48,14 @@ def test_the_default_is_the_indoor_triway(models):
 
 def test_only_the_current_version_of_each_is_shipped(models):
     assert len(models.entries) == len(SHIPPED)
+
+
+def test_the_terms_of_each_model_are_those_of_its_data(artifact):
+    text = (STORE.root / "TERMS.md").read_text()
+    rows = dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|", text, re.MULTILINE))
+    assert sorted(rows) == SHIPPED
+    restricted = any(source.research_only for source in artifact.manifest.data)
+    assert (rows[artifact.manifest.name].strip() == "research only") == restricted
 
 
 def test_an_artifact_is_small(artifact):
