@@ -59,6 +59,7 @@ SEED = 20180521
 _KEPT = 32
 _LANES = 32
 _ROOM_SWEEPS = 100
+_SETTLED = 1e-7
 
 
 class Completions:
@@ -173,6 +174,8 @@ def _room_weights(weights: Weights, contexts: Floats) -> Floats:
     mixture = np.zeros(len(pull))
     for _ in range(_ROOM_SWEEPS):
         mixture = np.logaddexp.reduce(under - log_z + np.log(sizes), axis=1)
-        log_z = np.logaddexp.reduce(under - mixture[:, None], axis=0)
+        before, log_z = log_z, np.logaddexp.reduce(under - mixture[:, None], axis=0)
         log_z -= log_z[0]
+        if np.abs(log_z - before).max() < _SETTLED:
+            break
     return np.ascontiguousarray((pull[:, : spec.C] - mixture[:, None]).T.astype(np.float32))

@@ -82,8 +82,12 @@ def _strongest(
     """For each column of (names, units) the names of its largest positive weights."""
     if not len(weights):
         return [()] * weights.shape[1]
-    index = np.argsort(-weights.T, axis=1, kind="stable")[:, :count]
-    values = np.take_along_axis(weights.T, index, axis=1)
+    count = min(count, len(weights))
+    largest = np.argpartition(-weights.T, count - 1, axis=1)[:, :count]
+    values = np.take_along_axis(weights.T, largest, axis=1)
+    order = np.lexsort((largest, -values), axis=1)
+    index = np.take_along_axis(largest, order, axis=1)
+    values = np.take_along_axis(values, order, axis=1)
     return [
         tuple((names[i], value) for i, value in zip(places, column, strict=True) if value > 0)
         for places, column in zip(index.tolist(), values.tolist(), strict=True)
