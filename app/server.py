@@ -108,7 +108,7 @@ def _listens(place: socket) -> bool:
 
 def _page(host: str, port: int) -> str:
     """The address of the page, as a browser on the same machine takes it."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 # compared only
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 # nosec B104
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 

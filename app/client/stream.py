@@ -253,7 +253,7 @@ class StreamClient:
                 self._ended = closed
                 raise closed
             # Many robots that lose one service do not come back at once.
-            await asyncio.sleep(self._pause * random.uniform(0.5, 1.0))  # noqa: S311
+            await asyncio.sleep(self._pause * random.uniform(0.5, 1.0))  # noqa: S311 # nosec B311
             self._pause = min(2 * self._pause, _LONGEST_PAUSE)
             try:
                 await self._connect()
