@@ -3,8 +3,8 @@
     RBM  ℓ_t = d_t + U_t·h1
     GBM  ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1
 
-The product RBM's U is formed from its factors. A triple that is not listed has no unit: nothing is
-learnt from it, and its log-odds are `NO_UNIT`.
+The product RBM's U is formed from its factors. Other triples have no unit: the model ignores them
+as evidence, and gives them the log-odds `NO_UNIT`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Places = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _DAMPING: Final = np.float32(0.8)
-# A logit at which nothing is drawn at any temperature.
+# The logit of a relation without a unit in drawn scenes, which is off at any temperature.
 _NEVER: Final = np.float32(-1e4)
 _THREE: Final = np.float32(3.0)
 
@@ -36,25 +36,16 @@ class ListedRelations:
     def __init__(self, weights: Weights) -> None:
         self._spec = weights.spec
         self._W, self._keys = weights["W"], weights.triple_keys
-        # The last row stands for units that do not exist.
-        self._U = np.concatenate([context_rows(weights), np.zeros((1, weights.spec.H1))]).astype(
-            np.float32
-        )
-        self._d = np.append(weights["d"], NO_UNIT)
-        self._g = np.zeros((len(self._d), 2), np.float32)
-        if weights.spec.variant == "gbm":
-            self._g[:-1] = weights["g"]
+        self._U, self._d = context_rows(weights), weights["d"]
+        is_gbm = weights.spec.variant == "gbm"
+        self._g = weights["g"] if is_gbm else np.zeros((weights.spec.T, 2), np.float32)
 
-    def find(self, a: Places, i: Places, j: Places) -> Places:
-        """Rows of units between classes i and j; the last one where there is no unit."""
+    def find(self, a: Places, i: Places, j: Places) -> tuple[Places, Places]:
+        """Of units between classes i and j: those that exist, and their rows."""
         keys = (a * self._spec.V + i) * self._spec.V + j
         rows = np.searchsorted(self._keys, keys)
-        found = np.append(self._keys, -1)[rows] == keys
-        return np.where(found, rows, len(self._keys))
-
-    def exist(self, rows: Places) -> Mask:
-        """Which of the rows that `find` gave are units."""
-        return rows < len(self._keys)
+        there = np.flatnonzero(np.append(self._keys, -1)[rows] == keys)
+        return there, rows[there]
 
     def base(self, rows: Places, v_i: Floats, v_j: Floats) -> Floats:
         """ℓ of units without the context's part."""
@@ -69,9 +60,10 @@ class ListedRelations:
         """ℓ between present classes for h1 (H1,), (A, n, n)."""
         n = len(classes)
         a, i, j = _grid(self._spec.A, n)
-        rows, one = self.find(a, classes[i], classes[j]), np.ones(len(a), np.float32)
-        found = self.base(rows, one, one) + self._U[rows] @ h1
-        found[~self.exist(rows)] = _NEVER
+        there, rows = self.find(a, classes[i], classes[j])
+        one = np.ones(len(rows), np.float32)
+        found = np.full(len(a), _NEVER, np.float32)
+        found[there] = self.base(rows, one, one) + self._U[rows] @ h1
         return found.reshape(self._spec.A, n, n)
 
     def fixed_point(
@@ -79,16 +71,21 @@ class ListedRelations:
     ) -> tuple[Floats, Floats, Floats]:
         """See `RelationPart`; the third are the rows U (E, H1) of the units."""
         del log_counts  # these variants do not see them
-        rows = self.find(given.a, classes[given.i], classes[given.j])
-        base = self.base(rows, presence[given.i], presence[given.j])
-        U, gate = self._U[rows], self.exist(rows) * given.g
+        there, rows = self.find(given.a, classes[given.i], classes[given.j])
+        base = self.base(rows, presence[given.i[there]], presence[given.j[there]])
+        own, r, gate = self._U[rows], given.r[there], given.g[there]
         y, slopes = x, np.zeros(len(rows), np.float32)
         for sweep in range(SWEEPS):
             kept = _DAMPING if sweep else np.float32(0.0)
-            slope = gate * (given.r - sigmoid(base + U @ sigmoid(y)))
+            slope = gate * (r - sigmoid(base + own @ sigmoid(y)))
             slopes = (kept * slopes + (1 - kept) * slope).astype(np.float32)
-            y = (x + slopes @ U).astype(np.float32)
-        return y, slopes, U
+            y = (x + slopes @ own).astype(np.float32)
+        # What is given of other relations says nothing.
+        all_slopes = np.zeros(len(given.a), np.float32)
+        all_slopes[there] = slopes
+        U = np.zeros((len(given.a), len(x)), np.float32)
+        U[there] = own
+        return y, all_slopes, U
 
     def log_odds(self, context: Context, between: Between) -> Floats:
         """See `RelationPart`."""
@@ -106,9 +103,8 @@ class ListedRelations:
     ) -> Floats:
         """Log-odds of units between the classes for y (H1,), or of each unit's own y (E, H1)."""
         a, i, j = units
-        rows = self.find(a, context.classes[i], context.classes[j])
-        there = np.flatnonzero(self.exist(rows))
-        rows, i, j = rows[there], i[there], j[there]
+        there, rows = self.find(a, context.classes[i], context.classes[j])
+        i, j = i[there], j[there]
         base = self.base(rows, context.presence[i], context.presence[j])
         mean = sigmoid(y if y.ndim == 1 else y[there])
         logits, spread = self._normal(rows, base, mean)
@@ -155,8 +151,10 @@ class ListedRelations:
         """See `RelationPart`."""
         del shift  # relations imply nothing for others here
         a, i, j = units
-        rows = self.find(a, context.classes[i], context.classes[j])
-        return self._between(context, units, context.y - slopes[:, None] * self._U[rows])
+        there, rows = self.find(a, context.classes[i], context.classes[j])
+        y = np.tile(context.y, (len(a), 1))
+        y[there] -= slopes[there, None] * self._U[rows]
+        return self._between(context, units, y)
 
     def implied(self, context: Context) -> tuple[Floats, Floats]:
         """Nothing."""
@@ -195,12 +193,11 @@ class ListedRelations:
         presences = np.ones(len(candidates), np.float32), context.presence[anchors]
         if not outgoing:
             ends, presences = ends[::-1], presences[::-1]
-        rows = self.find(relations, *ends)
-        there = np.flatnonzero(self.exist(rows))
+        there, rows = self.find(relations, *ends)
         found = np.full(len(candidates), NO_UNIT, np.float32)
         mean = sigmoid(context.y + self._W[candidates[there]])
-        base = self.base(rows[there], presences[0][there], presences[1][there])
-        logits, spread = self._normal(rows[there], base, mean)
+        base = self.base(rows, presences[0][there], presences[1][there])
+        logits, spread = self._normal(rows, base, mean)
         to_log_odds(logits, spread)
         found[there] = logits
         return found

@@ -1,8 +1,8 @@
 """The hidden layers given objects, the second one at its mean field.
 
-    x = c1 + Q[t] + v'W + J m2,   m1 = sigmoid(x),   m2 = sigmoid(c2 + m1'J)
+    x = c1 + Q[t] + v'W + J m2,   m1 = sigmoid(beta x),   m2 = sigmoid(beta (c2 + m1'J))
 
-from m2 = sigmoid(c2) on, in turn. With one layer x is exact.
+from m2 = sigmoid(beta c2) on, in turn; beta is one over the temperature. With one layer x is exact.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ def sigmoid(x: Floats) -> Floats:
     return found
 
 
-def with_second_layer(weights: Weights, base: Floats) -> tuple[Floats, Floats]:
+def with_second_layer(weights: Weights, base: Floats, beta: float = 1.0) -> tuple[Floats, Floats]:
     """x (B, H1) and m2 (B, H2) for base = c1 + Q[t] + v'W (B, H1)."""
     if not weights.spec.H2:
         return base, np.zeros((len(base), 0), base.dtype)
     J, c2 = weights["J"], weights["c2"]
-    m2 = np.broadcast_to(sigmoid(c2), (len(base), len(c2)))
+    m2 = np.broadcast_to(sigmoid(beta * c2), (len(base), len(c2)))
     for _ in range(SWEEPS):
-        m2 = sigmoid(c2 + sigmoid(base + m2 @ J.T) @ J)
+        m1 = sigmoid(beta * (base + m2 @ J.T))
+        m2 = sigmoid(beta * (c2 + m1 @ J))
     return base + m2 @ J.T, m2

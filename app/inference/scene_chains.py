@@ -33,7 +33,8 @@ Floats = NDArray[np.float32]
 Places = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_OTHER_ROOM = np.float32(6.0)
+OTHER_ROOM = np.float32(6.0)
+"""What a stored scene of another room type loses of its log weight."""
 
 
 class Arrays(NamedTuple):
@@ -177,7 +178,7 @@ class SceneChains:
             return np.zeros(self.machine.spec.N, dtype=np.float32)
         own = self.machine["fantasy_rooms"] == room
         if own.any():
-            return np.where(own, np.float32(0.0), -_OTHER_ROOM)
+            return np.where(own, np.float32(0.0), -OTHER_ROOM)
         hint: Floats = (Q[room][:, None] * self.arrays.mean).sum(0)
         return hint
 
@@ -233,8 +234,17 @@ class ConditionedChains:
         )
         classes = chain_kernels.places(on)
         logits = self._logits(classes, h1)
-        r = chain_kernels.relations(w, self.bias, classes, logits, observed, beta, stream)
+        bias, _ = self._context_bias(classes, float(beta))
+        r = chain_kernels.relations(w, bias, classes, logits, observed, beta, stream)
         return Drawn(classes, chain_kernels.places(h1), chain_kernels.places(h2), logits, r > 0)
+
+    def _context_bias(self, classes: Places, beta: float = 1.0) -> tuple[Floats, Floats]:
+        """c1 + Q[t] + J m2 for present classes, (H1,), and m2 (H2,), the second layer's means."""
+        if not self._machine.spec.H2:
+            return self.bias, np.zeros(0, np.float32)
+        base = self.bias + self._machine["W"][classes].sum(0)
+        x, m2 = with_second_layer(self._machine, base[None], beta)
+        return (self.bias + (x[0] - base)).astype(np.float32), m2[0]
 
     def _logits(self, classes: Places, h1: NDArray[np.uint8]) -> Floats:
         """ℓ between the classes, (A, n, n)."""
@@ -256,14 +266,10 @@ class ConditionedChains:
             shown: (n,) the classes that count as present.
             kept: (A, n, n) the relations that count as on.
         """
-        bias, bound = self.bias, 0.0
-        if self._machine.spec.H2:
-            base = bias + self._machine["W"][drawn.classes[shown]].sum(0)
-            x, m = with_second_layer(self._machine, base[None])
-            bias = (bias + (x[0] - base)).astype(np.float32)
-            inner = m[0][(m[0] > 0) & (m[0] < 1)].astype(np.float64)
-            entropy = -(inner * np.log(inner) + (1 - inner) * np.log1p(-inner)).sum()
-            bound = float(self._machine["c2"] @ m[0] + entropy)
+        bias, m = self._context_bias(drawn.classes[shown])
+        inner = m[(m > 0) & (m < 1)].astype(np.float64)
+        entropy = -(inner * np.log(inner) + (1 - inner) * np.log1p(-inner)).sum()
+        bound = float(self._machine["c2"] @ m + entropy)
         score: float = chain_kernels.log_score(
             self._arrays, bias, drawn.classes, shown, drawn.logits, kept
         )
@@ -279,9 +285,8 @@ def _observed(w: Arrays, conditions: Conditions, listed: ListedRelations | None)
         z, base = chain_kernels.observed_units(w, classes, conditions.log_counts, a, i, j)
     else:
         # What has no unit says nothing of the context.
-        rows = listed.find(a, classes[i], classes[j])
-        known = np.flatnonzero(listed.exist(rows))
-        rows, a, i, j = (part[known] for part in (rows, a, i, j))
+        known, rows = listed.find(a, classes[i], classes[j])
+        a, i, j = (part[known] for part in (a, i, j))
         r = r[known]
         one = np.ones(len(a), np.float32)
         z, base = np.ascontiguousarray(listed.rows(rows).T), listed.base(rows, one, one)

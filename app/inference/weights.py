@@ -94,9 +94,14 @@ class Weights:
         keys: NDArray[np.int64] = (relation * self.spec.V + subject) * self.spec.V + object_
         return keys
 
-    @cached_property
+    @property
     def scenes(self) -> NDArray[np.float32]:
-        """(N, V) presence in the stored scenes."""
-        octets = self["fantasies"].astype("<i4").view(np.uint8).reshape(self.spec.N, -1)
-        bits = np.unpackbits(octets, axis=1, bitorder="little", count=self.spec.V)
-        return bits.astype(np.float32)
+        """(N, V) presence in the stored scenes; unpacked anew each time, since they are large."""
+        return unpack_scenes(self["fantasies"], self.spec.V)
+
+
+def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:
+    """Presence (N, V) of scenes as bits, (N, words)."""
+    octets = packed.astype("<i4").view(np.uint8).reshape(len(packed), -1)
+    bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
+    return bits.astype(np.float32)

@@ -246,37 +246,39 @@ def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
     assert (found[:, 40 + condition.held] == 1).all()
 
 
-def test_relations_that_imply_each_other_are_drawn_as_by_tensors():
+@pytest.mark.parametrize("temperature", [1.0, 1.6])
+@pytest.mark.parametrize("layers", [0, 4])
+def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, temperature):
     """Three classes, one relation, strong implications: the law of its six units from 40,000 draws
-    each. Two samples: total variation within its mean and 1e-9 of McDiarmid."""
+    each. Two samples: total variation within its mean and 1e-9 of McDiarmid.
+
+    How strictly implications hold is for the context to say, a second layer included.
+    """
     rows = 40_000
-    spec = MachineSpec("triway", V=3, A=1, H1=3, K=2, G=2, form="local")
+    spec = MachineSpec("triway", V=3, A=1, H1=3, H2=layers, K=2, G=2, form="local")
     generator = torch.Generator().manual_seed(4)
     machine = build(spec).requires_grad_(False)
     for parameter in machine.parameters():
         parameter.copy_(torch.randn(parameter.shape, generator=generator))
     machine.kappa.zero_()
     v, h1 = torch.ones(rows, 3), torch.tensor([[1.0, 0, 1]]).expand(rows, -1)
-    _, r = sample_relations(machine, v, h1, generator)
-    chains = SceneChains(weights_of(machine))
-    w, nothing = chains.arrays, chains.given(conditions())
-    classes = np.arange(3)
-    logits = chain_kernels.relation_logits(w, classes, np.array([1, 0, 1], np.uint8))
+    _, r = sample_relations(machine.scaled(1 / temperature), v, h1, generator)
+    chains = SceneChains(weights_of(machine)).given(conditions(), temperature)
+    on, second = np.array([1, 0, 1], np.uint8), np.zeros(layers, np.uint8)
     off = ~np.eye(3, dtype=bool)
     bits = 1 << np.arange(6)
     expected = np.bincount(r.view(-1, 3, 3).numpy()[:, off].astype(int) @ bits, minlength=64) / rows
     found = np.zeros(64)
     for chain in range(rows):
-        stream = philox.stream(0, chain)
-        drawn = chain_kernels.relations(
-            w, nothing.bias, classes, logits, nothing.observed, np.float32(1), stream
-        )
-        found[drawn[0][off] @ bits] += 1 / rows
+        # No sweep: relations are drawn where the chain stands.
+        stands = np.ones(3, np.uint8), on.copy(), second.copy()
+        drawn = chains.move(*stands, 0, philox.stream(0, chain))
+        found[drawn.r[0][off] @ bits] += 1 / rows
     mean = 0.5 * np.sqrt(4 * expected * (1 - expected) / (math.pi * rows)).sum()
     slack = math.sqrt(9 * math.log(10) / rows)
     assert 0.5 * np.abs(found - expected).sum() < 1.1 * mean + slack
     # The test could not pass without implications.
-    alone = 1 / (1 + np.exp(-logits[0][off]))
+    alone = 1 / (1 + np.exp(-drawn.logits[0][off] / temperature))
     independent = np.array(
         [np.prod(np.where(row >> np.arange(6) & 1, alone, 1 - alone)) for row in range(64)]
     )
