@@ -7,7 +7,7 @@ import ctypes
 import gc
 import logging
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from functools import wraps
 from pathlib import Path
 from typing import Concatenate, Literal, ParamSpec, TypeVar
@@ -33,7 +33,7 @@ from app.serving.errors import (
 )
 from app.serving.metrics import Change as Counted
 from app.serving.metrics import Metrics
-from app.serving.models import DEFAULT, ServedModels, prepare
+from app.serving.models import DEFAULT, Key, ServedModels, prepare
 from app.serving.queue import Threads, Ticket, WorkQueue
 from app.serving.reading import Limits
 from app.serving.record import RequestRecord
@@ -192,15 +192,14 @@ class Runtime:
             NotReadyError: nothing has been loaded yet.
         """
         async with self._changing:
-            old = self.models
-            new = await self._take_over(
-                lambda subject: subject == DEFAULT or subject not in old.failures
-            )
+            # Not the old snapshot itself: its memory is to be free when the new one settles.
+            failed, served = set(self.models.failures), set(self.models.served)
+            new = await self._take_over(lambda subject: subject == DEFAULT or subject not in failed)
             return RefreshAnswer(
                 request_id=request_id,
                 default=new.resolve(DEFAULT).reference,
-                added=_names(new, but_not=old),
-                removed=_names(old, but_not=new),
+                added=_names(set(new.served) - served),
+                removed=_names(served - set(new.served)),
                 failures=list(new.failures.values()),
             )
 
@@ -333,10 +332,8 @@ def _refusal(error: StoreError) -> Exception:
             return StoreNotWritableError(f"The store's aliases cannot be changed: {error.reason}.")
 
 
-def _names(models: ServedModels, *, but_not: ServedModels) -> list[str]:
-    return [
-        f"{name}@{version}" for name, version in sorted(set(models.served) - set(but_not.served))
-    ]
+def _names(keys: Iterable[Key]) -> list[str]:
+    return [f"{name}@{version}" for name, version in sorted(keys)]
 
 
 def _settle_memory() -> None:
