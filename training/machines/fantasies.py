@@ -28,23 +28,22 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from app.inference import weights
+from app.inference.scene_chains import OTHER_ROOM
 from training.machines.bernoulli import bernoulli
 from training.machines.gibbs import FREE, Clamp, State, initial_state
 from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
 
-_WORD = 32
-OTHER_ROOM = 6.0
-
 
 def words(classes: int) -> int:
     """32-bit words that a scene of so many classes takes."""
-    return -(-classes // _WORD)
+    return -(-classes // weights.WORD)
 
 
 def pack_scenes(v: Tensor) -> Tensor:
     """Presence (N, V) as bits, (N, words) int32."""
-    bits = np.zeros((len(v), words(v.shape[1]) * _WORD), dtype=np.uint8)
+    bits = np.zeros((len(v), words(v.shape[1]) * weights.WORD), dtype=np.uint8)
     bits[:, : v.shape[1]] = v.numpy() > 0
     packed = np.packbits(bits, axis=1, bitorder="little").view("<i4").astype(np.int32)
     return torch.from_numpy(packed)
@@ -52,9 +51,7 @@ def pack_scenes(v: Tensor) -> Tensor:
 
 def unpack_scenes(packed: Tensor, classes: int) -> Tensor:
     """Presence (N, V) float of scenes as bits."""
-    octets = packed.numpy().astype("<i4").view(np.uint8).reshape(len(packed), -1)
-    bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
-    return torch.from_numpy(bits).float()
+    return torch.from_numpy(weights.unpack_scenes(packed.numpy(), classes))
 
 
 class Fantasies:
@@ -103,7 +100,7 @@ class Fantasies:
             known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
             own = self.machine.fantasy_rooms == clamp.room.unsqueeze(1)
             hint = self._room.T[clamp.room.clamp(min=0)]
-            hint = torch.where(own.any(1, keepdim=True), -OTHER_ROOM * ~own, hint)
+            hint = torch.where(own.any(1, keepdim=True), -float(OTHER_ROOM) * ~own, hint)
             weight = weight + known * hint
         if clamp.h1 is not None:
             weight = weight + clamp.h1.to(given.dtype) @ self._unit.T

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from app.inference.mean_field import SWEEPS
 from training.machines.draws import HiddenDraws, draw_hidden
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
-from training.machines.mean_field import SWEEPS, Evidence, mean_field
+from training.machines.mean_field import Evidence, mean_field
 
 
 class _ContextGain(torch.autograd.Function):

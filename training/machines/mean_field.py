@@ -11,16 +11,13 @@ otherwise. With one layer and nothing but observed relations (seed) or none (loc
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from app.inference.mean_field import SWEEPS
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
-
-# Enough for the slopes to settle on the machines we ship; fixed, so that answers repeat.
-SWEEPS = 10
 
 
 @dataclass(frozen=True)
@@ -57,16 +54,6 @@ class Evidence:
         if machine.spec.form == "local" and not bool(self.observed.any()):
             return None
         return self.edges, self.r, self.observed
-
-
-class Pull(NamedTuple):
-    """How strongly observed relations act on the context, from 0 to 1, by kind of question."""
-
-    objects: float = 1.0
-    relations: float = 1.0
-
-
-FULL = Pull()
 
 
 @dataclass(frozen=True)

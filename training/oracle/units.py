@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from app.inference import relation_kernels
 from training.machines import BoltzmannMachine, Triway
 from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
 
-# Stands for the log-odds of a unit that does not exist, and bounds those of the units that do.
-NO_UNIT = -30.0
+# As a plain number: tensors do not take numpy's.
+NO_UNIT = float(relation_kernels.NO_UNIT)
 
 
 @dataclass(frozen=True)
