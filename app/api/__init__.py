@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import Depends, FastAPI
+from fastapi import FastAPI
 from starlette.types import Lifespan
 
 from app.api import (
@@ -20,7 +20,6 @@ from app.api import (
     stream,
     telemetry,
 )
-from app.api.dependencies import limit_deadline
 from app.serving.runtime import Runtime
 from app.serving.stream import Streams
 from app.settings import Settings
@@ -58,17 +57,17 @@ def build(
         backlog=lambda: runtime.backlog,
         is_draining=lambda: runtime.draining,
     )
-    app.include_router(stream.router)
     for router in (
         questions.router,
         batches.router,
+        stream.router,
         # Before what it shares addresses with: the first that fits an address names its methods.
         models.administration,
         models.router,
         health.router,
         health.protocol,
     ):
-        app.include_router(router, dependencies=[Depends(limit_deadline)])
+        app.include_router(router)
     if settings.metrics:
         app.include_router(monitoring.router)
     pages.install(app, docs=settings.docs)

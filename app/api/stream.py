@@ -26,6 +26,7 @@ from app.messages import (
     Ping,
     Pong,
     ProblemMessage,
+    SceneMessage,
     StreamLimits,
 )
 from app.schemas import FieldError
@@ -181,12 +182,18 @@ class _Conversation:
         is_first = isinstance(command, Open)
         if is_first == self._is_open:
             raise _unfit("the first message, and no other, must be open")
+        self._check_deadline(command)
         self._scene.take(command, self._session())
         if is_first:
             self._is_open = True
             await self._send_model(self._opened())
         if command.objects or not is_first:
             self._due.set()
+
+    def _check_deadline(self, message: SceneMessage) -> None:
+        most = self._settings.max_request_timeout_ms
+        if (message.timeout_ms or 0) > most:
+            raise _unfit(f"must be at most {most}", "timeout_ms")
 
     def _opened(self) -> Opened:
         settings = self._settings
@@ -262,7 +269,7 @@ def _command(kind: str, value: Any) -> Command:
         raise unfit(error, value) from None
 
 
-def _unfit(message: str) -> ProblemError:
-    fault = FieldError(pointer="#/type", message=message)
+def _unfit(message: str, field: str = "type") -> ProblemError:
+    fault = FieldError(pointer=f"#/{field}", message=message)
     detail = "The message has 1 fault; see errors."
     return ProblemError(catalogue.INVALID_REQUEST, detail, errors=[fault])

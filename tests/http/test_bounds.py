@@ -210,7 +210,7 @@ def _turnstile(begun: list[str], limit: int, backlog: Callable[[], int] = lambda
         begun.append(scope["path"])
         await send({"type": "http.response.start", "status": 200, "headers": []})
 
-    return Turnstile(answer, limit=limit, timeout=10.0, backlog=backlog)
+    return Turnstile(answer, limit=limit, timeout=10.0, longest_ms=60_000, backlog=backlog)
 
 
 @pytest.mark.anyio

@@ -162,6 +162,14 @@ def test_an_opening_may_bring_the_scene(live: LiveService) -> None:
         assert (answer["type"], answer["seq"], answer["superseded"]) == ("answer", 0, 0)
 
 
+def test_the_server_limits_the_deadlines_of_streams(live: LiveService) -> None:
+    with opened(live) as stream:
+        refused = talk(stream, "open", timeout_ms=60_001)
+        is_problem(refused, 422, "invalid-request")
+        assert refused["problem"]["errors"][0]["pointer"] == "#/timeout_ms"
+        assert talk(stream, "open", timeout_ms=60_000)["type"] == "opened"
+
+
 def test_a_question_that_fails_alone_carries_its_problem(live: LiveService) -> None:
     with opened(live) as stream:
         ask = {"missing": {"at": {"relation": "on-top", "object": "desk"}}, "outliers": {}}

@@ -38,6 +38,7 @@ def install(
         Turnstile,
         limit=settings.queue_requests,
         timeout=settings.request_timeout_ms / 1e3,
+        longest_ms=settings.max_request_timeout_ms,
         backlog=backlog,
         is_draining=is_draining,
     )

@@ -32,7 +32,6 @@ REFUSALS: Final = 8
 """Requests refused in one tick."""
 
 TIMEOUT_HEADER: Final = "X-Request-Timeout-Ms"
-MAX_TIMEOUT_MS: Final = 600_000
 
 _TIMEOUT: Final = re.compile(r"[1-9][0-9]{0,5}")
 # Seconds between two looks at whether the models have caught up.
@@ -56,6 +55,7 @@ class Turnstile:
     Args:
         limit: most requests that wait.
         timeout: seconds that a request has that sends no header of its own.
+        longest_ms: most milliseconds that a header may ask for.
         backlog: how many of those begun are still worked for.
         is_draining: whether nothing new is to be begun.
     """
@@ -66,12 +66,14 @@ class Turnstile:
         *,
         limit: int,
         timeout: float,
+        longest_ms: int,
         backlog: Callable[[], int] = lambda: 0,
         is_draining: Callable[[], bool] = lambda: False,
     ) -> None:
         self.app = app
         self.limit = limit
         self.timeout = timeout
+        self.longest_ms = longest_ms
         self.backlog = backlog
         self.is_draining = is_draining
         self._ticking = False
@@ -104,11 +106,11 @@ class Turnstile:
         given = Headers(scope=scope).get(TIMEOUT_HEADER)
         if given is None:
             return self.timeout
-        if not _TIMEOUT.fullmatch(given) or int(given) > MAX_TIMEOUT_MS:
+        if not _TIMEOUT.fullmatch(given) or int(given) > self.longest_ms:
             raise ProblemError(
                 catalogue.BAD_REQUEST,
-                f"{TIMEOUT_HEADER} must be a whole number of milliseconds from 1 to "
-                f"{MAX_TIMEOUT_MS}.",
+                f"{TIMEOUT_HEADER} must be a whole number, from 1 to "
+                f"{self.longest_ms} milliseconds.",
             )
         return int(given) / 1e3
 
