@@ -1,8 +1,11 @@
 """Log-odds of a scene's objects and relations in closed form.
 
 For machines in the local form. Without given relations p(h1 | v) is factorial, with means
-m = sigmoid(x), x = c1 + Q[t] + v'W + J m2, where m2, the second layer if there is one, is held at
-its mean field given the objects. Given relations, h1 is taken as at its mean field,
+
+    m = sigmoid(x),   x = c1 + Q[t] + v'W + J m2
+
+A second layer is held at its mean field m2 given the objects. With given relations, h1 is held at
+its mean field,
 
     y = x + sum_{e given} slope_e U_e,   slope_e = g_e (r_e - sigmoid(ℓ_e(m))),   m = sigmoid(y)
 
@@ -13,10 +16,10 @@ objects and another for those about relations (`Pull`). So in any case
     object     log-odds_i = b_i + sum_k [softplus(y_k + W_ik) - softplus(y_k)]
     relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))],  ℓ_e(h1) = ℓ_e(m) + sum_k U_ek (h1_k - m_k)
 
-What is judged is taken out of y first: its own slope for a given relation, and W_i with the slopes
-of all its relations and its part in the second layer for an object that is present, the other
-slopes held. A slope that is small is taken out to first order: ℓ_e(m) changes by slope_e σ_e², with
-σ_e² as below.
+The closed form takes the judged unit out of y first. For a given relation that is its own slope.
+For a present object it is W_i, the slopes of all its relations, and its part in the second layer.
+The other slopes stay. A small slope is taken out to first order: ℓ_e(m) changes by slope_e σ_e²,
+with σ_e² as below.
 
 The logit is a sum of many small independent terms, taken as normal with variance
 
@@ -67,7 +70,7 @@ class WithoutEach(NamedTuple):
     Attributes:
         gain: (n,) of each class given all others.
         off: (H,) sigmoid(-y), filled up as the loops need it.
-        rest: (n, H) sigmoid(y) e^-share of each class, the share being what it adds to y.
+        rest: (n, H) sigmoid(y) e^-share of each class, for its share of y.
         fall: (n, H) e^-share.
         growth: (n, H) e^W.
     """
@@ -82,7 +85,7 @@ class WithoutEach(NamedTuple):
 class ClosedForm:
     """What a machine says of scenes.
 
-    The same scene gives the same bits, whatever is asked before, after or beside it.
+    The same scene gives the same bits, independent of other questions.
 
     Raises:
         ValueError: a machine of another kind; see `fits`.

@@ -1,4 +1,4 @@
-"""What a variant's relations have to say of a scene, and what they are told."""
+"""The interface between the closed form and the relations of a variant."""
 
 from __future__ import annotations
 
