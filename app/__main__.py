@@ -52,8 +52,12 @@ def _give_back_what_is_large() -> None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
 
 
-def _bind(host: str, port: int) -> list[socket.socket]:
+def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     """Sockets for all addresses of a host; a connection is refused until the server listens.
+
+    Args:
+        send_timeout: seconds after which Linux ends a connection whose client acknowledges nothing
+            of what it is sent. Elsewhere only a proxy bounds that.
 
     Raises:
         OSError: the host has no usable address, or the port is not free.
@@ -67,6 +71,9 @@ def _bind(host: str, port: int) -> list[socket.socket]:
             place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if family == socket.AF_INET6:
                 place.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # connections inherit it
+                milliseconds = int(send_timeout * 1e3)
+                place.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
             place.bind(address)
         except OSError as error:
             # A name such as localhost may have an address of a kind that the machine lacks.
@@ -102,7 +109,7 @@ def serve(settings: Settings, began: float) -> int:
         The exit status: not 0 where the service did not start.
     """
     try:
-        sockets = _bind(settings.host, settings.port)
+        sockets = _bind(settings.host, settings.port, settings.client_timeout)
     except OSError as error:
         return _refuse_address(settings, error)
     # What starting makes stays: looking through it for garbage takes a fifth of the time. The

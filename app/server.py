@@ -9,16 +9,23 @@ import signal
 from socket import SO_ACCEPTCONN, SOL_SOCKET, socket
 from time import monotonic
 from types import FrameType
+from typing import Final
 
 import uvicorn
 
-from app.api import connections, sockets
 from app.main import create_app
 from app.serving.errors import ServingError
 from app.serving.logs import log_config
 from app.serving.runtime import Runtime
 from app.serving.stream import Streams
 from app.settings import Settings
+
+# Seconds that an idle connection is kept. A proxy in front must close its own first, or it sends
+# requests on connections that are about to be closed.
+KEEP_ALIVE: Final = 20
+
+# Seconds that streams have at least for their last message.
+LEAVE: Final = 0.3
 
 _logger = logging.getLogger("app.server")
 
@@ -31,6 +38,10 @@ class Server(uvicorn.Server):
     what is under way is finished. A second signal, or Ctrl-C, leaves the first step out.
 
     Args:
+        config: of uvicorn.
+        runtime: drained before the end.
+        streams: drained before the end.
+        drain_seconds: from SIGTERM until the listening socket is closed.
         began: `time.monotonic()` when the start began.
     """
 
@@ -81,10 +92,9 @@ class Server(uvicorn.Server):
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Uvicorn's handler of signals."""
-        if sig == signal.SIGTERM and not self._runtime.draining and self._drain_seconds:
+        if sig == signal.SIGTERM and not self._runtime.draining:
             self._runtime.drain()
-            self._captured_signals.append(sig)
-            self._closing_at = monotonic() + self._drain_seconds
+            self._closing_at = monotonic() + max(self._drain_seconds, LEAVE)
             return
         self._runtime.drain()
         super().handle_exit(sig, frame)
@@ -95,7 +105,8 @@ class Server(uvicorn.Server):
         if self._runtime.draining:
             self._streams.drain()
         if self._closing_at is not None and monotonic() >= self._closing_at:
-            self.should_exit = True
+            self._closing_at = None
+            super().handle_exit(signal.SIGTERM, None)
         return await super().on_tick(counter)
 
 
@@ -124,14 +135,25 @@ def build(settings: Settings, began: float) -> Server:
         host=settings.host,
         port=settings.port,
         root_path=settings.root_path,
-        http=connections.guarded(settings.client_timeout),
-        ws=sockets.guarded(settings.client_timeout),
+        http="httptools",
+        ws="websockets-sansio",
         ws_max_size=settings.max_body_bytes,
         ws_ping_interval=settings.client_timeout,
         ws_ping_timeout=settings.client_timeout,
+        ws_per_message_deflate=False,
+        limit_concurrency=settings.max_connections,
+        timeout_keep_alive=KEEP_ALIVE,
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,
         server_header=False,
+        # The service uses neither a client's address nor its scheme: it believes no X-Forwarded-*.
+        proxy_headers=False,
         timeout_graceful_shutdown=settings.drain_timeout,
     )
+    if settings.is_open:
+        _logger.warning(
+            "SCENE_HOST lets other machines in, and SCENE_API_KEY is not set: whoever reaches "
+            "port %d may ask",
+            settings.port,
+        )
     return Server(config, app.state.runtime, app.state.streams, settings.drain_seconds, began)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 from importlib.util import find_spec
+from ipaddress import IPv6Address, ip_address
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 from urllib.parse import urlsplit
 
 from pydantic import BeforeValidator, Field, SecretStr, ValidationInfo, field_validator
@@ -34,6 +36,25 @@ def _lower(value: object) -> object:
 
 def _words(value: object) -> object:
     return tuple(value.replace(",", " ").split()) if isinstance(value, str) else value
+
+
+LOOPBACK: Final = frozenset(("127.0.0.1", "localhost", "[::1]"))
+"""Names of this machine in a Host header."""
+
+_ANY_HOST: Final = "*"
+_HOST: Final = re.compile(r"[a-z0-9_]([a-z0-9._-]*[a-z0-9_])?")
+
+
+def _in_host_header(text: str) -> str:
+    """A name or an address as it stands in a Host header.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    name = text.lower()
+    if _HOST.fullmatch(name):
+        return name
+    return f"[{IPv6Address(name.removeprefix('[').removesuffix(']'))}]"
 
 
 def _is_origin(text: str) -> bool:
@@ -100,9 +121,27 @@ class Settings(BaseSettings):
             "`https://panel.example:8443`, parted by commas; none by default"
         ),
     ] = ()
+    allowed_hosts: Annotated[
+        tuple[str, ...],
+        NoDecode,
+        BeforeValidator(_words),
+        Field(
+            description="names and addresses that clients may use for this service, parted by "
+            "commas and without ports; `*` allows all; by default those of this machine, and "
+            "SCENE_HOST where that is one address"
+        ),
+    ] = ()
+    max_connections: Annotated[
+        int,
+        Field(ge=1, le=2**20, description="connections from which on requests get a plain 503"),
+    ] = 1024
     max_body_bytes: Annotated[
         int, Field(ge=1024, le=64 * 2**20, description="largest request body")
     ] = 2 * 2**20
+    held_body_bytes: Annotated[
+        int,
+        Field(ge=2**20, le=2**36, description="bytes of all request bodies that are held at once"),
+    ] = 64 * 2**20
     max_objects: Annotated[
         int, Field(ge=1, le=MAX_OBJECTS, description="most objects in one scene")
     ] = MAX_OBJECTS
@@ -159,8 +198,8 @@ class Settings(BaseSettings):
             ge=0.1,
             le=3600,
             allow_inf_nan=False,
-            description="seconds a client may take to send a request's head, then its body, and to "
-            "take in the answer",
+            description="seconds a client may take to send a request's body, to acknowledge what "
+            "it is sent, and to answer a stream's pings",
         ),
     ] = 20
     retry_after: Annotated[
@@ -170,7 +209,9 @@ class Settings(BaseSettings):
     opentelemetry: Annotated[
         bool, Field(description="send traces to where OTEL_EXPORTER_OTLP_ENDPOINT says")
     ] = False
-    docs: Annotated[bool, Field(description="serve the visual page, /docs and /redoc")] = True
+    docs: Annotated[
+        bool, Field(description="serve the visual page, /docs, /redoc and /openapi.json")
+    ] = True
     root_path: Annotated[
         str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")
     ] = ""
@@ -184,6 +225,48 @@ class Settings(BaseSettings):
     def secrets(self) -> list[str]:
         """What no log may hold."""
         return [key.get_secret_value() for key in (self.admin_key, self.api_key) if key]
+
+    @property
+    def accepted_hosts(self) -> frozenset[str] | None:
+        """What a Host header may name, without the port; None where it may name anything."""
+        if _ANY_HOST in self.allowed_hosts:
+            return None
+        if self.allowed_hosts:
+            return frozenset(self.allowed_hosts)
+        return LOOPBACK if self._listens_everywhere else LOOPBACK | {_in_host_header(self.host)}
+
+    @property
+    def is_open(self) -> bool:
+        """Whether other machines may ask without a key."""
+        is_local = self.host.startswith("127.") or self.host in {"localhost", "::1"}
+        return self.api_key is None and not is_local
+
+    @property
+    def _listens_everywhere(self) -> bool:
+        try:
+            return ip_address(self.host).is_unspecified
+        except ValueError:  # a name
+            return False
+
+    @field_validator("host")
+    @classmethod
+    def _is_host(cls, value: str) -> str:
+        try:
+            _in_host_header(value)
+        except ValueError:
+            raise ValueError("SCENE_HOST must be an address or a name") from None
+        return value
+
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _are_hosts(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        try:
+            return tuple(name if name == _ANY_HOST else _in_host_header(name) for name in value)
+        except ValueError:
+            raise ValueError(
+                "SCENE_ALLOWED_HOSTS must list names and addresses without scheme, port and "
+                "wildcard, or be *"
+            ) from None
 
     @field_validator("store")
     @classmethod

@@ -38,6 +38,7 @@ def build(
     """
     app = openapi.DocumentedAPI(
         lifespan=lifespan,
+        openapi_url="/openapi.json" if settings.docs else None,
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,

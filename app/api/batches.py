@@ -39,6 +39,7 @@ _PROBLEMS: Final = queued(
     catalogue.NOT_JSON,
     catalogue.REQUEST_TIMEOUT,
     catalogue.BODY_TOO_LARGE,
+    catalogue.BODIES_FULL,
     catalogue.UNSUPPORTED_MEDIA_TYPE,
     catalogue.INVALID_REQUEST,
     catalogue.NOT_READY,

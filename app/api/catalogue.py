@@ -40,21 +40,23 @@ BAD_REQUEST: Final = ProblemType(
     "bad-request",
     400,
     "The request could not be read",
-    "The connection broke off, the request breaks HTTP, or its X-Request-Timeout-Ms is no whole "
+    "The connection broke off before the body was complete, or X-Request-Timeout-Ms is not a whole "
     "number of milliseconds from 1 to SCENE_MAX_REQUEST_TIMEOUT_MS.",
 )
 REQUEST_TIMEOUT: Final = ProblemType(
     "request-timeout",
     408,
     "The request did not come in time",
-    "The head of a request, and then its body, must each have come within SCENE_CLIENT_TIMEOUT "
-    "seconds. The connection is closed; send the request again on a new one.",
+    "The body of a request must arrive within SCENE_CLIENT_TIMEOUT seconds of its head. "
+    "The connection is closed; send the request again on a new one.",
 )
-HEAD_TOO_LARGE: Final = ProblemType(
-    "head-too-large",
-    431,
-    "The request line and headers are over the limit",
-    "Send fewer or shorter headers. The connection is closed.",
+HOST_REFUSED: Final = ProblemType(
+    "host-refused",
+    421,
+    "The service does not answer under this name",
+    "The Host header must be one of the names in SCENE_ALLOWED_HOSTS; the port does not matter. "
+    "By default these are 127.0.0.1, localhost, [::1] and the address in SCENE_HOST. "
+    "Add the name that your clients use. Health checks answer under every name.",
 )
 UNAUTHORIZED: Final = ProblemType(
     "unauthorized",
@@ -76,7 +78,7 @@ NOT_FOUND: Final = ProblemType(
     "not-found",
     404,
     "There is nothing at this address",
-    "No route has this path. /openapi.json lists the routes.",
+    "No route has this path. /openapi.json lists the routes, unless SCENE_DOCS is off.",
 )
 MODEL_NOT_FOUND: Final = ProblemType(
     "model-not-found",
@@ -131,6 +133,13 @@ BODY_TOO_LARGE: Final = ProblemType(
     413,
     "The body is over the limit",
     "Send fewer scenes at once. The limit, SCENE_MAX_BODY_BYTES, holds for chunked bodies too.",
+)
+BODIES_FULL: Final = ProblemType(
+    "bodies-full",
+    503,
+    "The service holds too many bytes of request bodies",
+    "Bodies of all requests in progress may take SCENE_HELD_BODY_BYTES together. Bodies of at most "
+    "64 KiB that arrive at once are always accepted. Retry-After says when to ask again.",
 )
 UNSUPPORTED_MEDIA_TYPE: Final = ProblemType(
     "unsupported-media-type",
@@ -249,7 +258,8 @@ PROBLEM_TYPES: Final[dict[str, ProblemType]] = {
         UNKNOWN_LABELS,
         CONTRADICTORY_EVIDENCE,
         ANSWER_TOO_LARGE,
-        HEAD_TOO_LARGE,
+        HOST_REFUSED,
+        BODIES_FULL,
         INTERNAL_ERROR,
         NOT_READY,
         MODEL_UNAVAILABLE,

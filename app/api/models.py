@@ -110,6 +110,7 @@ async def refresh_models(runtime: RuntimeDep, request_id: RequestId) -> RefreshA
         catalogue.STORE_BUSY,
         catalogue.REQUEST_TIMEOUT,
         catalogue.BODY_TOO_LARGE,
+        catalogue.BODIES_FULL,
         catalogue.UNSUPPORTED_MEDIA_TYPE,
         catalogue.INVALID_REQUEST,
         catalogue.NOT_READY,

@@ -10,6 +10,7 @@ from fastapi.routing import APIRoute
 from app.api import catalogue, examples, keys
 from app.api.catalogue import ProblemType
 from app.api.example_requests import REQUESTS
+from app.api.middleware.hosts import HEALTH
 from app.api.middleware.turnstile import TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE, ProblemError
 from app.schemas import MAX_SEED, FieldError, Problem
@@ -133,6 +134,8 @@ class DocumentedAPI(FastAPI):
             schemas.pop("ValidationError", None)
             if self.state.settings.api_key is not None:
                 _ask_for_keys(document)
+            if self.state.settings.accepted_hosts is not None:
+                _refuse_other_hosts(document)
             _state_whole_numbers(document)
         return super().openapi()
 
@@ -147,6 +150,14 @@ def _timeout_parameter(most: int) -> dict[str, Any]:
         "schema": {"type": "integer", "minimum": 1, "maximum": most},
         "examples": {"second": {"summary": "a second", "value": min(1000, most)}},
     }
+
+
+def _refuse_other_hosts(document: dict[str, Any]) -> None:
+    """Say of each operation but health checks that it answers under some names only."""
+    kind = catalogue.HOST_REFUSED
+    for path, operations in document["paths"].items():
+        for operation in () if path.endswith(HEALTH) else operations.values():
+            operation["responses"][str(kind.status)] = problems(kind)[kind.status]
 
 
 def _ask_for_keys(document: dict[str, Any]) -> None:

@@ -29,6 +29,7 @@ PROBLEMS: Final = queued(
     catalogue.MODEL_NOT_FOUND,
     catalogue.REQUEST_TIMEOUT,
     catalogue.BODY_TOO_LARGE,
+    catalogue.BODIES_FULL,
     catalogue.UNSUPPORTED_MEDIA_TYPE,
     catalogue.INVALID_REQUEST,
     catalogue.UNKNOWN_LABELS,

@@ -57,6 +57,7 @@ class InProcess(httpx.BaseTransport):
                 metrics=False,
                 access_log=False,
                 docs=False,
+                allowed_hosts=("*",),
             )
         except ValidationError:
             fault = FieldError(pointer="#", message="the store must be an existing directory")

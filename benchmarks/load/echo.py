@@ -14,7 +14,6 @@ from fastapi import APIRouter, FastAPI
 
 from app.api import middleware, problems
 from app.api.body import JSONRoute
-from app.api.connections import guarded
 from app.api.dependencies import RequestId
 from app.schemas import (
     Because,
@@ -185,7 +184,7 @@ if __name__ == "__main__":
     uvicorn.run(
         build(settings),
         port=int(sys.argv[1]),
-        http=guarded(settings.client_timeout),
+        http="httptools",
         ws="none",
         log_config=log_config(settings.log_level, settings.log_format),
         access_log=False,

@@ -138,7 +138,7 @@ def test_drawings_are_requests_too() -> None:
 @pytest.mark.anyio
 @pytest.mark.parametrize("kind", KINDS)
 async def test_the_echo_answers_as_large_as_it_is_asked(kind: str, tmp_path: Path) -> None:
-    app = echo.build(Settings(store=tmp_path))
+    app = echo.build(Settings(store=tmp_path, allowed_hosts=["echo"]))
     transport = httpx.ASGITransport(app)
     async with httpx.AsyncClient(transport=transport, base_url="http://echo") as client:
         scene = bodies(kind, LABELS)[0]

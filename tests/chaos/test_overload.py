@@ -35,7 +35,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     folder = tmp_path_factory.mktemp("overload")
     store = make_store(folder / "store")
     # A line a request on a disk that others use is no part of what is tested.
-    with running(store, folder / "log", access_log="false") as service:
+    with running(store, folder / "log", access_log="false", max_connections="4096") as service:
         yield service
 
 

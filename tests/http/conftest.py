@@ -21,6 +21,8 @@ from app.settings import Settings
 from tests.http.stores import make_store
 
 ADMIN_KEY = "correct-horse-battery-staple"
+NAMED = {"allowed_hosts": ["service"]}
+"""Settings of a service in process, which its clients call http://service."""
 
 Serve = Callable[..., AbstractAsyncContextManager[httpx.AsyncClient]]
 
@@ -28,7 +30,7 @@ Serve = Callable[..., AbstractAsyncContextManager[httpx.AsyncClient]]
 @asynccontextmanager
 async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient]:
     """A client of the application over a store, inside its lifespan."""
-    app = create_app(Settings(store=store, **{"admin_key": ADMIN_KEY, **settings}))
+    app = create_app(Settings(store=store, **{"admin_key": ADMIN_KEY, **NAMED, **settings}))
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
         app.router.lifespan_context(app),

@@ -1,4 +1,4 @@
-"""Clients that are slow, leave, or do not read: bounded each, and nobody else waits for them."""
+"""Clients that are slow, leave, or do not read: bounded without a proxy too."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ import json
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import suppress
-from typing import Any
+from contextlib import ExitStack, suppress
+from pathlib import Path
 
 import pytest
 
-from app.api.connections import MAX_HEAD
-from tests.chaos.service import control, descriptors, running
-from tests.chaos.wire import BODY, Wire, exchange
+from tests.chaos.service import control, descriptors, memory, running
+from tests.chaos.wire import BODY, Answer, Wire, exchange
 from tests.http.conftest import LiveService
 from tests.http.stores import make_store
+from tests.http.test_problems import problem
 
 pytestmark = pytest.mark.system
 
 HEAD = (
-    b"POST /outliers HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+    b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     b"Content-Length: %d\r\n\r\n"
 )
+LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
 @pytest.fixture(scope="module")
@@ -38,56 +39,34 @@ def connect(service: LiveService) -> socket.socket:
 
 
 @pytest.mark.parametrize(
-    ("part", "expected"),
-    [
-        (b"", ()),
-        (b"\r\n", ()),
-        (b"POST /outl", (408,)),
-        (HEAD[:60], (408,)),
-        (HEAD % len(BODY), (408,)),
-        (HEAD % len(BODY) + BODY[:-1], (408,)),
-        (HEAD % len(BODY) + BODY + b"GET /", (200,)),
-    ],
-    ids=["silence", "empty line", "method", "head", "no body", "part of a body", "half a second"],
+    "part",
+    [HEAD % len(BODY), HEAD % len(BODY) + BODY[:-1], HEAD % 1_000_000 + b" " * 500_000],
+    ids=["no body", "part of a body", "part of a large body"],
 )
-def test_who_stops_in_the_middle_is_not_waited_for(
-    service: LiveService, part: bytes, expected: tuple[int, ...]
-) -> None:
-    answers, closed = exchange(service.port, Wire("", [part], None))
-    assert tuple(answer.status for answer in answers) == expected
-    assert closed
-    for answer in answers:
-        if answer.status == 408:
-            is_problem(answer, 408, "request-timeout")
-
-
-def test_a_head_without_end_is_refused(service: LiveService) -> None:
-    head = HEAD[:40] + b"x: " + b"y" * (2 * MAX_HEAD)
-    (answer,), closed = exchange(service.port, Wire("", [head], None))
-    is_problem(answer, 431, "head-too-large")
+def test_the_rest_of_a_body_is_not_waited_for(service: LiveService, part: bytes) -> None:
+    (answer,), closed = exchange(service.port, Wire("", [part], None))
+    is_problem(answer, 408, "request-timeout")
     assert closed
 
 
-def is_problem(answer: Any, status: int, slug: str) -> None:
+def is_problem(answer: Answer, status: int, slug: str) -> None:
     assert answer.status == status
     assert json.loads(answer.body)["type"] == f"/problems/{slug}"
 
 
-@pytest.mark.parametrize("beginning", [b"", HEAD[:40], HEAD % 1000], ids=["lines", "head", "body"])
-def test_a_byte_now_and_then_keeps_no_connection(service: LiveService, beginning: bytes) -> None:
-    """Slow loris: sixty at once; others are answered meanwhile, and all of them are closed."""
+def test_a_byte_now_and_then_keeps_no_connection(service: LiveService) -> None:
+    """Sixty bodies at once; others are answered meanwhile, and all sixty are ended."""
     before = control(service)
     files = descriptors(service)
     slow = [connect(service) for _ in range(60)]
     for connection in slow:
-        connection.sendall(beginning)
-    byte = b" " if beginning else b"\r\n"
+        connection.sendall(HEAD % 1000)
     for _ in range(100):
         if not slow:
             break
         for connection in list(slow):
             try:
-                connection.sendall(byte)
+                connection.sendall(b" ")
                 connection.settimeout(0.001)
                 # An answer is on its way to the end of the connection; the end itself is b"".
                 while connection.recv(4096):
@@ -119,14 +98,11 @@ def test_who_leaves_in_the_middle_is_forgotten(service: LiveService) -> None:
             connection.recv(1)  # in the middle of the answer
     assert control(service) == before
     assert "Traceback" not in service.log.read_text()
-    for _ in range(100):
-        if descriptors(service) <= files + 2:
-            break
-        time.sleep(0.1)
-    assert descriptors(service) <= files + 2
+    wait_for_descriptors(service, files)
 
 
 def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
+    """The system ends the connection, some retransmissions after SCENE_CLIENT_TIMEOUT."""
     before = control(service)
     files = descriptors(service)
     body = json.dumps({"scenes": [json.loads(BODY)] * 256}).encode()
@@ -141,10 +117,54 @@ def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
             connection.sendall(batch * 20)
         unread.append(connection)
     assert control(service) == before
-    for _ in range(300):
-        if descriptors(service) <= files + 2:
-            break
-        time.sleep(0.1)
-    assert descriptors(service) <= files + 2
+    wait_for_descriptors(service, files)
     for connection in unread:
         connection.close()
+
+
+def wait_for_descriptors(service: LiveService, files: int) -> None:
+    for _ in range(300):
+        if descriptors(service) <= files + 2:
+            return
+        time.sleep(0.1)
+    pytest.fail(f"{descriptors(service)} descriptors, where there were {files}")
+
+
+def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
+    """Sixty bodies of 2 MiB less one byte: the service holds as many as its budget allows."""
+    store = make_store(tmp_path / "store")
+    settings = {"client_timeout": "60", "held_body_bytes": str(8 * 2**20)}
+    size = 2 * 2**20
+    with running(store, tmp_path / "log", **settings) as service, ExitStack() as held:
+        before, answers = memory(service), control(service)
+        refused = 0
+        for _ in range(60):
+            connection = held.enter_context(connect(service))
+            connection.settimeout(0.2)
+            with suppress(TimeoutError, ConnectionError):
+                connection.sendall(HEAD % size + b" " * (size - 1))
+                refused += connection.recv(4096).startswith(b"HTTP/1.1 503 ")
+        assert refused >= 56
+        assert memory(service) - before < 32 * 2**20
+        # Small bodies that arrive at once are accepted.
+        assert control(service) == answers
+        batch = {"scenes": [{"objects": ["bed"] * 60}] * 256}
+        response = service.client.post("/missing/batch", json=batch)
+        problem(response, 503, "bodies-full")
+        assert int(response.headers["retry-after"]) > 0
+        held.close()
+        time.sleep(0.5)
+        assert service.client.post("/missing/batch", json=batch).status_code == 200
+
+
+def test_connections_over_the_limit_get_a_plain_503(tmp_path: Path) -> None:
+    store = make_store(tmp_path / "store")
+    with running(store, tmp_path / "log", max_connections="8") as service, ExitStack() as held:
+        for _ in range(8):
+            held.enter_context(connect(service))
+        (answer,), closed = exchange(service.port, Wire("", [LIVE], (503,), closes=True))
+        assert (answer.status, answer.body) == (503, b"Service Unavailable")
+        assert closed
+        held.close()
+        time.sleep(0.5)
+        assert service.client.get("/health/ready").status_code == 200

@@ -10,7 +10,7 @@ import pytest
 
 from app.main import create_app
 from app.settings import Settings
-from tests.http.conftest import serve
+from tests.http.conftest import NAMED, serve
 from tests.http.stores import corrupt
 from tests.http.test_problems import problem
 
@@ -42,7 +42,7 @@ async def test_protocol_metadata(client: httpx.AsyncClient) -> None:
 
 
 async def test_before_its_start_a_service_is_live_and_not_ready(shared_store: Path) -> None:
-    app = create_app(Settings(store=shared_store))
+    app = create_app(Settings(store=shared_store, **NAMED))
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
         assert (await client.get("/health/live")).status_code == 200

@@ -149,7 +149,7 @@ def test_bodies_over_the_limit_are_refused(live: LiveService) -> None:
     # A declared size is believed at once: nothing of the body is waited for.
     head, body = exchange(
         live.port,
-        b"POST /missing HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        b"POST /missing HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         b"Content-Length: 999999999999999999999\r\n\r\n",
     )
     assert head.startswith((b"HTTP/1.1 413", b"HTTP/1.1 400"))
@@ -159,7 +159,7 @@ def test_bodies_over_the_limit_are_refused(live: LiveService) -> None:
 def test_a_body_that_breaks_off_leaves_the_service_well(live: LiveService) -> None:
     with socket.create_connection(("127.0.0.1", live.port), timeout=10) as connection:
         connection.sendall(
-            b"POST /missing HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+            b"POST /missing HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
             b"Content-Length: 100\r\n\r\n{"
         )
     assert live.client.get("/health/ready").status_code == 200
@@ -255,7 +255,7 @@ def test_a_connection_outlives_a_defect(shared_store: Path, tmp_path: Path) -> N
     try:
         body = json.dumps(SCENE).encode()
         request = (
-            b"POST /missing HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+            b"POST /missing HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
             b"Content-Length: " + str(len(body)).encode() + b"\r\n\r\n" + body
         )
         with socket.create_connection(("127.0.0.1", service.port), timeout=10) as connection:

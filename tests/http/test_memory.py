@@ -53,7 +53,7 @@ async def status(app: Any, path: str, body: bytes) -> int:
         "raw_path": path.encode(),
         "root_path": "",
         "query_string": b"",
-        "headers": [(b"content-type", b"application/json")],
+        "headers": [(b"host", b"service"), (b"content-type", b"application/json")],
         "server": ("service", 80),
         "client": ("127.0.0.1", 1),
         "state": {},

@@ -16,7 +16,7 @@ import pytest
 
 from app.scene.relations import CANONICAL
 from app.serving.queue import Ticket
-from tests.http.conftest import ADMIN_KEY, serve
+from tests.http.conftest import ADMIN_KEY, NAMED, serve
 from tests.http.stores import VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
 
@@ -150,7 +150,7 @@ async def test_without_a_configured_key_admin_routes_are_off(store: Path) -> Non
     from app.main import create_app
     from app.settings import Settings
 
-    app = create_app(Settings(store=store))
+    app = create_app(Settings(store=store, **NAMED))
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
         app.router.lifespan_context(app),

@@ -497,7 +497,11 @@ async def test_a_body_that_breaks_off_is_no_request(client: httpx.AsyncClient, p
         "method": "POST",
         "path": path,
         "query_string": b"",
-        "headers": [(b"content-type", b"application/json"), (b"content-length", b"99")],
+        "headers": [
+            (b"host", b"service"),
+            (b"content-type", b"application/json"),
+            (b"content-length", b"99"),
+        ],
     }
     await client.app(scope, receive, send)  # type: ignore[attr-defined]
     start, body = sent

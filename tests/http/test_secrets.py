@@ -98,13 +98,13 @@ def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> N
 
     # What the server itself has a word about: handshakes, broken HTTP, clients that leave.
     handshake = (
-        "GET /stream?key={key} HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\n"
+        "GET /stream?key={key} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
         "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n{header}{key}\r\n\r\n"
     )
     broken = "GET /{key} HTTP/1.1\r\nHost x\r\n{header}{key}\r\n\r\n"
     left = (
-        "POST /relations HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+        "POST /relations HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         "{header}{key}\r\nContent-Length: 99\r\n\r\n{key}"
     )
     for text in (handshake, broken, left):

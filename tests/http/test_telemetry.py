@@ -56,7 +56,7 @@ async def ask(settings: Settings, *requests: tuple[str, str]) -> None:
     # Without FastAPI's own lifespan, which would start the exporter to the address above.
     async with (
         app.router.lifespan_context(app),
-        httpx.AsyncClient(transport=transport, base_url="http://service") as client,
+        httpx.AsyncClient(transport=transport, base_url="http://localhost") as client,
     ):
         for method, path in requests:
             await client.request(method, path, json=SCENE)

@@ -90,7 +90,7 @@ def test_every_variable_given_to_the_service_is_one_it_reads(
     assert in_compose <= known
 
 
-@pytest.mark.parametrize("name", ["scene", "train", "prometheus", "grafana"])
+@pytest.mark.parametrize("name", ["proxy", "scene", "train", "prometheus", "grafana"])
 def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     service = compose["services"][name]
     assert re.fullmatch(r"[1-9]\d+:\d+", service["user"])
@@ -102,7 +102,7 @@ def test_services_are_confined(compose: dict[str, Any], name: str) -> None:
     assert all("/var/run" not in volume for volume in service["volumes"])
 
 
-@pytest.mark.parametrize("name", ["scene", "train"])
+@pytest.mark.parametrize("name", ["proxy", "scene", "train"])
 def test_what_services_write_is_bounded(compose: dict[str, Any], name: str) -> None:
     service = compose["services"][name]
     assert service["logging"]["driver"] == "json-file"
@@ -131,9 +131,10 @@ def test_keys_come_from_the_caller_and_stand_in_no_file(
 
 
 def test_nothing_is_published_beyond_this_machine_unless_asked(compose: dict[str, Any]) -> None:
-    (port,) = compose["services"]["scene"]["ports"]
+    (port,) = compose["services"]["proxy"]["ports"]
     assert port.startswith("${PUBLISH_ADDRESS:-127.0.0.1}:")
-    assert "ports" not in compose["services"]["train"]
+    for name in ("scene", "train"):
+        assert "ports" not in compose["services"][name]
     for name in ("prometheus", "grafana"):
         (port,) = compose["services"][name]["ports"]
         assert port.startswith("127.0.0.1:")

@@ -13,6 +13,7 @@ from app.api.middleware.body_limit import BodyLimit
 from app.api.middleware.context import RequestContext
 from app.api.middleware.defects import Defects
 from app.api.middleware.headers import SafeHeaders
+from app.api.middleware.hosts import HostGuard
 from app.api.middleware.key_guard import KeyGuard
 from app.api.middleware.origins import CrossOrigin
 from app.api.middleware.turnstile import Turnstile
@@ -33,7 +34,12 @@ def install(
         backlog: how many of the requests begun are still worked for.
         is_draining: whether nothing new is to be begun.
     """
-    app.add_middleware(BodyLimit, limit=settings.max_body_bytes, patience=settings.client_timeout)
+    app.add_middleware(
+        BodyLimit,
+        limit=settings.max_body_bytes,
+        budget=settings.held_body_bytes,
+        patience=settings.client_timeout,
+    )
     app.add_middleware(
         Turnstile,
         limit=settings.queue_requests,
@@ -49,5 +55,7 @@ def install(
     app.add_middleware(Defects)
     if settings.cors_origins:
         app.add_middleware(CrossOrigin, origins=settings.cors_origins)
+    if (hosts := settings.accepted_hosts) is not None:
+        app.add_middleware(HostGuard, hosts=hosts)
     app.add_middleware(SafeHeaders)
     app.add_middleware(RequestContext, metrics=metrics, access_log=settings.access_log)

@@ -1,8 +1,9 @@
-"""How large a body may be, and how slow."""
+"""How large a body may be, how slow, and how much all bodies together."""
 
 from __future__ import annotations
 
 import asyncio
+from typing import Final
 
 from starlette.datastructures import Headers
 from starlette.requests import Request
@@ -11,17 +12,32 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from app.api import catalogue
 from app.api.problems import ProblemError, respond
 
+SMALL: Final = 64 * 1024
+"""Bytes of a body that is accepted whatever else is held, if it has arrived when it is read.
+
+Unfinished bodies of one client do not refuse the usual requests of the others.
+"""
+
 
 class BodyLimit:
-    """Refuses bodies over ``limit`` bytes, and those that take longer than ``patience`` seconds.
+    """Bounds the size of each body, its time, and the bytes of all bodies held at once.
 
-    By Content-Length at once, chunked ones as they come.
+    Declared sizes are judged at once, chunked bodies as they arrive. A body is held until its
+    request is answered.
+
+    Args:
+        app: the application.
+        limit: bytes of one body.
+        budget: bytes of all bodies.
+        patience: seconds in which a body must arrive.
     """
 
-    def __init__(self, app: ASGIApp, *, limit: int, patience: float) -> None:
+    def __init__(self, app: ASGIApp, *, limit: int, budget: int, patience: float) -> None:
         self.app = app
         self.limit = limit
+        self.budget = budget
         self.patience = patience
+        self.held = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection."""
@@ -47,17 +63,29 @@ class BodyLimit:
                     message = await receive()
             except TimeoutError:
                 raise self._too_slow() from None
-            received += len(message.get("body", b""))
+            size = len(message.get("body", b""))
+            received += size
+            self.held += size
+            complete = not message.get("more_body", False)
             if received > self.limit:
                 raise self._too_large()
-            complete = not message.get("more_body", False)
+            if self.held > self.budget and not (complete and received == size <= SMALL):
+                raise self._too_many()
             return message
 
-        await self.app(scope, receive_within_limits, send)
+        try:
+            await self.app(scope, receive_within_limits, send)
+        finally:
+            self.held -= received
 
     def _too_large(self) -> ProblemError:
         return ProblemError(
             catalogue.BODY_TOO_LARGE, f"The body must not be larger than {self.limit} bytes."
+        )
+
+    def _too_many(self) -> ProblemError:
+        return ProblemError(
+            catalogue.BODIES_FULL, f"All bodies together must not exceed {self.budget} bytes."
         )
 
     def _too_slow(self) -> ProblemError:

@@ -1,0 +1,147 @@
+"""Names under which the service answers, and what it says where it is open to others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from websockets.exceptions import InvalidStatus
+
+from app.settings import Settings
+from tests.http.conftest import LiveService, launch, serve
+from tests.http.streams import opened, talk
+from tests.http.test_problems import problem
+
+SCENE = {"objects": ["bed"]}
+KEY = "incorrect-zebra-capacitor-nail"
+
+
+@pytest.fixture(autouse=True)
+def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SCENE_HOST", "SCENE_ALLOWED_HOSTS", "SCENE_API_KEY"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, {"127.0.0.1", "localhost", "[::1]"}),
+        ({"host": "0.0.0.0"}, {"127.0.0.1", "localhost", "[::1]"}),
+        ({"host": "::"}, {"127.0.0.1", "localhost", "[::1]"}),
+        ({"host": "10.0.0.7"}, {"127.0.0.1", "localhost", "[::1]", "10.0.0.7"}),
+        ({"host": "fd00::7"}, {"127.0.0.1", "localhost", "[::1]", "[fd00::7]"}),
+        ({"host": "Robot.local"}, {"127.0.0.1", "localhost", "[::1]", "robot.local"}),
+        ({"allowed_hosts": "scene, Robot.local [fd00::7]"}, {"scene", "robot.local", "[fd00::7]"}),
+        ({"allowed_hosts": "::1"}, {"[::1]"}),
+        ({"allowed_hosts": "scene,*"}, None),
+    ],
+)
+def test_names_are_those_of_this_machine_or_listed(
+    tmp_path: Path, settings: dict[str, Any], expected: set[str] | None
+) -> None:
+    assert Settings(store=tmp_path, **settings).accepted_hosts == expected
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("host", "accepted"),
+    [
+        ("127.0.0.1", True),
+        ("127.0.0.1:8000", True),
+        ("LOCALHOST:1", True),
+        ("[::1]:8000", True),
+        ("evil.example", False),
+        ("127.0.0.1.evil.example", False),
+        ("localhost@evil.example", False),
+        ("localhost:80:80", False),
+        ("localhost:port", False),
+        ("::1", False),
+        ("", False),
+    ],
+)
+async def test_a_page_of_another_name_is_refused(
+    shared_store: Path, host: str, accepted: bool
+) -> None:
+    async with serve(shared_store, allowed_hosts=()) as client:
+        headers = {"Host": host}
+        response = await client.post("/relations", json=SCENE, headers=headers)
+        if accepted:
+            assert response.status_code == 200
+        else:
+            problem(response, 421, "host-refused")
+        # Orchestrators ask by the address of a replica.
+        for path in ("/health/live", "/health/ready", "/v2/health/ready"):
+            assert (await client.get(path, headers=headers)).status_code == 200
+
+
+@pytest.mark.anyio
+async def test_a_request_has_one_host(shared_store: Path) -> None:
+    async with serve(shared_store) as client:
+        headers = [("Host", "service"), ("Host", "service")]
+        problem(await client.get("/models", headers=headers), 421, "host-refused")
+
+
+@pytest.mark.anyio
+async def test_every_name_is_allowed_where_the_operator_says_so(shared_store: Path) -> None:
+    async with serve(shared_store, allowed_hosts=["*"]) as client:
+        response = await client.get("/models", headers={"Host": "evil.example"})
+        assert response.status_code == 200
+        document = (await client.get("/openapi.json")).json()
+    assert not any(
+        "421" in operation["responses"]
+        for path in document["paths"].values()
+        for operation in path.values()
+    )
+
+
+@pytest.mark.anyio
+async def test_the_document_says_which_routes_refuse_names(client: httpx.AsyncClient) -> None:
+    paths = (await client.get("/openapi.json")).json()["paths"]
+    for path, operations in paths.items():
+        for operation in operations.values():
+            assert ("421" in operation["responses"]) == ("/health/" not in path), path
+
+
+@pytest.mark.system
+def test_no_stream_opens_under_another_name(live: LiveService) -> None:
+    origin = "http://evil.example"
+    with pytest.raises(InvalidStatus) as refused:
+        opened(live, additional_headers={"Host": "evil.example"}, origin=origin).__enter__()
+    # The client sends its own Host header as well: two are refused, whatever they name.
+    assert refused.value.response.status_code == 421
+    with opened(live) as stream:
+        assert talk(stream, "open")["type"] == "opened"
+        talk(stream, "close")
+
+
+@pytest.mark.parametrize(
+    ("host", "key", "is_open"),
+    [
+        ("127.0.0.1", None, False),
+        ("127.0.0.2", None, False),
+        ("::1", None, False),
+        ("localhost", None, False),
+        ("0.0.0.0", None, True),
+        ("::", None, True),
+        ("10.0.0.7", None, True),
+        ("0.0.0.0", KEY, False),
+    ],
+)
+def test_a_service_without_a_key_is_open_beyond_this_machine(
+    tmp_path: Path, host: str, key: str | None, is_open: bool
+) -> None:
+    assert Settings(store=tmp_path, host=host, api_key=key).is_open == is_open
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("variables", [{}, {"SCENE_API_KEY": KEY}])
+def test_an_open_service_warns(
+    shared_store: Path, tmp_path: Path, variables: dict[str, str]
+) -> None:
+    service = launch(shared_store, tmp_path / "log", SCENE_HOST="0.0.0.0", **variables)
+    service.client.close()
+    service.process.terminate()
+    service.process.wait(timeout=30)
+    assert ("SCENE_API_KEY is not set" in service.log.read_text()) == (not variables)

@@ -1,0 +1,432 @@
+"""HAProxy with the shipped configuration in front of the service: attacked, and asked as usual."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import yaml
+
+from app.client import Client
+from app.settings import Settings
+from tests.chaos.service import running
+from tests.chaos.wire import BODY, Wire, exchange, wires
+from tests.http.conftest import ADMIN_KEY, LiveService
+from tests.http.stores import make_store
+from tests.http.streams import opened, talk
+
+pytestmark = pytest.mark.system
+
+FindTool = Callable[[str], Path]
+
+API_KEY = "incorrect-zebra-capacitor-nail"
+CONNECTIONS, REQUESTS = 30, 400
+SCENE = {"objects": ["bed", "lamp"]}
+HEAD = b"POST /outliers HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
+
+
+@dataclass
+class Proxy:
+    """A running proxy.
+
+    Attributes:
+        service: in front of which it stands.
+    """
+
+    process: subprocess.Popen[str]
+    port: int
+    log: Path
+    service: LiveService
+
+    @property
+    def address(self) -> str:
+        """Where to ask."""
+        return f"http://127.0.0.1:{self.port}"
+
+
+@pytest.fixture(scope="module")
+def configuration(repository: Path) -> Path:
+    return repository / "deploy" / "haproxy" / "haproxy.cfg"
+
+
+@pytest.fixture(scope="module")
+def haproxy(require_system_tool: FindTool, configuration: Path) -> Callable[..., Any]:
+    """Start the proxy in front of a service; variables as in its configuration."""
+    # Debian keeps it where only administrators look.
+    os.environ["PATH"] += os.pathsep + "/usr/sbin"
+    program = require_system_tool("haproxy")
+
+    @contextmanager
+    def start(service: LiveService, log: Path, **variables: str) -> Iterator[Proxy]:
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            port = probe.getsockname()[1]
+        environment = os.environ | {
+            "PROXY_LISTEN": f"127.0.0.1:{port}",
+            "SCENE_BACKEND": f"127.0.0.1:{service.port}",
+            "SCENE_REPLICAS": "1",
+            **variables,
+        }
+        with log.open("w") as output:
+            process = subprocess.Popen(
+                [program, "-db", "-f", configuration],
+                env=environment,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+        proxy = Proxy(process, port, log, service)
+        try:
+            wait_until(lambda: is_ready(proxy), log)
+            yield proxy
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+
+    return start
+
+
+def is_ready(proxy: Proxy) -> bool:
+    with suppress(httpx.TransportError):
+        return httpx.get(f"{proxy.address}/health/ready").status_code == 200
+    return False
+
+
+def wait_until(condition: Callable[[], bool], log: Path | None = None) -> None:
+    for _ in range(300):
+        if condition():
+            return
+        time.sleep(0.1)
+    pytest.fail("it takes too long" + (f":\n{log.read_text()}" if log else ""))
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    folder = tmp_path_factory.mktemp("behind")
+    with running(make_store(folder / "store"), folder / "log", client_timeout="3") as service:
+        yield service
+
+
+@pytest.fixture(scope="module")
+def proxy(
+    haproxy: Callable[..., Any], service: LiveService, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Proxy]:
+    """A proxy of little patience and no limit on rates."""
+    log = tmp_path_factory.mktemp("proxy") / "log"
+    variables = {"PROXY_HEAD_TIMEOUT": "1s", "PROXY_TIMEOUT": "2s", "PROXY_REQUESTS": "1000000"}
+    with haproxy(service, log, PROXY_CONNECTIONS=str(CONNECTIONS), **variables) as proxy:
+        yield proxy
+
+
+def send(proxy: Proxy, *parts: bytes) -> tuple[list[Any], bool]:
+    return exchange(proxy.port, Wire("", parts, None))
+
+
+def refused(proxy: Proxy, request: bytes, status: int) -> Any:
+    """The answer to a request that the proxy refuses."""
+    answers, is_closed = send(proxy, request)
+    assert [answer.status for answer in answers] == [status]
+    assert is_closed
+    return answers[0]
+
+
+# ---------------------------------------------------------------------------------- as usual
+
+
+def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
+    with Client(proxy.address) as scene:
+        assert scene.missing(SCENE["objects"]).missing
+    with httpx.Client(base_url=proxy.address) as client:
+        for path in ("/", "/docs", "/models", "/v2", "/problems", "/health/ready"):
+            assert client.get(path).status_code == 200, path
+        batch = client.post("/missing/batch", json={"scenes": [SCENE] * 256})
+        assert len(batch.json()["results"]) == 256
+        # Refusals of the service arrive as they are.
+        assert client.post("/missing", json={}).json()["type"] == "/problems/invalid-request"
+        large = client.post(
+            "/missing", content=b" " * 2_100_000, headers={"Content-Type": "application/json"}
+        )
+        assert large.json()["type"] == "/problems/body-too-large"
+
+
+def test_an_answer_may_take_longer_than_a_client_may_pause(proxy: Proxy) -> None:
+    body = {**SCENE, "model": "plain", "count": 64, "steps": 1500}
+    began = time.monotonic()
+    response = httpx.post(f"{proxy.address}/generate", json=body, timeout=60)
+    assert response.status_code in {200, 504}
+    assert time.monotonic() - began > 2
+
+
+def test_a_stream_passes_and_outlives_the_pauses_of_requests(proxy: Proxy) -> None:
+    with opened(proxy) as stream:  # type: ignore[arg-type]
+        assert talk(stream, "open", ask={"missing": {}})["type"] == "opened"
+        assert talk(stream, "update", seq=1, objects=["bed"])["type"] == "answer"
+        time.sleep(3)
+        assert talk(stream, "update", seq=2, objects=["lamp"])["type"] == "answer"
+        assert talk(stream, "close")["type"] == "closed"
+
+
+def test_the_name_that_clients_use_reaches_the_service(proxy: Proxy) -> None:
+    response = httpx.get(f"{proxy.address}/models", headers={"Host": "evil.example"})
+    assert response.status_code == 421
+    assert response.json()["type"] == "/problems/host-refused"
+
+
+# ---------------------------------------------------------------------------------- attacks
+
+
+@pytest.mark.parametrize("part", [b"GE", LIVE[:-2], HEAD], ids=["method", "head", "no end"])
+def test_half_a_head_is_not_waited_for(proxy: Proxy, part: bytes) -> None:
+    began = time.monotonic()
+    refused(proxy, part, 408)
+    assert time.monotonic() - began < 3
+
+
+def test_a_head_that_trickles_in_is_not_waited_for(proxy: Proxy) -> None:
+    began = time.monotonic()
+    with socket.create_connection(("127.0.0.1", proxy.port)) as connection, suppress(OSError):
+        connection.sendall(HEAD)
+        while time.monotonic() - began < 10:
+            connection.sendall(b"A")
+            time.sleep(0.1)
+    assert time.monotonic() - began < 3
+
+
+def test_connections_without_a_request_are_closed(proxy: Proxy) -> None:
+    began = time.monotonic()
+    answers, is_closed = send(proxy, b"")
+    assert is_closed
+    assert [answer.status for answer in answers] in ([], [408])
+    assert time.monotonic() - began < 3
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        LIVE[:-2] + b"A: " + b"a" * 20_000 + b"\r\n\r\n",
+        b"GET /" + b"a" * 20_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        LIVE[:-2] + b"A: b\r\n" * 3_000 + b"\r\n",
+        LIVE[:-2] + b"A: b\r\n" * 100 + b"\r\n",
+    ],
+    ids=["value", "path", "fields", "hundred fields"],
+)
+def test_a_large_head_is_refused(proxy: Proxy, head: bytes) -> None:
+    refused(proxy, head, 400)
+
+
+@pytest.mark.parametrize(
+    "hosts",
+    [b"", b"Host: localhost\r\nHost: evil.example\r\n"],
+    ids=["none", "two"],
+)
+def test_a_request_has_one_host(proxy: Proxy, hosts: bytes) -> None:
+    refused(proxy, b"GET /models HTTP/1.1\r\n" + hosts + b"\r\n", 400)
+
+
+def test_the_old_protocol_has_no_chunks(proxy: Proxy) -> None:
+    head = HEAD.replace(b"HTTP/1.1", b"HTTP/1.0") + b"Transfer-Encoding: chunked\r\n\r\n"
+    refused(proxy, head + b"%x\r\n%s\r\n0\r\n\r\n" % (len(BODY), BODY), 400)
+
+
+@pytest.mark.parametrize("wire", list(wires()), ids=lambda wire: wire.name)
+def test_what_is_wrong_below_http_reaches_nobody(proxy: Proxy, wire: Wire) -> None:
+    """Every refusal is a client's error; no request hides in another."""
+    answers, is_closed = exchange(proxy.port, wire)
+    for answer in answers:
+        assert answer.status < 500
+    if wire.expected is not None:
+        assert tuple(answer.status for answer in answers) == wire.expected
+    assert is_closed or not wire.closes
+    log = proxy.service.log.read_text()
+    assert '"smuggled"' not in log
+    assert "Traceback" not in log
+
+
+def test_unread_pipelined_requests_are_not_queued(proxy: Proxy) -> None:
+    """The service sees few of 20,000 requests whose answers are not read; the connection ends."""
+    before = lines(proxy.service)
+    with socket.socket() as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.settimeout(0.5)
+        connection.connect(("127.0.0.1", proxy.port))
+        with suppress(TimeoutError, ConnectionError):
+            connection.sendall(LIVE.replace(b"/health/live", b"/docs") * 20_000)
+        assert is_ready(proxy)
+        began = time.monotonic()
+        wait_until(lambda: '"ended": "c' in proxy.log.read_text())
+        assert time.monotonic() - began < 10
+    assert lines(proxy.service) - before < 2_000
+
+
+def lines(service: LiveService) -> int:
+    """Lines of its log."""
+    return len(service.log.read_text().splitlines())
+
+
+@pytest.mark.parametrize("beginning", [b"", b" " * 50_000], ids=["from the start", "after 50 kB"])
+def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy, beginning: bytes) -> None:
+    """Every byte starts the proxy's time anew; the service bounds the time of the whole body."""
+    began = time.monotonic()
+    received = b""
+    with socket.create_connection(("127.0.0.1", proxy.port)) as connection:
+        connection.sendall(HEAD + b"Content-Length: 100000\r\n\r\n" + beginning)
+        connection.settimeout(0.2)
+        while time.monotonic() - began < 20:
+            try:
+                connection.sendall(b" ")
+                if not (part := connection.recv(4096)):
+                    break
+            except TimeoutError:
+                continue
+            except ConnectionError:
+                break
+            received += part
+    assert 2 < time.monotonic() - began < 10
+    assert received.startswith(b"HTTP/1.1 408 ")
+    assert b"/problems/request-timeout" in received
+
+
+def test_one_address_has_so_many_connections(proxy: Proxy) -> None:
+    wait_until(lambda: is_ready(proxy))
+    with ExitStack() as held:
+        answered = 0
+        for _ in range(CONNECTIONS + 10):
+            with suppress(ConnectionError):
+                connection = socket.create_connection(("127.0.0.1", proxy.port), timeout=5)
+                held.enter_context(connection)
+                connection.sendall(LIVE)
+                answered += connection.recv(4096).startswith(b"HTTP/1.1 200 ")
+    assert CONNECTIONS - 5 <= answered <= CONNECTIONS
+    wait_until(lambda: is_ready(proxy))
+
+
+def test_one_address_asks_so_often(
+    haproxy: Callable[..., Any], service: LiveService, tmp_path: Path
+) -> None:
+    with (
+        haproxy(service, tmp_path / "log", PROXY_REQUESTS=str(REQUESTS)) as proxy,
+        httpx.Client(base_url=proxy.address) as client,
+    ):
+        answers = [client.post("/missing", json=SCENE) for _ in range(REQUESTS + 100)]
+    statuses = [answer.status_code for answer in answers]
+    assert statuses.count(200) + statuses.count(429) == len(statuses)
+    assert REQUESTS - 50 <= statuses.count(200) <= REQUESTS
+    (refusal, *_) = (answer for answer in answers if answer.status_code == 429)
+    assert refusal.headers["content-type"] == "application/problem+json"
+    assert int(refusal.headers["retry-after"]) > 0
+
+
+HIDDEN = [
+    ("POST", "/models/refresh"),
+    ("POST", "/models/refresh/"),
+    ("POST", "//models//refresh"),
+    ("POST", "/models%2Frefresh"),
+    ("POST", "/%6dodels/%72efresh"),
+    ("POST", "/models/refresh?a=b"),
+    ("PUT", "/models/aliases/default"),
+    ("PUT", "/models/aliase%73/default"),
+    ("PUT", "/models/aliases/%2e%2e"),
+    ("GET", "/metrics"),
+    ("GET", "/metric%73"),
+    ("GET", "/metrics/"),
+]
+
+
+@pytest.mark.parametrize(("method", "path"), HIDDEN)
+def test_administration_and_figures_are_not_for_the_outside(
+    proxy: Proxy, method: str, path: str
+) -> None:
+    before = lines(proxy.service)
+    request = (
+        f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nX-Admin-Key: {ADMIN_KEY}\r\n"
+        "Content-Type: application/json\r\nContent-Length: 2\r\nConnection: close\r\n\r\n{}"
+    )
+    answer = refused(proxy, request.encode(), 404)
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert json.loads(answer.body)["type"] == "/problems/not-found"
+    added = proxy.service.log.read_text().splitlines()[before:]
+    assert all("/health/" in line for line in added)
+
+
+def test_an_escape_that_is_none_hides_no_route(proxy: Proxy) -> None:
+    request = "PUT /models/aliases/%zz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+    answers, _ = send(proxy, request.encode())
+    assert answers[0].status in {400, 404}
+
+
+def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
+    haproxy: Callable[..., Any], tmp_path: Path
+) -> None:
+    store = make_store(tmp_path / "store")
+    with (
+        running(store, tmp_path / "service", api_key=API_KEY) as service,
+        haproxy(service, tmp_path / "log") as proxy,
+        httpx.Client(base_url=proxy.address) as client,
+    ):
+        for headers in (
+            {"X-API-Key": API_KEY},
+            {"X-Admin-Key": ADMIN_KEY},
+            {"Authorization": f"Bearer {API_KEY}"},
+        ):
+            known = headers | {"X-Request-Id": "find-me"}
+            answer = client.post(f"/missing?key={API_KEY}", json=SCENE, headers=known)
+            assert answer.status_code == 200
+            assert client.get(f"/{API_KEY}/{ADMIN_KEY}", headers=headers).status_code == 404
+        wait_until(lambda: proxy.log.read_text().count('"status": 404') >= 3)
+        log = proxy.log.read_text()
+    assert API_KEY not in log
+    assert ADMIN_KEY not in log
+    entries = [json.loads(line) for line in log.splitlines() if line.startswith("{")]
+    assert [entry["request_id"] for entry in entries].count("find-me") == 3
+
+
+def test_a_service_that_is_not_ready_is_not_asked(
+    haproxy: Callable[..., Any], tmp_path: Path
+) -> None:
+    store = make_store(tmp_path / "store")
+    with (
+        running(store, tmp_path / "service") as service,
+        haproxy(service, tmp_path / "log") as proxy,
+    ):
+        service.process.kill()
+        service.process.wait(timeout=30)
+        wait_until(lambda: not is_ready(proxy))
+        answer = httpx.post(f"{proxy.address}/missing", json=SCENE)
+        assert answer.status_code == 503
+        assert answer.json()["type"] == "/problems/not-ready"
+        assert int(answer.headers["retry-after"]) > 0
+
+
+# ---------------------------------------------------------------------------- configuration
+
+
+def test_the_compose_file_puts_the_proxy_in_front(repository: Path, configuration: Path) -> None:
+    services = yaml.safe_load((repository / "docker-compose.yml").read_text("utf-8"))["services"]
+    proxy, scene = services["proxy"], services["scene"]
+    assert "ports" not in scene
+    (port,) = proxy["ports"]
+    assert port.startswith("${PUBLISH_ADDRESS:-127.0.0.1}:")
+    (mounted,) = proxy["volumes"]
+    source, _, target = mounted.removesuffix(":ro").partition(":")
+    assert (repository / source).samefile(configuration.parent)
+    assert target == "/usr/local/etc/haproxy"
+    assert mounted.endswith(":ro")
+    listening = configuration.read_text("utf-8")
+    assert f"${{SCENE_BACKEND-scene:{scene['environment']['SCENE_PORT']}}}" in listening
+
+
+def test_the_proxy_leaves_the_service_room_for_health_checks(configuration: Path) -> None:
+    text = configuration.read_text("utf-8")
+    (most,) = [int(line.split(" maxconn ")[1].split()[0])
+               for line in text.splitlines() if "default-server" in line]  # fmt: skip
+    assert most < Settings.model_fields["max_connections"].default
