@@ -33,9 +33,9 @@ _logger = logging.getLogger("app.server")
 class Server(uvicorn.Server):
     """Ends in three steps on SIGTERM.
 
-    At once nothing new is taken, readiness says so, and streams take their leave; after
-    ``drain_seconds``, in which a load balancer may notice, the listening socket is closed; then
-    what is under way is finished. A second signal, or Ctrl-C, leaves the first step out.
+    First new requests are refused, readiness is off, and streams are closed. After
+    ``drain_seconds``, in which a load balancer may notice, the listening socket is closed. Then
+    requests in progress are finished. A second signal, or Ctrl-C, skips the first step.
 
     Args:
         config: of uvicorn.

@@ -73,8 +73,8 @@ def haproxy(require_system_tool: FindTool, configuration: Path) -> Callable[...,
             port = probe.getsockname()[1]
         environment = os.environ | {
             "PROXY_LISTEN": f"127.0.0.1:{port}",
-            "SCENE_BACKEND": f"127.0.0.1:{service.port}",
-            "SCENE_REPLICAS": "1",
+            "PROXY_BACKEND": f"127.0.0.1:{service.port}",
+            "PROXY_REPLICAS": "1",
             **variables,
         }
         with log.open("w") as output:
@@ -275,7 +275,7 @@ def lines(service: LiveService) -> int:
 
 @pytest.mark.parametrize("beginning", [b"", b" " * 50_000], ids=["from the start", "after 50 kB"])
 def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy, beginning: bytes) -> None:
-    """Every byte starts the proxy's time anew; the service bounds the time of the whole body."""
+    """Every byte restarts the proxy's time-out; the service bounds the time of the whole body."""
     began = time.monotonic()
     received = b""
     with socket.create_connection(("127.0.0.1", proxy.port)) as connection:
@@ -422,7 +422,7 @@ def test_the_compose_file_puts_the_proxy_in_front(repository: Path, configuratio
     assert target == "/usr/local/etc/haproxy"
     assert mounted.endswith(":ro")
     listening = configuration.read_text("utf-8")
-    assert f"${{SCENE_BACKEND-scene:{scene['environment']['SCENE_PORT']}}}" in listening
+    assert f"${{PROXY_BACKEND-scene:{scene['environment']['SCENE_PORT']}}}" in listening
 
 
 def test_the_proxy_leaves_the_service_room_for_health_checks(configuration: Path) -> None:
