@@ -26,6 +26,7 @@ RUN /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-che
 # ---- training: docker run ... train --help
 FROM base AS train
 COPY --from=training-packages /opt/venv /opt/venv
+COPY clients/python/scene_client ./scene_client
 COPY app ./app
 COPY training ./training
 COPY --chown=10001:10001 model_store ./model_store
@@ -39,6 +40,7 @@ CMD ["--help"]
 # ---- the service
 FROM base AS runtime
 COPY --from=packages /opt/venv /opt/venv
+COPY clients/python/scene_client ./scene_client
 COPY app ./app
 # Owned by the service, which moves aliases; publishing adds versions beside those shipped.
 COPY --chown=10001:10001 model_store ./model_store

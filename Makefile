@@ -56,9 +56,10 @@ soak: $(EVERYTHING)  ## ten minutes of mixed use: nothing may grow (MINUTES=10)
 
 setup: $(EVERYTHING)  ## install everything that training, tests and benchmarks need
 
-format: $(EVERYTHING)  ## rewrite the sources in the house format
+format: $(EVERYTHING)  ## rewrite the sources in the house format, the blocking client too
 	$(BIN)/python -m ruff check --fix-only --quiet .
 	$(BIN)/python -m ruff format .
+	$(BIN)/python scripts/sync_client.py
 
 bench: $(EVERYTHING)  ## run the benchmarks, then the service under load beside an echo, then a stream
 	$(BIN)/python -m benchmarks $(ARGS)
@@ -72,18 +73,18 @@ clean:  ## remove the environment and every cache
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .numba_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(SERVICE): requirements.lock pyproject.toml | $(BIN)/python
+$(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing the service's packages into $(VENV) ..."
 	@$(PIP) install -qq -r requirements.lock
-	@$(PIP) install -qq --no-deps --editable .
+	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@echo "Compiling loops for this machine ..."
 	@$(BIN)/python -m app.compile
 	@touch $@
 
-$(EVERYTHING): requirements-dev.lock pyproject.toml | $(BIN)/python
+$(EVERYTHING): requirements-dev.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
 	@echo "Installing every package into $(VENV) ..."
 	@$(PIP) install -qq $(INDEX) -r requirements-dev.lock
-	@$(PIP) install -qq --no-deps --editable .
+	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@touch $(SERVICE) $@
 
 # Order-only above: an environment is made once and then kept, whatever its own time stamp says.

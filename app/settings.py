@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from pydantic import BeforeValidator, Field, SecretStr, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from app.schemas import MAX_RELATIONS
+from scene_client.schemas import MAX_RELATIONS
 
 MAX_OBJECTS = 256
 """The contract's limit on objects in one scene; settings may lower it, never raise it."""

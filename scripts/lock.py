@@ -1,4 +1,4 @@
-"""Write requirements*.lock from pyproject.toml: the exact versions that are tested together.
+"""Write requirements*.lock from both pyproject.toml: the exact versions that are tested together.
 
 pip resolves the development set first, downloads nothing it can read the metadata of, and installs
 nothing; the smaller sets are then resolved inside those pins, so that the files never disagree.
@@ -58,9 +58,12 @@ def with_markers(locked: dict[str, str], requirements: list[str]) -> list[str]:
 
 
 def main(pip_arguments: list[str]) -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    client, project = (
+        tomllib.loads((ROOT / folder / "pyproject.toml").read_text("utf-8"))["project"]
+        for folder in ("clients/python", ".")
+    )
     extras = project["optional-dependencies"]
-    runtime = project["dependencies"] + extras["service"]
+    runtime = client["dependencies"] + extras["service"]
     training = runtime + extras["training"]
     development = training + extras["telemetry"] + extras["docs"] + extras["dev"]
 

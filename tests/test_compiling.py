@@ -223,4 +223,4 @@ def test_the_digest_holds_every_file_that_is_compiled_in(repository: Path) -> No
         "app.scene.relations",  # numbers of relations
         "app.serving.answers",
     } <= found
-    assert not {"app.main", "app.schemas", "app.serving.runtime", "app.settings"} & found
+    assert not {"app.main", "scene_client.schemas", "app.serving.runtime", "app.settings"} & found

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pydantic_core import to_json
 from starlette.responses import Response
 
-from app.schemas import Problem
 from app.serving.answers import Answer, written
+from scene_client.schemas import Problem
 
 # Their schemas, which the routes declare, describe them: to validate an answer would cost as much
 # as to write it, and could only fail after the work. The tests do.

@@ -16,7 +16,12 @@ from app.api.body import JSONRoute
 from app.api.dependencies import SessionDep
 from app.api.openapi import queued
 from app.api.problems import from_exception, report_defect, unfit
-from app.schemas import (
+from app.serving import questions
+from app.serving.answers import Answer
+from app.serving.models import DEFAULT
+from app.serving.record import SUCCESS
+from app.serving.session import Session
+from scene_client.schemas import (
     BatchAnswer,
     BatchRequest,
     MissingAnswer,
@@ -27,11 +32,6 @@ from app.schemas import (
     RelationsRequest,
     SceneRequest,
 )
-from app.serving import questions
-from app.serving.answers import Answer
-from app.serving.models import DEFAULT
-from app.serving.record import SUCCESS
-from app.serving.session import Session
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
 

@@ -14,7 +14,7 @@ from starlette.responses import Response
 
 from app.api import catalogue
 from app.api.problems import ProblemError
-from app.schemas import FieldError
+from scene_client.schemas import FieldError
 
 MAX_MEMBERS: Final = 32
 """No object of any request has as many fields, and every field that is unknown is a fault to tell:

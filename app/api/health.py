@@ -13,7 +13,7 @@ from app.api import catalogue
 from app.api.dependencies import RuntimeDep
 from app.api.models import Reference
 from app.api.openapi import problems, queued
-from app.schemas import (
+from scene_client.schemas import (
     Health,
     ModelMetadata,
     ModelReady,

@@ -9,7 +9,8 @@ from fastapi import APIRouter, Path
 from app.api import admin, catalogue
 from app.api.dependencies import RequestId, RuntimeDep
 from app.api.openapi import queued
-from app.schemas import (
+from app.serving import describe
+from scene_client.schemas import (
     AliasAnswer,
     AliasRequest,
     ContextsAnswer,
@@ -19,7 +20,6 @@ from app.schemas import (
     VersionDetails,
     VocabularyAnswer,
 )
-from app.serving import describe
 
 _PROBLEMS: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY)
 _USABLE: Final = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)

@@ -13,7 +13,7 @@ from app.api.example_requests import REQUESTS
 from app.api.middleware.hosts import HEALTH
 from app.api.middleware.turnstile import TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE, ProblemError
-from app.schemas import MAX_SEED, FieldError, Problem
+from scene_client.schemas import MAX_SEED, FieldError, Problem
 
 Responses = dict[int | str, dict[str, Any]]
 

@@ -16,9 +16,6 @@ from starlette.types import Receive, Scope, Send
 
 from app.api import catalogue
 from app.api.catalogue import ProblemType
-from app.faults import MAX_ERRORS, field_errors
-from app.pointers import pointer
-from app.schemas import Failure, FieldError, Problem
 from app.serving.errors import (
     AliasConflictError,
     DeadlinePassedError,
@@ -37,6 +34,9 @@ from app.serving.errors import (
     StoreNotWritableError,
     UnknownModelError,
 )
+from scene_client.faults import MAX_ERRORS, field_errors
+from scene_client.pointers import pointer
+from scene_client.schemas import Failure, FieldError, Problem
 
 MEDIA_TYPE: Final = "application/problem+json"
 

@@ -12,7 +12,8 @@ from app.api.answers import respond
 from app.api.body import JSONRoute
 from app.api.dependencies import SessionDep
 from app.api.openapi import queued
-from app.schemas import (
+from app.serving import questions
+from scene_client.schemas import (
     GenerateAnswer,
     GenerateRequest,
     MissingAnswer,
@@ -22,7 +23,6 @@ from app.schemas import (
     RelationsAnswer,
     RelationsRequest,
 )
-from app.serving import questions
 
 PROBLEMS: Final = queued(
     catalogue.NOT_JSON,

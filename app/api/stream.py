@@ -17,7 +17,16 @@ from app.api import catalogue
 from app.api.body import parse
 from app.api.middleware.origins import may_connect
 from app.api.problems import ProblemError, answer, from_exception, unfit
-from app.messages import (
+from app.serving.answers import written
+from app.serving.errors import ServingError
+from app.serving.queue import Ticket
+from app.serving.record import SUCCESS, RequestRecord
+from app.serving.runtime import Runtime
+from app.serving.session import Session
+from app.serving.stream import Streams, StreamScene, TokenBucket
+from app.settings import Settings
+from scene_client.schemas import FieldError
+from scene_client.stream_messages import (
     COMMANDS,
     MAX_SEQ,
     Command,
@@ -29,15 +38,6 @@ from app.messages import (
     SceneMessage,
     StreamLimits,
 )
-from app.schemas import FieldError
-from app.serving.answers import written
-from app.serving.errors import ServingError
-from app.serving.queue import Ticket
-from app.serving.record import SUCCESS, RequestRecord
-from app.serving.runtime import Runtime
-from app.serving.session import Session
-from app.serving.stream import Streams, StreamScene, TokenBucket
-from app.settings import Settings
 
 PATH: Final = "/stream"
 READING_SHARE: Final = 0.2

@@ -29,13 +29,13 @@ def of_relations(
     disagreements: Sequence[reasoning.Disagreement],
     reading: Reading,
 ) -> int:
-    """Bytes of `app.schemas.RelationsAnswer`."""
+    """Bytes of `scene_client.schemas.RelationsAnswer`."""
     entries = len(found) + 2 * len(disagreements)
     return _of_envelope(reading) + entries * (_RELATION + 2 * _longest(reading))
 
 
 def of_missing(found: Sequence[reasoning.MissingAnswer], reading: Reading) -> int:
-    """Bytes of `app.schemas.MissingAnswer`."""
+    """Bytes of `scene_client.schemas.MissingAnswer`."""
     places = sum([len(entry.placements) for entry in found])
     causes = sum([len(entry.because) for entry in found])
     name = _longest(reading)
@@ -44,7 +44,7 @@ def of_missing(found: Sequence[reasoning.MissingAnswer], reading: Reading) -> in
 
 
 def of_outliers(found: reasoning.OutliersFound, reading: Reading) -> int:
-    """Bytes of `app.schemas.OutliersAnswer`."""
+    """Bytes of `scene_client.schemas.OutliersAnswer`."""
     causes = sum([len(entry.because) + len(entry.usually_with) for entry in found.outliers])
     name = _longest(reading)
     judged = len(found.outliers) * (_OBJECT + 2 * name) + causes * (_CAUSE + name)
@@ -52,7 +52,7 @@ def of_outliers(found: reasoning.OutliersFound, reading: Reading) -> int:
 
 
 def of_generated(drawn: Sequence[reasoning.GeneratedScene], reading: Reading) -> int:
-    """Bytes of `app.schemas.GenerateAnswer`."""
+    """Bytes of `scene_client.schemas.GenerateAnswer`."""
     name = reading.unknown.vocabulary.longest_label
     objects = sum([len(scene.objects) for scene in drawn])
     relations = sum([len(scene.relations) for scene in drawn])

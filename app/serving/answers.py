@@ -1,8 +1,8 @@
 """What the models say, in the names of a request, as JSON has it.
 
-The schemas of `app.schemas` describe these answers: fields in that order, and none that would be
-null. They are made as plain dictionaries, since an answer holds a hundred parts, and to make and
-write each as an object takes twice the time (docs/decisions/answers.md).
+The schemas of `scene_client.schemas` describe these answers: fields in that order, and none that
+would be null. They are made as plain dictionaries, since an answer holds a hundred parts, and to
+make and write each as an object takes twice the time (docs/decisions/answers.md).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from pydantic_core import from_json, to_json
 from app import reasoning
 from app.compiling import compiled
 from app.scene.relations import CANONICAL, canonicalise, opposite
-from app.schemas import ModelReference, SceneRequest
 from app.serving.reading import Reading
+from scene_client.schemas import ModelReference, SceneRequest
 
 Answer: TypeAlias = dict[str, Any]
 
@@ -29,7 +29,7 @@ DIGITS: Final = 6
 def envelope(
     request: SceneRequest, request_id: str, model: ModelReference, reading: Reading
 ) -> Answer:
-    """See `app.schemas.Answer`."""
+    """See `scene_client.schemas.Answer`."""
     fields: Answer = {"model": model, "request_id": request_id}
     if request.frame_id is not None:
         fields["frame_id"] = request.frame_id
@@ -58,7 +58,7 @@ def relations(
     *,
     min_probability: float,
 ) -> Answer:
-    """See `app.schemas.RelationsAnswer`; what is less likely when rounded is left out."""
+    """See `scene_client.schemas.RelationsAnswer`; what is less likely when rounded is left out."""
     ids = reading.ids
     rounded = significant([entry.probability for entry in found])
     envelope["relations"] = [
@@ -82,7 +82,7 @@ def missing(
     found: Sequence[reasoning.MissingAnswer],
     reading: Reading,
 ) -> Answer:
-    """See `app.schemas.MissingAnswer`."""
+    """See `scene_client.schemas.MissingAnswer`."""
     ids = reading.ids
     envelope["coverage"] = coverage
     numbers: list[float] = []
@@ -109,7 +109,7 @@ def missing(
 
 
 def outliers(envelope: Answer, found: reasoning.OutliersFound, reading: Reading) -> Answer:
-    """See `app.schemas.OutliersAnswer`."""
+    """See `scene_client.schemas.OutliersAnswer`."""
     ids = reading.ids
     envelope["threshold"] = float(f"{found.threshold:.{DIGITS}g}")
     numbers: list[float] = []
@@ -142,7 +142,7 @@ def outliers(envelope: Answer, found: reasoning.OutliersFound, reading: Reading)
 
 
 def generate(envelope: Answer, seed: int, drawn: Sequence[reasoning.GeneratedScene]) -> Answer:
-    """See `app.schemas.GenerateAnswer`."""
+    """See `scene_client.schemas.GenerateAnswer`."""
     envelope["seed"] = seed
     envelope["scenes"] = [
         {

@@ -8,7 +8,9 @@ from typing import cast
 
 from app.registry import AliasTarget
 from app.scene.relations import opposite
-from app.schemas import (
+from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
+from app.serving.models import ServedModel, ServedModels
+from scene_client.schemas import (
     ContextsAnswer,
     ContextUnit,
     Metric,
@@ -24,8 +26,6 @@ from app.schemas import (
     WeightedLabel,
     WeightedRelation,
 )
-from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
-from app.serving.models import ServedModel, ServedModels
 
 
 def everything(models: ServedModels) -> ModelList:

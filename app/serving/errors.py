@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from app.schemas import Failure
+from scene_client.schemas import Failure
 
 Location = tuple[str | int, ...]
 """A way into a request: field names and list positions."""

@@ -20,9 +20,9 @@ from prometheus_client import (
     generate_latest,
 )
 
-from app.schemas import ModelReference
 from app.serving.errors import ServingError
 from app.serving.models import DEFAULT, Key, ServedModels
+from scene_client.schemas import ModelReference
 
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 

@@ -18,10 +18,10 @@ from types import MappingProxyType
 from app import reasoning
 from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
 from app.scene.vocabulary import Vocabulary
-from app.schemas import Failure, ModelReference
 from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
 from app.serving.queue import WorkQueue
 from app.serving.warm_up import warm_up
+from scene_client.schemas import Failure, ModelReference
 
 DEFAULT = "default"
 Key = tuple[str, str]

@@ -9,19 +9,19 @@ from dataclasses import replace
 from app import reasoning
 from app.scene.frames import viewer_axes
 from app.scene.relations import opposite
-from app.schemas import (
-    GenerateRequest,
-    MissingRequest,
-    OutliersRequest,
-    RelationsRequest,
-    SceneRequest,
-)
 from app.serving import answer_size, answers
 from app.serving.answers import Answer
 from app.serving.errors import Location, Reason
 from app.serving.models import ServedModel
 from app.serving.reading import Faults, Reading
 from app.serving.session import Session
+from scene_client.schemas import (
+    GenerateRequest,
+    MissingRequest,
+    OutliersRequest,
+    RelationsRequest,
+    SceneRequest,
+)
 
 DRAWN_SEED_BITS = 53
 """Every JSON reader can hand such a seed back: a double holds it exactly."""

@@ -20,7 +20,9 @@ from app.scene.observe import observe
 from app.scene.relations import CANONICAL, canonicalise
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
-from app.schemas import (
+from app.serving.errors import Fault, Location, Reason, RequestError
+from app.serving.warnings import scene_warnings
+from scene_client.schemas import (
     Detection,
     Mapped,
     ObservedRelation,
@@ -28,8 +30,6 @@ from app.schemas import (
     SceneWarning,
     UnknownLabels,
 )
-from app.serving.errors import Fault, Location, Reason, RequestError
-from app.serving.warnings import scene_warnings
 
 MAX_SUGGESTED: Final = 32
 """How many unknown labels of one scene are looked up, to suggest or to take the nearest class; and

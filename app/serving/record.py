@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Final
 
-from app.schemas import ModelReference
+from scene_client.schemas import ModelReference
 
 SUCCESS: Final = "success"
 

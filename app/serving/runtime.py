@@ -15,7 +15,6 @@ from typing import Concatenate, Literal, ParamSpec, TypeVar
 from app.compiling import check_cache, progress
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.registry.verified import MAX_WEIGHTS_BYTES
-from app.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 from app.serving.errors import (
     AliasConflictError,
     DrainingError,
@@ -38,6 +37,7 @@ from app.serving.queue import Threads, Ticket, WorkQueue
 from app.serving.reading import Limits
 from app.serving.record import RequestRecord
 from app.serving.session import Session
+from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -11,13 +11,13 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 from app.registry import Artifact
 from app.scene.scene import Scene
-from app.schemas import SceneRequest
 from app.serving.errors import ServingError
 from app.serving.metrics import Metrics
 from app.serving.models import ServedModel, ServedModels
 from app.serving.queue import Done, Ticket
 from app.serving.reading import Limits, LookUps, Reading, check_scene, read_scene
 from app.serving.record import RequestRecord
+from scene_client.schemas import SceneRequest
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -12,8 +12,13 @@ from dataclasses import replace
 from time import monotonic
 from typing import Any, Final
 
-from app.messages import Ask, MergedScene, SceneMessage, Update, Whole, object_id
-from app.schemas import (
+from app.serving import answers, questions
+from app.serving.answers import Answer
+from app.serving.errors import Location, Reason, RequestError, ServingError
+from app.serving.metrics import Metrics
+from app.serving.reading import Faults
+from app.serving.session import Session
+from scene_client.schemas import (
     MissingOptions,
     MissingRequest,
     OutliersOptions,
@@ -21,12 +26,7 @@ from app.schemas import (
     RelationsRequest,
     SceneRequest,
 )
-from app.serving import answers, questions
-from app.serving.answers import Answer
-from app.serving.errors import Location, Reason, RequestError, ServingError
-from app.serving.metrics import Metrics
-from app.serving.reading import Faults
-from app.serving.session import Session
+from scene_client.stream_messages import Ask, MergedScene, SceneMessage, Update, Whole, object_id
 
 # Fields of a message beside the scene.
 _NOT_REQUESTED: Final = frozenset({"ask", "timeout_ms"})

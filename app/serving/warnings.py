@@ -10,7 +10,7 @@ from typing import Final, Literal
 from app.scene.frames import is_optical, is_world_fixed
 from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
-from app.schemas import SceneRequest, SceneWarning
+from scene_client.schemas import SceneRequest, SceneWarning
 
 MOST_DISTANT: Final = 100.0  # m: millimetres taken for metres are a thousand times as far
 SMALLEST, LARGEST = 1e-3, 20.0  # m, sides of a box

@@ -15,7 +15,10 @@ from fastapi import APIRouter, FastAPI
 from app.api import middleware, problems
 from app.api.body import JSONRoute
 from app.api.dependencies import RequestId
-from app.schemas import (
+from app.serving.logs import log_config
+from app.serving.metrics import Metrics, Unmeasured
+from app.settings import Settings
+from scene_client.schemas import (
     Because,
     Detection,
     Disagreement,
@@ -37,9 +40,6 @@ from app.schemas import (
     SceneRequest,
     Vector,
 )
-from app.serving.logs import log_config
-from app.serving.metrics import Metrics, Unmeasured
-from app.settings import Settings
 
 # So many relations a posed object are derived in the rooms that are asked about.
 _DERIVED = 3

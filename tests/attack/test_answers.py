@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from app.schemas import MAX_BATCH
+from scene_client.schemas import MAX_BATCH
 from tests.http.conftest import launch, serve
 from tests.http.stores import VOCABULARY
 

@@ -12,13 +12,13 @@ import httpx
 import numpy as np
 import pytest
 
-from app.schemas import GenerateRequest, MissingRequest, OutliersRequest, RelationsRequest
 from app.settings import Settings
 from benchmarks.load import echo
 from benchmarks.load.connections import prepared
 from benchmarks.load.measure import is_steady
 from benchmarks.load.questions import KINDS, SCENES, bodies, drawings
 from benchmarks.load.windows import Window, at_concurrency, at_rate, joined
+from scene_client.schemas import GenerateRequest, MissingRequest, OutliersRequest, RelationsRequest
 
 LABELS = [f"thing {number}" for number in range(40)]
 REQUESTS = [prepared("/missing", {"objects": [label]}) for label in LABELS]

@@ -393,7 +393,7 @@ def test_the_curl_shown_gives_the_answer_shown(
 def test_the_python_call_shown_gives_the_same_answer(
     bedroom: Board, api: httpx.Client, repository: Path
 ) -> None:
-    pytest.importorskip("app.client")
+    pytest.importorskip("scene_client")
     done = subprocess.run(
         [sys.executable, "-c", bedroom.python("missing")],
         capture_output=True,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from app.api.catalogue import PROBLEM_TYPES
-from app.schemas import Problem
+from scene_client.schemas import Problem
 from tests.chaos.corpus import JSON, MARKER, NUMBER, Hostile
 from tests.http.conftest import ADMIN_KEY
 

@@ -17,10 +17,10 @@ import pytest
 
 from app import reasoning
 from app.registry import Artifact, Store
-from app.schemas import MissingRequest
 from app.serving.answers import significant
 from app.serving.reading import Limits, read_scene
 from benchmarks.load.connections import prepared
+from scene_client.schemas import MissingRequest
 from tests.chaos.load import ConstantLoad
 from tests.chaos.service import control, memory, running
 from tests.chaos.trends import trend

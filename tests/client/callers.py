@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import pytest
 from pydantic import BaseModel
 
-from app.client import (
+from scene_client import (
     AnswerError,
     AsyncClient,
     Client,
@@ -24,7 +24,7 @@ from app.client import (
     ProblemError,
     UnreachableError,
 )
-from app.schemas import FieldError
+from scene_client.schemas import FieldError
 from tests.conftest import REPOSITORY
 
 
@@ -109,7 +109,7 @@ def compiled(
     command = [
         compiler,
         *("-std=c++17", "-Wall", "-Wextra", "-Werror", "-pthread"),
-        *(f"-I{folder}" for folder in (REPOSITORY / "deploy" / "cpp", *headers_in)),
+        *(f"-I{folder}" for folder in (REPOSITORY / "clients" / "cpp", *headers_in)),
         *(source, "-o", program),
         *found.stdout.split(),
     ]

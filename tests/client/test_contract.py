@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 
 from app.api.example_requests import REQUESTS
-from app.client import (
+from scene_client import (
     Client,
     DeadlineError,
     InvalidRequestError,
     OfflineClient,
     ProblemError,
 )
-from app.schemas import Answer
+from scene_client.schemas import Answer
 from tests.client.callers import Caller
 from tests.client.conftest import EVERY
 from tests.conftest import REPOSITORY
@@ -163,7 +163,7 @@ def test_clients_without_a_service_answer_the_whole_catalogue_alike(
 
 UNCLOSED = """
 import sys
-from app.client import DeadlineError, OfflineClient
+from scene_client import DeadlineError, OfflineClient
 scene = OfflineClient(sys.argv[1])
 try:
     scene.generate(count=64, steps=2000, timeout=0.01)

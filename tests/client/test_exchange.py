@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.client import (
+from scene_client import (
     AnswerError,
     DeadlineError,
     InvalidRequestError,
@@ -21,8 +21,8 @@ from app.client import (
     UnreachableError,
     calls,
 )
-from app.client.calls import Call
-from app.client.exchange import (
+from scene_client.calls import Call
+from scene_client.exchange import (
     LONGEST_PAUSE,
     RETRIES,
     Late,
@@ -34,7 +34,7 @@ from app.client.exchange import (
     exchange,
     problem_of,
 )
-from app.schemas import FieldError, Health
+from scene_client.schemas import FieldError, Health
 
 CALL = calls.health("ready")
 ONCE: Call[Any] = calls.promote("default", {"model": "home"})

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from app.client.command import app
+from scene_client.command import app
 from tests.client import callers
 from tests.conftest import REPOSITORY
 
@@ -69,7 +69,7 @@ def test_the_cpp_example_is_made_and_asks_all_four_questions(
     url: str, tmp_path: Path, bridge: Path, require_system_tool: Callable[[str], Path]
 ) -> None:
     # Asking for `bridge` leaves this test out where the libraries are missing.
-    folder = shutil.copytree(REPOSITORY / "deploy" / "cpp", tmp_path / "cpp")
+    folder = shutil.copytree(REPOSITORY / "clients" / "cpp", tmp_path / "cpp")
     make = require_system_tool("make")
     done = subprocess.run([make, "-C", folder, "CXXFLAGS=-O0"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -24,15 +24,15 @@ PROGRAM = f"""
 import sys
 for module in {HEAVY!r}:
     sys.modules[module] = None  # importing it raises ImportError
-import app.client, app.client.command, app.schemas
-with app.client.Client("http://127.0.0.1:9", retries=0) as scene:
+import scene_client, scene_client.command, scene_client.schemas
+with scene_client.Client("http://127.0.0.1:9", retries=0) as scene:
     assert not scene.is_ready()
     try:
         scene.missing(["bed"])
-    except app.client.UnreachableError:
+    except scene_client.UnreachableError:
         pass
 try:
-    app.client.OfflineClient()
+    scene_client.OfflineClient()
 except ImportError as error:
     print(error)
 """

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.client.layout import HEIGHT, Box, arrange, extent
-from app.schemas import GenerateAnswer, GeneratedScene, ModelReference, Relation
+from scene_client.layout import HEIGHT, Box, arrange, extent
+from scene_client.schemas import GenerateAnswer, GeneratedScene, ModelReference, Relation
 
 NAMES = ["bed", "desk", "lamp", "book", "a rather long name", "x", "chair", "mug"]
 RELATIONS = ["left", "right", "front", "behind", "on-top", "under", "above", "below"]
@@ -100,7 +100,7 @@ def scene(objects: list[str], *relations: tuple[str, str, str]) -> GeneratedScen
 
 @pytest.mark.parametrize("count", [1, 3, 16])
 def test_every_scene_is_in_the_picture(tmp_path: Path, count: int) -> None:
-    plot = pytest.importorskip("app.client.plot")
+    plot = pytest.importorskip("scene_client.plot")
     room = scene(
         ["desk", "lamp", "$chair$"], ("lamp", "on-top", "desk"), ("lamp", "left", "$chair$")
     )
@@ -112,7 +112,7 @@ def test_every_scene_is_in_the_picture(tmp_path: Path, count: int) -> None:
 
 
 def test_a_picture_of_the_largest_answer_stays_within_bounds(tmp_path: Path) -> None:
-    plot = pytest.importorskip("app.client.plot")
+    plot = pytest.importorskip("scene_client.plot")
     names = [f"thing {number}" for number in range(200)]
     row = [(a, "left", b) for a, b in pairwise(names)]
     path = tmp_path / "scenes.png"

@@ -9,8 +9,8 @@ from typing import Any
 import httpx
 import pytest
 
-from app.client import AsyncClient, Client, InvalidRequestError, ProblemError
-from app.schemas import (
+from scene_client import AsyncClient, Client, InvalidRequestError, ProblemError
+from scene_client.schemas import (
     Anchor,
     Detection,
     MissingRequest,

@@ -14,7 +14,7 @@ from typing import Any
 import httpcore
 import pytest
 
-from app.client import (
+from scene_client import (
     AnswerError,
     AsyncClient,
     Client,

@@ -15,10 +15,12 @@ from hypothesis import strategies as st
 from rosbags.typesys.store import Typestore
 from typer.testing import CliRunner
 
-from app.client.command import app
-from app.client.label_maps import COCO
-from app.client.messages import MessageError
-from app.client.vision_msgs import (
+from app.registry import Store
+from scene_client.command import app
+from scene_client.label_maps import COCO
+from scene_client.ros_fields import MessageError
+from scene_client.schemas import SceneRequest
+from scene_client.vision_msgs import (
     MAX_OBJECTS,
     MAX_RELATIONS,
     SceneFields,
@@ -27,8 +29,6 @@ from app.client.vision_msgs import (
     from_message,
     is_message,
 )
-from app.registry import Store
-from app.schemas import SceneRequest
 from tests.client.ros_messages import Layout, blank, through_cdr, to_json
 from tests.http.stores import publish
 
@@ -590,7 +590,7 @@ def test_any_message_is_a_request_or_an_error_of_this_module(message: Any, label
 
 
 def test_the_recorded_message_is_a_scene_with_one_detection_left_out(repository: Path) -> None:
-    recorded = json.loads((repository / "deploy/ros2/detections.json").read_text())
+    recorded = json.loads((repository / "clients/ros2/detections.json").read_text())
     assert is_message(recorded)
     assert not is_message({"objects": ["bed"]})
     fields = from_message(recorded)
@@ -603,7 +603,7 @@ def test_the_recorded_message_is_a_scene_with_one_detection_left_out(repository:
 
 def test_the_command_takes_a_recorded_message_for_a_scene(repository: Path, tmp_path: Path) -> None:
     publish(tmp_path, "home", "1.0.0", alias="default")
-    recorded = str(repository / "deploy/ros2/detections.json")
+    recorded = str(repository / "clients/ros2/detections.json")
     runner = CliRunner()
     done = runner.invoke(app, ["--offline", str(tmp_path), "--json", "outliers", recorded])
     assert done.exit_code == 0, done.output
@@ -622,7 +622,7 @@ def test_the_command_takes_a_recorded_message_for_a_scene(repository: Path, tmp_
 
 def test_a_robot_needs_neither_arrays_nor_ros_for_it() -> None:
     program = (
-        "import sys, app.client.vision_msgs\n"
+        "import sys, scene_client.vision_msgs\n"
         "heavy = {'torch', 'numpy', 'numba', 'fastapi', 'rclpy'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )

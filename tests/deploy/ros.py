@@ -19,7 +19,7 @@ import pytest
 from tests.client.ros_messages import Layout, blank, through_cdr
 
 STORE = Layout.current
-PACKAGE = Path(__file__).resolve().parents[2] / "deploy" / "ros2" / "scene_reasoning"
+PACKAGE = Path(__file__).resolve().parents[2] / "clients" / "ros2" / "scene_reasoning"
 
 
 def message_type(name: str) -> Any:

@@ -15,8 +15,8 @@ import py_trees
 import pytest
 from py_trees.common import Status
 
-from app.client import Client, UnreachableError
-from app.client.vision_msgs import SceneFields, from_message
+from scene_client import Client, UnreachableError
+from scene_client.vision_msgs import SceneFields, from_message
 from tests.deploy.ros import load_package
 from tests.http.conftest import LiveService
 
@@ -29,7 +29,7 @@ def client(service: LiveService) -> Iterator[Client]:
 
 @pytest.fixture
 def scene(repository: Path) -> SceneFields:
-    return from_message(json.loads((repository / "deploy/ros2/detections.json").read_text()))
+    return from_message(json.loads((repository / "clients/ros2/detections.json").read_text()))
 
 
 @pytest.fixture

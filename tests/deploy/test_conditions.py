@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from app.client import Client
-from app.client.vision_msgs import SceneFields, from_message
+from scene_client import Client
+from scene_client.vision_msgs import SceneFields, from_message
 from tests.client import callers
 from tests.http.conftest import LiveService
 
@@ -33,7 +33,7 @@ def program(
         tmp_path_factory.mktemp("conditions") / "conditions",
         require_system_tool("g++"),
         require_system_tool("pkg-config"),
-        repository / "deploy" / "ros2" / "behaviortree_cpp",
+        repository / "clients" / "ros2" / "behaviortree_cpp",
         here,
     )
 
@@ -58,7 +58,7 @@ def url(service: LiveService) -> str:
 
 @pytest.fixture
 def scene(repository: Path) -> SceneFields:
-    return from_message(json.loads((repository / "deploy/ros2/detections.json").read_text()))
+    return from_message(json.loads((repository / "clients/ros2/detections.json").read_text()))
 
 
 def test_a_scene_is_complete_if_nothing_missing_is_rather_there_than_not(

@@ -45,7 +45,7 @@ def bridge(*published: Any) -> Iterator[tuple[str, list[Any]]]:
 
 
 def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
-    script = repository / "deploy" / "ros2" / "over_rosbridge.py"
+    script = repository / "clients" / "ros2" / "over_rosbridge.py"
     done = subprocess.run(
         [sys.executable, str(script), *arguments],
         capture_output=True,
@@ -65,7 +65,7 @@ def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
 def test_a_published_message_is_answered(
     repository: Path, service: LiveService, question: str, part: str
 ) -> None:
-    recorded = json.loads((repository / "deploy/ros2/detections.json").read_text())
+    recorded = json.loads((repository / "clients/ros2/detections.json").read_text())
     at = f"http://127.0.0.1:{service.port}"
     with bridge({"op": "status", "level": "info"}, recorded) as (url, heard):
         (answer,), errors = run(

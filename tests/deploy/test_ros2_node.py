@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 import yaml
 
-from app.client import Client, UnreachableError
-from app.client.vision_msgs import SceneFields
+from scene_client import Client, UnreachableError
+from scene_client.vision_msgs import SceneFields
 from tests.client.ros_messages import blank
 from tests.deploy.ros import PACKAGE, STORE, Ros, from_json, load_package
 from tests.http.conftest import LiveService
@@ -26,7 +26,7 @@ from tests.http.conftest import LiveService
 
 @pytest.fixture
 def recorded(repository: Path) -> Any:
-    envelope = json.loads((repository / "deploy/ros2/detections.json").read_text())
+    envelope = json.loads((repository / "clients/ros2/detections.json").read_text())
     return from_json("vision_msgs/msg/Detection3DArray", envelope["msg"])
 
 

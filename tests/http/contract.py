@@ -9,9 +9,9 @@ import requests
 import schemathesis
 from pydantic import BaseModel, ValidationError
 
-from app import schemas
 from app.main import create_app
 from app.settings import Settings
+from scene_client import schemas
 from tests.conftest import REPOSITORY
 from tests.http.conftest import ADMIN_KEY, LiveService
 

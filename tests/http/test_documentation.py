@@ -13,9 +13,9 @@ from urllib.parse import urljoin, urlsplit
 import httpx
 import pytest
 
-from app import schemas
 from app.api.example_requests import REQUESTS
-from app.schemas import Problem
+from scene_client import schemas
+from scene_client.schemas import Problem
 from tests.http.conftest import serve
 from tests.http.test_problems import problem
 

@@ -49,7 +49,7 @@ def test_bodies_are_read_without_a_proxy_too(service: LiveService, wire: Wire) -
 
 
 def test_every_field_of_every_request_is_attacked() -> None:
-    from app import schemas
+    from scene_client import schemas
 
     forms = {
         "/relations": schemas.RelationsRequest,

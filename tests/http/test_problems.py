@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from app.api.catalogue import PROBLEM_TYPES
-from app.schemas import (
+from scene_client.schemas import (
     Detection,
     GenerateRequest,
     MissingRequest,

@@ -12,13 +12,13 @@ import httpx
 import pytest
 
 from app.scene.relations import CANONICAL, opposite
-from app.schemas import (
+from app.serving.answers import significant
+from scene_client.schemas import (
     GenerateAnswer,
     MissingAnswer,
     OutliersAnswer,
     RelationsAnswer,
 )
-from app.serving.answers import significant
 from tests.http.conftest import serve
 from tests.http.stores import VOCABULARY, publish
 

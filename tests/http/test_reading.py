@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.schemas import SceneRequest
 from app.serving.errors import Reason, RequestError
 from app.serving.reading import MAX_SUGGESTED, Limits, Reading, read_scene
+from scene_client.schemas import SceneRequest
 from tests.http.stores import VOCABULARY
 
 

@@ -22,14 +22,14 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from app.api.catalogue import PROBLEM_TYPES
 from app.api.stream import LEAST_COST, READING_BURST, READING_SHARE
-from app.client import (
+from scene_client import (
     ProblemError,
     StreamClient,
     StreamClosedError,
     StreamProblemError,
     UnreachableError,
 )
-from app.messages import AnswerMessage
+from scene_client.stream_messages import AnswerMessage
 from tests.chaos.service import memory, running
 from tests.http.conftest import ADMIN_KEY, LiveService, launch
 from tests.http.stores import make_store

@@ -14,7 +14,7 @@ from app.scene.relations import (
     contradiction,
     opposite,
 )
-from app.schemas import RelationName
+from scene_client.schemas import RelationName
 
 relations = st.sampled_from(RELATIONS)
 

@@ -14,8 +14,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.messages import Open, Update, Whole
-from app.schemas import MissingRequest, OutliersRequest, RelationsRequest
 from app.serving import questions
 from app.serving.answers import written
 from app.serving.errors import DeadlinePassedError, RequestError, UnknownModelError
@@ -25,6 +23,8 @@ from app.serving.reading import Limits
 from app.serving.runtime import Runtime
 from app.serving.session import Session
 from app.serving.stream import Streams, StreamScene, TokenBucket
+from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest
+from scene_client.stream_messages import Open, Update, Whole
 from tests.http.stores import make_store
 
 ASK = {"missing": {"top_k": 4}, "outliers": {}, "relations": {"top_k": 6}}

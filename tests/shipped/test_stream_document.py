@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from app.api.stream import LEAST_COST, READING_BURST, READING_SHARE
-from app.messages import COMMANDS, EVENTS, AnswerMessage
 from app.settings import Settings
+from scene_client.stream_messages import COMMANDS, EVENTS, AnswerMessage
 from tests.http.conftest import launch
 from tests.http.streams import hear, opened
 

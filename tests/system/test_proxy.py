@@ -19,8 +19,8 @@ import httpx
 import pytest
 import yaml
 
-from app.client import Client
 from app.settings import Settings
+from scene_client import Client
 from tests.chaos.service import running
 from tests.chaos.wire import BODY, Wire, exchange, wires
 from tests.http.conftest import ADMIN_KEY, LiveService

@@ -1,12 +1,12 @@
-"""Relations between the boxes of an image, by the rule of `app.image_plane`: left and above."""
+"""Relations between the boxes of an image, left and above: `scene_client.image_plane`."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from app.image_plane import are_neighbours, relation_between
 from app.scene import CANONICAL, PoseRelations, canonicalise
+from scene_client.image_plane import are_neighbours, relation_between
 
 _IN_THE_IMAGE = [CANONICAL.index("left"), CANONICAL.index("above")]
 

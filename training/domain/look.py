@@ -14,7 +14,7 @@ _ON_TOP, _ABOVE = CANONICAL.index("on-top"), CANONICAL.index("above")
 # So many of each kind are shown; all of them are counted.
 SHOWN = 5
 
-# Of a label in a request (`Label` of app/schemas.py, which training does without).
+# Of a label in a request: `scene_client.schemas.Label`, which training does without.
 LONGEST = 100
 
 

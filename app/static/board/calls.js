@@ -31,7 +31,7 @@ export function python(question, { objects, ...fields }) {
   const key = hasKey() ? ', api_key=os.environ["SCENE_API_KEY"]' : '';
   return [
     ...(hasKey() ? ['import os', ''] : []),
-    'from app.client import Client',
+    'from scene_client import Client',
     '',
     `with Client(${JSON.stringify(service)}${key}) as scene:`,
     `    answer = scene.${question}(`,

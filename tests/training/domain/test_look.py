@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from app.schemas import MissingRequest
+from scene_client.schemas import MissingRequest
 from tests.training.domain.scenes import scene
 from training.datasets import generate_rooms
 from training.datasets.names import Names

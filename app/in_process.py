@@ -1,0 +1,111 @@
+"""The service inside this process, as something that carries a client's requests."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import weakref
+from concurrent.futures import Future
+from pathlib import Path
+from threading import Thread
+
+import httpx
+from fastapi import FastAPI
+from pydantic import SecretStr, ValidationError
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource
+
+from app.main import create_app
+from app.settings import Settings
+from scene_client.errors import InvalidRequestError
+from scene_client.schemas import FieldError
+
+
+class _Given(Settings):
+    """Settings that no environment changes: its variables are meant for services."""
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        return (init_settings,)
+
+
+class InProcess(httpx.BaseTransport):
+    """The application, on an event loop of its own in a thread of its own.
+
+    Args:
+        store: directory of published models.
+
+    Attributes:
+        admin_key: of this application, drawn anew.
+
+    Raises:
+        InvalidRequestError: the store is no directory.
+    """
+
+    def __init__(self, store: Path) -> None:
+        self.admin_key = secrets.token_hex()
+        try:
+            settings = _Given(
+                store=store,
+                admin_key=SecretStr(self.admin_key),
+                metrics=False,
+                access_log=False,
+                docs=False,
+                allowed_hosts=("*",),
+            )
+        except ValidationError:
+            fault = FieldError(pointer="#", message="the store must be an existing directory")
+            raise InvalidRequestError([fault]) from None
+        app = create_app(settings)
+        self._asgi = httpx.ASGITransport(app, raise_app_exceptions=False)
+        started: Future[asyncio.AbstractEventLoop] = Future()
+        ending = asyncio.Event()
+        thread = Thread(target=_live, args=(app, started, ending), daemon=True, name="scene")
+        thread.start()
+        self._loop = started.result()
+        # Runs at the latest when the program ends: a thread that goes on would keep it from that.
+        self._finalize = weakref.finalize(self, _end, self._loop, ending, thread)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        """See `httpx.BaseTransport`."""
+        future = asyncio.run_coroutine_threadsafe(self._answer(request), self._loop)
+        try:
+            return future.result(request.extensions["timeout"]["read"])
+        except TimeoutError:
+            future.cancel()
+            raise httpx.ReadTimeout("no answer in time", request=request) from None
+
+    async def _answer(self, request: httpx.Request) -> httpx.Response:
+        response = await self._asgi.handle_async_request(request)
+        # Its body can only be read on this loop.
+        body = await response.aread()
+        return httpx.Response(response.status_code, headers=response.headers, content=body)
+
+    def close(self) -> None:
+        """End the application and its thread."""
+        self._finalize()
+
+
+def _live(app: FastAPI, started: Future[asyncio.AbstractEventLoop], ending: asyncio.Event) -> None:
+    async def live() -> None:
+        async with app.router.lifespan_context(app):
+            started.set_result(asyncio.get_running_loop())
+            await ending.wait()
+
+    try:
+        asyncio.run(live())
+    except BaseException as error:
+        if started.done():
+            raise
+        started.set_exception(error)
+
+
+def _end(loop: asyncio.AbstractEventLoop, ending: asyncio.Event, thread: Thread) -> None:
+    loop.call_soon_threadsafe(ending.set)
+    thread.join()

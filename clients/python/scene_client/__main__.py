@@ -1,0 +1,7 @@
+"""``python -m scene_client``: the command `scene`."""
+
+from __future__ import annotations
+
+from scene_client.command import app
+
+app(prog_name="scene")

@@ -1,0 +1,469 @@
+"""``scene``: the questions on the command line, for people and for scripts.
+
+Exit status: 0, answered; 1, the service refused the request; 2, the command makes no sense; 3, no
+service there; 4, no answer in time; 5, the service is busy or not ready; 6, anything else. What is
+wrong goes to standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any, Final, NoReturn, get_args
+
+import typer
+from pydantic import BaseModel
+from rich.console import Console, RenderableType
+from typer.core import TyperGroup
+
+from scene_client import __version__, tables
+from scene_client.errors import (
+    ClientError,
+    DeadlineError,
+    InvalidRequestError,
+    ProblemError,
+    UnreachableError,
+)
+from scene_client.offline import OfflineClient
+from scene_client.ros_fields import MessageError
+from scene_client.schemas import RelationName, Sensitivity, UnknownLabels
+from scene_client.sync import Client
+from scene_client.vision_msgs import from_message, is_message
+
+REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
+
+MAX_FILE: Final = 64 * 2**20
+"""Bytes of a scene file; no service takes more."""
+
+_FLAGS: Final = ("--json",)
+_VALUED: Final = ("--url", "--model", "--offline", "--timeout")
+_RELATIONS: Final = get_args(RelationName)
+
+
+class _Group(TyperGroup):
+    """A command whose own options may stand after the question, too."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Bring them to the front."""
+        own, others = [], []
+        given = iter(args)
+        for word in given:
+            if word == "--":
+                others += [word, *given]
+            elif word in _FLAGS or word.partition("=")[0] in _VALUED:
+                own += [word, *islice(given, word in _VALUED)]
+            else:
+                others.append(word)
+        parsed: list[str] = super().parse_args(ctx, own + others)
+        return parsed
+
+
+app = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Ask what is missing from a scene, what does not belong, and how things stand.",
+    epilog="The options above may stand anywhere. Exit status: 1 refused, 2 wrong usage, 3 no "
+    "service, 4 too late, 5 busy or not ready, 6 anything else.",
+)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What was said before or beside the question."""
+
+    url: str
+    model: str | None
+    store: Path | None
+    timeout: float
+    as_json: bool
+
+    def open(self) -> Client:
+        """A client of whatever shall answer."""
+        if self.store is not None:
+            return OfflineClient(self.store, timeout=self.timeout, model=self.model)
+        # Keys are no options: other users of a machine see those.
+        key = os.environ.get("SCENE_API_KEY") or None
+        return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
+
+    def show(self, answer: BaseModel, table: Callable[[Any], RenderableType]) -> None:
+        """Print an answer: as JSON, or as a table with colours where a person looks at it."""
+        if self.as_json:
+            print(answer.model_dump_json(exclude_none=True))
+            return
+        console = Console(markup=False, highlight=False, emoji=False)
+        if not console.is_terminal:
+            # Whoever reads on has no margin: nothing is cut or wrapped.
+            console.width = 10_000
+        console.print(table(answer))
+        for note in tables.notes(answer):
+            print(note, file=sys.stderr)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"scene {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    context: typer.Context,
+    url: Annotated[
+        str, typer.Option(envvar="SCENE_URL", help="Where the service is.")
+    ] = "http://127.0.0.1:8000",
+    model: Annotated[
+        str | None, typer.Option(help="An alias, a name, or name@version.", show_default="default")
+    ] = None,
+    offline: Annotated[
+        Path | None,
+        typer.Option(metavar="STORE", help="Answer here, from this model store, with no service."),
+    ] = None,
+    timeout: Annotated[float, typer.Option(help="Seconds for all of it.")] = 10.0,
+    json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
+    version: Annotated[  # noqa: ARG001 — its callback has done all there is to do
+        bool,
+        typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Keep what holds for every question."""
+    context.obj = Asked(url, model, offline, timeout, json)
+
+
+# ---------------------------------------------------------------------------------- questions
+
+Things = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="LABEL... | SCENE.json | -",
+        help="Labels; or a file with a request as in the HTTP contract, or with detections as "
+        "rosbridge writes them; or - to read it.",
+        show_default=False,
+    ),
+]
+Stated = Annotated[
+    list[str] | None,
+    typer.Option("--relation", help='What holds, as in "lamp on-top desk"; repeatable.'),
+]
+Room = Annotated[str | None, typer.Option("--room", help="The type of the room.")]
+TopK = Annotated[int | None, typer.Option("--top-k", help="How many at most.")]
+Unknown = Annotated[
+    bool, typer.Option("--ignore-unknown", help="Answer without labels the model does not know.")
+]
+UnknownChoice = Annotated[
+    UnknownLabels | None,
+    typer.Option(
+        "--unknown-labels", help="Refuse them, ignore them, or take the nearest class of each."
+    ),
+]
+
+
+@app.command()
+def relations(
+    context: typer.Context,
+    things: Things = None,
+    relation: Stated = None,
+    room: Room = None,
+    top_k: TopK = None,
+    min_probability: Annotated[
+        float | None, typer.Option(help="Leave out what is less likely.")
+    ] = None,
+    opposites: Annotated[
+        bool, typer.Option("--opposites", help="Also right, behind, under and below.")
+    ] = False,
+    ignore_unknown: Unknown = False,
+    unknown_labels: UnknownChoice = None,
+) -> None:
+    """How do these objects stand to each other?"""
+    asked: Asked = context.obj
+    with _failing(), asked.open() as client:
+        request = _request(
+            things,
+            relation,
+            room,
+            _treatment(ignore_unknown, unknown_labels),
+            top_k=top_k,
+            min_probability=min_probability,
+            include_opposites=opposites or None,
+        )
+        asked.show(client.relations(request), tables.relations)
+
+
+@app.command()
+def missing(
+    context: typer.Context,
+    things: Things = None,
+    coverage: Annotated[
+        float | None, typer.Option(help="Share of what is there that is listed, 0 to 1.")
+    ] = None,
+    at: Annotated[str | None, typer.Option(help='At this place, as in "on-top desk".')] = None,
+    candidate: Annotated[
+        list[str] | None, typer.Option(help="Only this label; repeatable.")
+    ] = None,
+    relation: Stated = None,
+    room: Room = None,
+    top_k: TopK = None,
+    ignore_unknown: Unknown = False,
+    unknown_labels: UnknownChoice = None,
+) -> None:
+    """What else should be here, and where?"""
+    asked: Asked = context.obj
+    with _failing(), asked.open() as client:
+        request = _request(
+            things,
+            relation,
+            room,
+            _treatment(ignore_unknown, unknown_labels),
+            top_k=top_k,
+            coverage=coverage,
+            at=None if at is None else _anchor(at),
+            candidates=candidate or None,
+        )
+        asked.show(client.missing(request), tables.missing)
+
+
+@app.command()
+def outliers(
+    context: typer.Context,
+    things: Things = None,
+    sensitivity: Annotated[
+        Sensitivity | None, typer.Option(help="How readily an alarm is raised.")
+    ] = None,
+    threshold: Annotated[
+        float | None, typer.Option(help="An outlier from this probability on.")
+    ] = None,
+    relation: Stated = None,
+    room: Room = None,
+    ignore_unknown: Unknown = False,
+    unknown_labels: UnknownChoice = None,
+) -> None:
+    """What does not belong here, or stands in the wrong place?"""
+    asked: Asked = context.obj
+    with _failing(), asked.open() as client:
+        request = _request(
+            things,
+            relation,
+            room,
+            _treatment(ignore_unknown, unknown_labels),
+            sensitivity=sensitivity,
+            threshold=threshold,
+        )
+        asked.show(client.outliers(request), tables.outliers)
+
+
+@app.command()
+def generate(
+    context: typer.Context,
+    things: Things = None,
+    count: Annotated[int | None, typer.Option(help="How many scenes.")] = None,
+    seed: Annotated[int | None, typer.Option(help="The same draws the same.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Gibbs sweeps.")] = None,
+    temperature: Annotated[float | None, typer.Option(help="Above 1: more varied.")] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="Draw the scenes into this file (.png, .svg, .pdf).", dir_okay=False),
+    ] = None,
+    relation: Stated = None,
+    room: Room = None,
+    ignore_unknown: Unknown = False,
+    unknown_labels: UnknownChoice = None,
+) -> None:
+    """What would a scene like this look like?"""
+    asked: Asked = context.obj
+    if plot is not None and find_spec("matplotlib") is None:
+        needed = "--plot needs matplotlib: pip install matplotlib"
+        _fail(needed, MEANINGLESS)
+    with _failing(), asked.open() as client:
+        request = _request(
+            things,
+            relation,
+            room,
+            _treatment(ignore_unknown, unknown_labels),
+            from_nothing=True,
+            count=count,
+            seed=seed,
+            steps=steps,
+            temperature=temperature,
+        )
+        answer = client.generate(request)
+    asked.show(answer, tables.generate)
+    if plot is not None:
+        from scene_client.plot import draw
+
+        try:
+            draw(answer, plot)
+        except (OSError, ValueError) as error:
+            _fail(f"no picture: {error}", MEANINGLESS)
+
+
+# ------------------------------------------------------------------------------------- models
+
+
+@app.command()
+def models(context: typer.Context) -> None:
+    """Which models there are."""
+    asked: Asked = context.obj
+    with _failing(), asked.open() as client:
+        asked.show(client.models(), tables.models)
+
+
+@app.command()
+def vocabulary(context: typer.Context) -> None:
+    """The words of the model."""
+    asked: Asked = context.obj
+    with _failing(), asked.open() as client:
+        asked.show(client.vocabulary(), tables.vocabulary)
+
+
+@app.command()
+def contexts(context: typer.Context) -> None:
+    """What the hidden units of the model stand for."""
+    asked: Asked = context.obj
+    with _failing(), asked.open() as client:
+        asked.show(client.contexts(), tables.contexts)
+
+
+@app.command()
+def ready(context: typer.Context) -> None:
+    """Whether the service answers; says nothing but by its exit status."""
+    asked: Asked = context.obj
+    with _failing(), asked.open() as client:
+        client.check_ready()
+
+
+# ------------------------------------------------------------------------------------ reading
+
+
+def _request(
+    things: list[str] | None,
+    stated: list[str] | None,
+    room: str | None,
+    unknown_labels: UnknownLabels | None,
+    *,
+    from_nothing: bool = False,
+    **options: Any,
+) -> dict[str, Any]:
+    """The body of a request; options beside a file take the place of what stands there."""
+    files = [thing for thing in things or () if _is_file(thing)]
+    if files and things != files[:1]:
+        _fail(f"{files[0]} must stand alone: it is a whole scene", MEANINGLESS)
+    if not things and not from_nothing:
+        _fail("name what is there: labels, a file that ends in .json, or - to read it", MEANINGLESS)
+    request = _read(files[0]) if files else {"objects": things or []}
+    options["relations"] = [_relation(text) for text in stated] if stated else None
+    options["room_type"] = room
+    options["unknown_labels"] = unknown_labels
+    return request | {name: value for name, value in options.items() if value is not None}
+
+
+def _treatment(ignore_unknown: bool, unknown_labels: UnknownLabels | None) -> UnknownLabels | None:
+    """Of unknown labels: `--ignore-unknown` is short for `--unknown-labels ignore`."""
+    if ignore_unknown and unknown_labels not in (None, "ignore"):
+        _fail("--ignore-unknown and --unknown-labels disagree", MEANINGLESS)
+    return "ignore" if ignore_unknown else unknown_labels
+
+
+def _is_file(thing: str) -> bool:
+    """Whether this names a scene, and no label: no label ends so, or holds a slash."""
+    return thing == "-" or thing.endswith(".json") or os.sep in thing
+
+
+def _read(name: str) -> dict[str, Any]:
+    try:
+        if name == "-":
+            text = sys.stdin.buffer.read(MAX_FILE + 1)
+        else:
+            with Path(name).open("rb") as file:
+                text = file.read(MAX_FILE + 1)
+    except OSError as error:
+        _fail(f"{name}: {error.strerror}", MEANINGLESS)
+    if len(text) > MAX_FILE:
+        _fail(f"{name}: over {MAX_FILE} bytes", MEANINGLESS)
+    try:
+        scene = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        _fail(f"{name}: no JSON: {error}", MEANINGLESS)
+    if is_message(scene):
+        return _detected(name, scene)
+    if isinstance(scene, list):
+        return {"objects": scene}
+    if not isinstance(scene, dict):
+        _fail(f"{name}: neither a request nor a list of objects", MEANINGLESS)
+    return scene
+
+
+def _detected(name: str, message: Any) -> dict[str, Any]:
+    """The request of a message of detections, as rosbridge writes it."""
+    try:
+        fields = from_message(message)
+    except MessageError as error:
+        _fail(f"{name}: {error}", MEANINGLESS)
+    for note in fields.notes:
+        which = "" if note.detection is None else f"detection {note.detection}: "
+        print(f"{name}: {which}{note.detail}", file=sys.stderr)
+    return fields
+
+
+def _anchor(text: str) -> dict[str, str]:
+    relation, _, object = text.strip().partition(" ")
+    if relation not in _RELATIONS or not object:
+        names = ", ".join(_RELATIONS)
+        _fail(f'--at must be one of {names}, and an object: "on-top desk"', MEANINGLESS)
+    return {"relation": relation, "object": object.strip()}
+
+
+def _relation(text: str) -> dict[str, str]:
+    # Labels may hold spaces; the relation is the word between them.
+    words = text.split()
+    place = next((n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS), None)
+    if place is None:
+        names = ", ".join(_RELATIONS)
+        _fail(f"--relation must name two objects with one of {names} between them", MEANINGLESS)
+    subject, object = " ".join(words[:place]), " ".join(words[place + 1 :])
+    return {"subject": subject, "relation": words[place], "object": object}
+
+
+# ------------------------------------------------------------------------------------- errors
+
+
+@contextmanager
+def _failing() -> Iterator[None]:
+    try:
+        yield
+    except InvalidRequestError as error:
+        _fail(str(error), MEANINGLESS)
+    except ProblemError as problem:
+        _fail(str(problem), _status(problem))
+    except UnreachableError as error:
+        _fail(f"no service: {error}", UNREACHABLE)
+    except DeadlineError as error:
+        _fail(str(error), LATE)
+    except ClientError as error:
+        _fail(str(error), FAILED)
+    except ImportError as error:
+        _fail(str(error), MEANINGLESS)
+
+
+def _status(problem: ProblemError) -> int:
+    if problem.status in (429, 503):
+        return BUSY
+    return REFUSED if 400 <= problem.status < 500 else FAILED
+
+
+def _fail(message: str, status: int) -> NoReturn:
+    Console(stderr=True, markup=False, highlight=False, emoji=False, soft_wrap=True).print(
+        message, style="red"
+    )
+    raise typer.Exit(status)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,329 @@
+"""A client of ``GET /stream`` that keeps the newest answer; docs/stream.md is the contract."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+from collections.abc import Sequence
+from time import monotonic
+from types import TracebackType
+from typing import Any, Final, Self
+from urllib.parse import urlsplit, urlunsplit
+
+from pydantic import BaseModel
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+
+from scene_client.errors import ClientError, ProblemError, UnreachableError
+from scene_client.exchange import Received, problem_of
+from scene_client.schemas import Detection, Problem
+from scene_client.stream_messages import (
+    EVENTS,
+    AnswerMessage,
+    Event,
+    MergedScene,
+    Open,
+    Opened,
+    Ping,
+    ProblemMessage,
+    StreamLimits,
+    Update,
+    Whole,
+)
+
+Objects = Sequence[str | dict[str, Any] | Detection]
+
+_PATH: Final = "/stream"
+_MAX_EVENT: Final = 64 * 2**20
+# Of connections that broke, and of services that end or fail; others would close it again.
+_TRANSIENT: Final = frozenset({1001, 1006, 1011, 1012, 1013})
+_FIRST_PAUSE: Final = 0.1
+_LONGEST_PAUSE: Final = 5.0
+
+
+class StreamProblemError(ClientError):
+    """The service refused a message; the stream goes on.
+
+    Attributes:
+        problem: branch on its `type`.
+        seq: of the message, where it has one.
+    """
+
+    def __init__(self, message: ProblemMessage) -> None:
+        super().__init__(f"{message.problem.title}: {message.problem.detail}")
+        self.problem: Problem = message.problem
+        self.seq = message.seq
+
+
+class StreamClosedError(ClientError):
+    """The stream has ended.
+
+    Attributes:
+        code: of the close (RFC 6455, section 7.4); 1006 where the connection broke.
+        reason: a word, where the service gave one: `draining`, `stream-idle`.
+    """
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(f"closed with {code} {reason}".rstrip())
+        self.code = code
+        self.reason = reason
+
+
+class StreamClient:
+    """One stream: send changes of the scene, iterate over the newest answers.
+
+        async with StreamClient("http://127.0.0.1:8000", room_type="bedroom") as scene:
+            await scene.update(objects=["bed", {"id": "lamp_1", "label": "lamp"}])
+            async for answer in scene:
+                print(answer.missing.missing[0].label)
+
+    The client keeps the scene. Where the connection breaks, the iteration connects again and sends
+    the whole scene. `StreamProblemError` can be caught, and the iteration begun again.
+
+    Args:
+        url: of the service, with http, https, ws or wss.
+        api_key: of a service that asks for one.
+        timeout: seconds for connecting, and for closing.
+        reconnect: seconds without an answer after which the client gives up a broken stream.
+        **fields: of the opening message: `model`, `ask`, `room_type`, `frame_id` and so on.
+
+    Attributes:
+        seq: of the newest message.
+        limits: of the service.
+        answer: the newest; None before the first.
+    """
+
+    limits: StreamLimits
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        api_key: str | None = None,
+        timeout: float = 10.0,
+        reconnect: float = 60.0,
+        **fields: Any,
+    ) -> None:
+        parts = urlsplit(url)
+        scheme = {"http": "ws", "https": "wss"}.get(parts.scheme, parts.scheme)
+        path = parts.path.rstrip("/").removesuffix(_PATH) + _PATH
+        self._address = urlunsplit((scheme, parts.netloc, path, "", ""))
+        self._headers = {} if api_key is None else {"X-API-Key": api_key}
+        self._timeout = timeout
+        self._patience = reconnect
+        self._opening = Open(type="open", **fields)
+        self._scene = MergedScene().after(self._opening)
+        self._unanswered: dict[int, Update | Whole] = {}
+        self._connection: ClientConnection | None = None
+        self._ended: StreamClosedError | None = None
+        self._lost_at: float | None = None
+        self._pause = _FIRST_PAUSE
+        self.seq = 0
+        self.answer: AnswerMessage | None = None
+
+    async def __aenter__(self) -> Self:
+        """Connect and open.
+
+        Raises:
+            UnreachableError: the service cannot be reached.
+            ProblemError: it refused the handshake.
+            StreamProblemError: it refused the opening.
+            StreamClosedError: it closed the stream.
+        """
+        await self._connect()
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the stream."""
+        await self.close()
+
+    # -- sending --------------------------------------------------------------------------------
+
+    async def update(
+        self, objects: Objects = (), *, remove: Sequence[str] = (), **fields: Any
+    ) -> int:
+        """Send objects that were added, moved or changed, and removed; the message's number.
+
+        Args:
+            objects: each with an id, or its label for one.
+            remove: ids.
+            **fields: of the scene: `relations`, `room_type`, `stamp` and so on.
+
+        Raises:
+            pydantic.ValidationError: the message is malformed and was not sent.
+            StreamClosedError: the stream has ended.
+        """
+        if remove:
+            fields["remove"] = list(remove)
+        things: list[Any] = list(objects)
+        return await self._next(Update(type="update", seq=self.seq + 1, objects=things, **fields))
+
+    async def replace(self, objects: Objects, **fields: Any) -> int:
+        """Send a whole scene in place of the one before; the message's number.
+
+        Raises:
+            pydantic.ValidationError, StreamClosedError: see `update`.
+        """
+        things: list[Any] = list(objects)
+        return await self._next(Whole(type="scene", seq=self.seq + 1, objects=things, **fields))
+
+    async def ping(self) -> None:
+        """Keep a quiet stream open.
+
+        Raises:
+            StreamClosedError: the stream has ended.
+        """
+        await self._send(Ping(type="ping"))
+
+    async def close(self) -> None:
+        """End the stream, and with it the iteration."""
+        self._ended = self._ended or StreamClosedError(1000, "")
+        if self._connection is not None:
+            await self._connection.close()
+
+    async def _next(self, message: Update | Whole) -> int:
+        if self._ended is not None:
+            raise self._ended
+        self.seq = message.seq
+        self._unanswered[message.seq] = message
+        if not await self._send(message):
+            self._merge(message.seq)
+        return message.seq
+
+    async def _send(self, message: BaseModel) -> bool:
+        """Send a message; False where the connection is broken."""
+        if self._ended is not None:
+            raise self._ended
+        if self._connection is None:
+            raise RuntimeError("the stream is not open: use it with `async with`")
+        try:
+            await self._connection.send(_text(message))
+        except ConnectionClosed:
+            return False
+        return True
+
+    def _merge(self, seq: int) -> None:
+        """Merge messages up to a number into the kept scene."""
+        for number in [number for number in self._unanswered if number <= seq]:
+            self._scene = self._scene.after(self._unanswered.pop(number))
+
+    # -- receiving ------------------------------------------------------------------------------
+
+    def __aiter__(self) -> Self:
+        """The answers as they come."""
+        return self
+
+    async def __anext__(self) -> AnswerMessage:
+        """The next answer.
+
+        Raises:
+            StreamProblemError: the service refused a message.
+            StreamClosedError: the service ended the stream, or cannot be reached any more.
+            ProblemError: the service refused a new connection.
+            StopAsyncIteration: the stream was closed from here.
+        """
+        if self._connection is None:
+            raise RuntimeError("the stream is not open: use it with `async with`")
+        while True:
+            try:
+                event = _event(await self._connection.recv())
+            except ConnectionClosed as error:
+                await self._reconnect(_closed(error))
+                continue
+            if isinstance(event, ProblemMessage):
+                self._unanswered.pop(event.seq or 0, None)
+                raise StreamProblemError(event)
+            if isinstance(event, AnswerMessage):
+                self._merge(event.seq)
+                self.answer, self._lost_at, self._pause = event, None, _FIRST_PAUSE
+                return event
+
+    async def _reconnect(self, closed: StreamClosedError) -> None:
+        """Connect again and send the whole scene, with growing pauses between attempts."""
+        self._lost_at = self._lost_at or monotonic()
+        while self._ended is None:
+            late = monotonic() + self._pause > self._lost_at + self._patience
+            if late or closed.code not in _TRANSIENT:
+                self._ended = closed
+                raise closed
+            # Many robots that lose one service do not come back at once.
+            await asyncio.sleep(self._pause * random.uniform(0.5, 1.0))  # noqa: S311 # nosec B311
+            self._pause = min(2 * self._pause, _LONGEST_PAUSE)
+            try:
+                await self._connect()
+            except (UnreachableError, StreamClosedError):
+                continue
+            except ProblemError as refused:
+                if refused.status not in {429, 503}:
+                    raise
+            else:
+                return
+        if self._ended.code != 1000:
+            raise self._ended
+        raise StopAsyncIteration
+
+    async def _connect(self) -> None:
+        connection = await self._connected()
+        try:
+            await connection.send(_text(self._opening))
+            opened = _event(await connection.recv())
+            if isinstance(opened, ProblemMessage):
+                raise StreamProblemError(opened)
+            if not isinstance(opened, Opened):
+                raise TypeError(f"the stream was opened with {opened.type}")
+            sent = 0
+            while sent != self.seq:  # messages come while the scene is sent
+                sent = self.seq
+                self._merge(sent)
+                objects = list(self._scene.objects.values())
+                scene = Whole(type="scene", seq=sent, objects=objects, **self._scene.fields)
+                await connection.send(_text(scene))
+        except BaseException as error:
+            await connection.close()
+            if isinstance(error, ConnectionClosed):
+                raise _closed(error) from None
+            raise
+        self.limits = opened.limits
+        self._connection = connection
+        if self._ended is not None:  # closed meanwhile
+            await connection.close()
+
+    async def _connected(self) -> ClientConnection:
+        try:
+            return await connect(
+                self._address,
+                additional_headers=self._headers,
+                open_timeout=self._timeout,
+                close_timeout=self._timeout,
+                max_size=_MAX_EVENT,
+                compression=None,
+                proxy=None,
+            )
+        except InvalidStatus as refused:
+            answer = refused.response
+            headers = {name.lower(): value for name, value in answer.headers.raw_items()}
+            body = bytes(answer.body or b"")
+            raise problem_of(Received(answer.status_code, headers, body)) from None
+        except (OSError, InvalidHandshake) as error:
+            raise UnreachableError(f"no stream at {self._address}: {error}") from error
+
+
+def _text(message: BaseModel) -> str:
+    return message.model_dump_json(exclude_unset=True)
+
+
+def _event(text: str | bytes) -> Event:
+    value = json.loads(text)
+    return EVENTS[value["type"]].model_validate(value)
+
+
+def _closed(error: ConnectionClosed) -> StreamClosedError:
+    if error.rcvd is None:
+        return StreamClosedError(1006, "")
+    return StreamClosedError(error.rcvd.code, error.rcvd.reason)

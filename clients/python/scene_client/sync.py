@@ -1,0 +1,315 @@
+# Written by `make format` from asynchronous.py; do not edit.
+"""The client: `AsyncClient`, and `Client`, which is generated from it by `make format`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from time import monotonic
+from types import TracebackType
+from typing import Self, Unpack, overload
+
+import httpx
+
+from scene_client import calls
+from scene_client.calls import Call, T
+from scene_client.deadline import DeadlineTransport
+from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
+from scene_client.exchange import (
+    MAX_ANSWER,
+    RETRIES,
+    Late,
+    Outcome,
+    Pause,
+    Received,
+    Send,
+    exchange,
+)
+from scene_client.fields import (
+    AliasFields,
+    Body,
+    GenerateFields,
+    MissingFields,
+    Objects,
+    OutliersFields,
+    RelationsFields,
+)
+from scene_client.options import Options
+from scene_client.schemas import (
+    AliasAnswer,
+    BatchAnswer,
+    ContextsAnswer,
+    GenerateAnswer,
+    GenerateRequest,
+    MissingAnswer,
+    MissingRequest,
+    ModelList,
+    ModelSummary,
+    OutliersAnswer,
+    OutliersRequest,
+    RefreshAnswer,
+    RelationsAnswer,
+    RelationsRequest,
+    VersionDetails,
+    VocabularyAnswer,
+)
+
+
+class Client:
+    """Asks a service.
+
+    `Client` waits for each answer, and threads may share one. The same methods of `AsyncClient`
+    are coroutines.
+
+    Args:
+        url: of the service.
+        timeout: seconds for a whole call, further attempts and the pauses between them included.
+        api_key: where the service asks for one.
+        admin_key: for `refresh` and `promote`.
+        model: asked where a request names none; left out, the service's default.
+        retries: further attempts at most, as far as there is time: after 429, 503 and broken
+            connections.
+        transport: what carries requests; by default pooled connections.
+
+    Every question takes objects and the request's own fields, or a whole request alone, and
+    ``timeout`` for this one call.
+
+    Raises:
+        InvalidRequestError: the service would refuse the request as malformed.
+        ProblemError: the service answered with a problem.
+        DeadlineError: the time was over.
+        UnreachableError: there is no connection.
+        AnswerError: the answer cannot be read.
+    """
+
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8000",
+        *,
+        timeout: float = 10.0,
+        api_key: str | None = None,
+        admin_key: str | None = None,
+        model: str | None = None,
+        retries: int = RETRIES,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.options = Options(url, timeout, api_key, admin_key, model, retries)
+        if transport is None:
+            transport = DeadlineTransport(self.options.ssl_context())
+        self._http = httpx.Client(transport=transport, trust_env=False)
+
+    # ------------------------------------------------------------------------------ questions
+
+    def relations(
+        self,
+        objects: Objects | RelationsRequest | Body,
+        *,
+        timeout: float | None = None,
+        **fields: Unpack[RelationsFields],
+    ) -> RelationsAnswer:
+        """How do these objects stand to each other?"""
+        model = self.options.model
+        return self._call(calls.ask(calls.RELATIONS, objects, fields, model), timeout)
+
+    def missing(
+        self,
+        objects: Objects | MissingRequest | Body,
+        *,
+        timeout: float | None = None,
+        **fields: Unpack[MissingFields],
+    ) -> MissingAnswer:
+        """What else should be here, and where?"""
+        model = self.options.model
+        return self._call(calls.ask(calls.MISSING, objects, fields, model), timeout)
+
+    def outliers(
+        self,
+        objects: Objects | OutliersRequest | Body,
+        *,
+        timeout: float | None = None,
+        **fields: Unpack[OutliersFields],
+    ) -> OutliersAnswer:
+        """What does not belong here, or stands in the wrong place?"""
+        model = self.options.model
+        return self._call(calls.ask(calls.OUTLIERS, objects, fields, model), timeout)
+
+    def generate(
+        self,
+        objects: Objects | GenerateRequest | Body = (),
+        *,
+        timeout: float | None = None,
+        **fields: Unpack[GenerateFields],
+    ) -> GenerateAnswer:
+        """What would a scene like this look like?"""
+        model = self.options.model
+        return self._call(calls.ask(calls.GENERATE, objects, fields, model), timeout)
+
+    # -------------------------------------------------------------------------------- batches
+
+    def relations_batch(
+        self,
+        scenes: Iterable[Objects | RelationsRequest | Body],
+        *,
+        timeout: float | None = None,
+    ) -> BatchAnswer[RelationsAnswer]:
+        """As `relations`, for up to 256 scenes; what the model refuses spoils one entry only."""
+        return self._call(calls.ask_each(calls.RELATIONS, scenes, self.options.model), timeout)
+
+    def missing_batch(
+        self,
+        scenes: Iterable[Objects | MissingRequest | Body],
+        *,
+        timeout: float | None = None,
+    ) -> BatchAnswer[MissingAnswer]:
+        """As `missing`, for up to 256 scenes; what the model refuses spoils one entry only."""
+        return self._call(calls.ask_each(calls.MISSING, scenes, self.options.model), timeout)
+
+    def outliers_batch(
+        self,
+        scenes: Iterable[Objects | OutliersRequest | Body],
+        *,
+        timeout: float | None = None,
+    ) -> BatchAnswer[OutliersAnswer]:
+        """As `outliers`, for up to 256 scenes; what the model refuses spoils one entry only."""
+        return self._call(calls.ask_each(calls.OUTLIERS, scenes, self.options.model), timeout)
+
+    # --------------------------------------------------------------------------------- models
+
+    def models(self, *, timeout: float | None = None) -> ModelList:
+        """Models, versions and aliases."""
+        return self._call(calls.models(), timeout)
+
+    @overload
+    def model(self, name: str, *, timeout: float | None = None) -> ModelSummary: ...
+
+    @overload
+    def model(self, name: str, version: str, *, timeout: float | None = None) -> VersionDetails: ...
+
+    def model(
+        self, name: str, version: str | None = None, *, timeout: float | None = None
+    ) -> ModelSummary | VersionDetails:
+        """The versions of a model, or all there is to know about one of them."""
+        if version is None:
+            return self._call(calls.model(name), timeout)
+        return self._call(calls.version(name, version), timeout)
+
+    def vocabulary(
+        self, name: str | None = None, *, timeout: float | None = None
+    ) -> VocabularyAnswer:
+        """The words of a model."""
+        return self._call(calls.vocabulary(self.options.named(name)), timeout)
+
+    def contexts(self, name: str | None = None, *, timeout: float | None = None) -> ContextsAnswer:
+        """The hidden units of a model by their strongest objects."""
+        return self._call(calls.contexts(self.options.named(name)), timeout)
+
+    def refresh(self, *, timeout: float | None = None) -> RefreshAnswer:
+        """Let the service take over what its store holds now; needs the admin key."""
+        return self._call(calls.refresh(), timeout)
+
+    def promote(
+        self,
+        alias: str,
+        model: str,
+        *,
+        timeout: float | None = None,
+        **fields: Unpack[AliasFields],
+    ) -> AliasAnswer:
+        """Let an alias lead to a model or a version of it; needs the admin key.
+
+        Not asked again after a broken connection, which may have broken after the alias moved.
+
+        Args:
+            alias: ``default``, or any other.
+            model: ``name@version``, or ``name`` for its newest.
+            **fields: ``expected``: where it must lead now; None: it must not exist yet.
+        """
+        return self._call(calls.promote(alias, {"model": model, **fields}), timeout)
+
+    # --------------------------------------------------------------------------------- health
+
+    def is_live(self, *, timeout: float | None = None) -> bool:
+        """Whether the service answers at all; asked once."""
+        return self._is("live", timeout)
+
+    def is_ready(self, *, timeout: float | None = None) -> bool:
+        """Whether the service's default model answers; asked once."""
+        return self._is("ready", timeout)
+
+    def check_ready(self, *, timeout: float | None = None) -> None:
+        """Return if the service's default model answers; asked once.
+
+        Raises:
+            UnreachableError, DeadlineError, ProblemError: it does not, and so.
+        """
+        self._call(calls.health("ready"), timeout, retries=0)
+
+    def _is(self, health: str, timeout: float | None) -> bool:
+        try:
+            self._call(calls.health(health), timeout, retries=0)
+        except (UnreachableError, DeadlineError):
+            return False
+        except ProblemError as problem:
+            if problem.status != 503:
+                raise
+            return False
+        return True
+
+    # ------------------------------------------------------------------------------- exchange
+
+    def _call(self, call: Call[T], timeout: float | None, retries: int | None = None) -> T:
+        retries = self.options.retries if retries is None else retries
+        steps = exchange(call, self.options.limit(timeout), monotonic, retries=retries)
+        outcome: Outcome = None
+        while True:
+            try:
+                to_do = steps.send(outcome)
+            except StopIteration as done:
+                answer: T = done.value
+                return answer
+            match to_do:
+                case Send(headers, left):
+                    outcome = self._send(call, headers, left)
+                case Pause(seconds):
+                    time.sleep(seconds)
+                    outcome = None
+
+    def _send(self, call: Call[T], headers: Mapping[str, str], left: float) -> Outcome:
+        options = self.options
+        body = bytearray()
+        try:
+            with self._http.stream(
+                call.method,
+                options.address(call),
+                content=call.body,
+                headers={**options.headers(call), **headers},
+                timeout=left,
+            ) as response:
+                for part in response.iter_bytes():
+                    body += part
+                    if len(body) > MAX_ANSWER:
+                        raise AnswerError("The answer is too long.")
+        except httpx.TimeoutException:
+            return Late()
+        except (httpx.ConnectError, httpx.UnsupportedProtocol) as error:
+            return options.lost(error, sent=False)
+        except httpx.TransportError as error:
+            return options.lost(error, sent=True)
+        return Received(response.status_code, response.headers, bytes(body))
+
+    # ------------------------------------------------------------------------------- lifetime
+
+    def close(self) -> None:
+        """Close every connection."""
+        self._http.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,210 @@
+"""Answers as tables for people; programs ask for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+
+from scene_client.schemas import (
+    Because,
+    ContextsAnswer,
+    GenerateAnswer,
+    MissingAnswer,
+    ModelList,
+    OutliersAnswer,
+    Placement,
+    RelationsAnswer,
+    VocabularyAnswer,
+    WeightedLabel,
+)
+
+MOST_MISPLACED: Final = 10
+"""Rows at most: a dozen positions tell of a hundred relations."""
+
+
+def relations(answer: RelationsAnswer) -> RenderableType:
+    """Relations, best first, and what was stated and is not believed."""
+    rows = [
+        (
+            entry.subject,
+            entry.relation,
+            entry.object,
+            _share(entry.probability),
+            "observed" if getattr(entry, "observed", False) else "",
+        )
+        for entry in answer.relations
+    ]
+    stated = _table("subject", "relation", "object", "probability", "", rows=rows)
+    # A service of an earlier version says nothing of them.
+    doubted = [
+        (
+            entry.subject,
+            ", ".join(entry.observed),
+            entry.object,
+            _share(entry.observed_probability),
+            f"{entry.expected} {_share(entry.probability)}",
+        )
+        for entry in getattr(answer, "disagreements", None) or ()
+    ]
+    if not doubted:
+        return stated
+    columns = ("subject", "observed", "object", "probability", "expected")
+    return Group(stated, _table(*columns, rows=doubted, title="disagreements"))
+
+
+def missing(answer: MissingAnswer) -> RenderableType:
+    """Absent objects, likeliest first, with where they would stand and why."""
+    rows = [
+        (
+            entry.label,
+            _share(entry.probability),
+            f"{entry.log_odds:+.2f}",
+            "\n".join(map(_placement, entry.placements)),
+            _reasons(getattr(entry, "because", None) or ()),
+        )
+        for entry in answer.missing
+    ]
+    return _table("missing", "probability", "log-odds", "where", "because", rows=rows)
+
+
+def outliers(answer: OutliersAnswer) -> RenderableType:
+    """Every object, least fitting first, with why, and what was given likely wrongly."""
+    rows = [
+        (
+            entry.object,
+            entry.label,
+            _share(entry.probability),
+            f"{entry.log_odds:+.2f}",
+            "outlier" if entry.is_outlier else "",
+            _reasons(entry.because),
+            ", ".join(getattr(entry, "usually_with", None) or ()),
+        )
+        for entry in answer.outliers
+    ]
+    heads = ("object", "label", "probability", "log-odds", "", "because", "usually with")
+    found = _table(*heads, rows=rows)
+    if not answer.misplaced:
+        return found
+    wrong = [
+        (
+            entry.subject,
+            entry.relation,
+            entry.object,
+            _share(entry.probability),
+            "misplaced" if getattr(entry, "is_misplaced", False) else "",
+        )
+        for entry in answer.misplaced[:MOST_MISPLACED]
+    ]
+    columns = ("subject", "relation", "object", "probability of being wrong", "")
+    title = "relations as given"
+    if len(wrong) < len(answer.misplaced):
+        title += f": the {len(wrong)} likeliest to be wrong of {len(answer.misplaced)}"
+    return Group(found, _table(*columns, rows=wrong, title=title))
+
+
+def notes(answer: Any) -> list[str]:
+    """What an answer says of its scene: labels that were mapped, and warnings."""
+    mapped = [
+        f"{entry.label}: taken for {entry.class_} (similarity {entry.similarity:.2f})"
+        for entry in getattr(answer, "mapped", None) or ()
+    ]
+    warnings = [
+        f"{entry.code}: {', '.join(entry.objects)}: {entry.message}"
+        for entry in getattr(answer, "warnings", None) or ()
+    ]
+    return mapped + warnings
+
+
+def generate(answer: GenerateAnswer) -> RenderableType:
+    """Drawn scenes."""
+    rows = [
+        (
+            str(number),
+            ", ".join(scene.objects),
+            "\n".join(f"{r.subject} {r.relation} {r.object}" for r in scene.relations),
+            f"{scene.log_score:.1f}",
+        )
+        for number, scene in enumerate(answer.scenes, 1)
+    ]
+    title = f"seed {answer.seed}"
+    return _table("scene", "objects", "relations", "log score", rows=rows, title=title)
+
+
+def models(answer: ModelList) -> RenderableType:
+    """Versions, the aliases that lead to them, and what cannot be used."""
+    rows = [
+        (
+            f"{model.name}@{version.version}",
+            version.variant or "",
+            ", ".join(version.aliases),
+            version.status if version.reason is None else f"{version.status}: {version.reason}",
+        )
+        for model in answer.models
+        for version in model.versions
+    ]
+    found = _table("model", "variant", "aliases", "status", rows=rows)
+    failures = [(failure.subject, failure.reason, failure.detail) for failure in answer.failures]
+    if not failures:
+        return found
+    return Group(found, _table("failed", "reason", "detail", rows=failures))
+
+
+def contexts(answer: ContextsAnswer) -> RenderableType:
+    """Hidden units by what they go with."""
+    rows = [
+        (layer, str(unit.unit), _weighted(unit.objects), _weighted(unit.room_types))
+        for layer, units in answer.layers.items()
+        for unit in units
+    ]
+    return _table("layer", "unit", "objects", "room types", rows=rows)
+
+
+def vocabulary(answer: VocabularyAnswer) -> RenderableType:
+    """Object classes and what else they are called."""
+    rows = [
+        (entry.label, ", ".join(entry.aliases), "structure" if entry.structure else "")
+        for entry in answer.objects
+    ]
+    title = f"room types: {', '.join(answer.room_types) or 'none'}"
+    return _table("object", "also", "", rows=rows, title=title)
+
+
+def _table(*columns: str, rows: Iterable[Sequence[str]], title: str | None = None) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
+    for column in columns:
+        numbers = column.startswith("probability") or column in {"log-odds", "log score"}
+        # A drawn scene's objects fill lines; everything else is short, or has lines of its own.
+        width = 60 if column == "objects" else None
+        table.add_column(column, justify="right" if numbers else "left", max_width=width)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _share(probability: float) -> str:
+    return f"{probability:.3f}"
+
+
+def _placement(placement: Placement) -> str:
+    told = f"{placement.relation} {placement.object} {_share(placement.probability)}"
+    # A model that was trained without positions cannot say how far.
+    offset: Any = getattr(placement, "offset", None)
+    if offset is None:
+        return told
+    axes = (
+        f"{axis} {getattr(offset.mean, axis):+.2f}±{getattr(offset.std, axis):.2f}"
+        for axis in ("x", "y", "z")
+    )
+    return f"{told} ({', '.join(axes)} m)"
+
+
+def _reasons(because: Iterable[Because]) -> str:
+    return "\n".join(f"{reason.object} {reason.log_odds_change:+.2f}" for reason in because)
+
+
+def _weighted(labels: Iterable[WeightedLabel]) -> str:
+    return ", ".join(f"{entry.label} {entry.weight:+.2f}" for entry in labels)

@@ -1,0 +1,150 @@
+"""Conditions of behaviour trees (py_trees): is something missing, does something belong?
+
+    scene = lambda: from_detection3d_array(newest_message)
+    root.add_children([SceneComplete("table is set", client, scene, candidates=["fork"]), leave])
+
+A condition asks when it is first ticked and is RUNNING until its answer is there, so no tick waits
+for the service. It fails where nothing was seen, or no answer comes in time: a tree goes on only
+with what somebody knows. Its ``feedback_message`` says why, and ``answer`` is the answer.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from py_trees.behaviour import Behaviour
+from py_trees.common import Status
+
+from scene_client import ClientError
+from scene_client.ros_fields import MessageError
+from scene_client.schemas import MissingAnswer, OutliersAnswer
+from scene_reasoning.advisor import Asker
+
+SceneSource = Callable[[], Mapping[str, Any] | None]
+
+
+class SceneCondition(Behaviour):
+    """Asks one question about the newest scene.
+
+    Args:
+        name: of the node in the tree.
+        client: who is asked.
+        scene: gives the fields of a request, or None as long as nothing was seen. Called in the
+            condition's thread: a conversion of detections may be put here.
+        timeout: seconds from the first tick until the condition fails.
+        own: further fields of the question.
+    """
+
+    def __init__(
+        self, name: str, client: Asker, scene: SceneSource, *, timeout: float = 1.0, **own: Any
+    ) -> None:
+        super().__init__(name)
+        self.client = client
+        self.scene = scene
+        self.timeout = timeout
+        self.own = own
+        self.answer: Any = None
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
+        self._asked: Future[Any] | None = None
+        self._until = 0.0
+
+    def initialise(self) -> None:
+        self.answer = None
+        self._until = time.monotonic() + self.timeout
+        self._asked = self._thread.submit(self._ask)
+
+    def update(self) -> Status:
+        if self._asked is None or not self._asked.done():
+            if time.monotonic() < self._until:
+                return Status.RUNNING
+            return self._fail("no answer in time")
+        try:
+            self.answer = self._asked.result()
+        except (ClientError, MessageError) as error:
+            return self._fail(f"{type(error).__name__}: {error}")
+        if self.answer is None:
+            return self._fail("nothing was seen")
+        holds, self.feedback_message = self.judge(self.answer)
+        return Status.SUCCESS if holds else Status.FAILURE
+
+    def terminate(self, new_status: Status) -> None:
+        # A question of a tick long past: it ends with its own timeout, and nobody reads it.
+        if self._asked is not None:
+            self._asked.cancel()
+            self._asked = None
+
+    def shutdown(self) -> None:
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    def _ask(self) -> Any:
+        fields = self.scene()
+        if not fields or not fields.get("objects"):
+            return None
+        return self.ask({**fields, **self.own})
+
+    def _fail(self, why: str) -> Status:
+        self.feedback_message = why
+        return Status.FAILURE
+
+    @abstractmethod
+    def ask(self, fields: dict[str, Any]) -> Any:
+        """Put the question; called in the condition's thread."""
+
+    @abstractmethod
+    def judge(self, answer: Any) -> tuple[bool, str]:
+        """Whether the condition holds, and why."""
+
+
+class SceneComplete(SceneCondition):
+    """SUCCESS as long as nothing is missing that is rather there than not.
+
+    Args:
+        log_odds: of presence against absence, from which on a thing counts as missing. 0 is even;
+            2.2 is nine to one.
+        own: ``candidates`` and ``at`` narrow the question: what could be missing, and where.
+    """
+
+    def __init__(
+        self, name: str, client: Asker, scene: SceneSource, *, log_odds: float = 0.0, **own: Any
+    ) -> None:
+        super().__init__(name, client, scene, **own)
+        self.log_odds = log_odds
+
+    def ask(self, fields: dict[str, Any]) -> MissingAnswer:
+        return self.client.missing(**fields)
+
+    def judge(self, answer: MissingAnswer) -> tuple[bool, str]:
+        missing = [thing.label for thing in answer.missing if thing.log_odds >= self.log_odds]
+        return not missing, f"missing: {', '.join(missing)}" if missing else "nothing is missing"
+
+
+class ObjectBelongs(SceneCondition):
+    """SUCCESS if a thing that was seen fits the scene, FAILURE if it is an outlier or not there.
+
+    Args:
+        thing: its id, or a label: then every thing of this label has to belong.
+        own: ``threshold`` says from which probability on a thing is an outlier.
+    """
+
+    def __init__(
+        self, name: str, client: Asker, scene: SceneSource, thing: str, **own: Any
+    ) -> None:
+        super().__init__(name, client, scene, **own)
+        self.thing = thing
+
+    def ask(self, fields: dict[str, Any]) -> OutliersAnswer:
+        return self.client.outliers(**fields)
+
+    def judge(self, answer: OutliersAnswer) -> tuple[bool, str]:
+        named = [entry for entry in answer.outliers if entry.object == self.thing] or [
+            entry for entry in answer.outliers if entry.label == self.thing
+        ]
+        if not named:
+            return False, f"no {self.thing} was seen"
+        worst = max(named, key=lambda entry: entry.probability)
+        text = f"{worst.object}: an outlier with probability {worst.probability:.2f}"
+        return not any(entry.is_outlier for entry in named), text
