@@ -25,7 +25,7 @@ The logit is a sum of many small independent terms, taken as normal with varianc
 
     σ_e² = sum_k U_ek² m_k (1 - m_k)
 
-and the mean of its sigmoid by quadrature. Errors are measured in docs/decisions/estimators.md.
+and the mean of its sigmoid by quadrature. Errors are measured in docs/decisions/inference.md.
 Which units there are, with ℓ_e and U_e, is the variant's: `shared_relations`, `listed_relations`.
 """
 
@@ -48,7 +48,7 @@ Floats = NDArray[np.float32]
 Places = NDArray[np.int64]
 
 # Slopes up to which what a given relation says of itself is taken out to first order
-# (docs/decisions/compiled-loops.md).
+# (docs/decisions/inference.md).
 _GENTLE = 0.5
 _NO_UNITS = NOTHING.reshape(0), NOTHING.reshape(0, 0)
 _NONE = np.zeros((0, 0), dtype=np.bool_)

@@ -91,7 +91,7 @@ def singular(word: str) -> str:
     """The singular of a folded English noun; whatever is no plural is returned as it is.
 
     Regular endings (-ies, -ches, -shes, -xes, -sses, -oes, -s) and a short list of irregular ones.
-    Compared with a general inflection library in docs/decisions/labels.md.
+    Compared with a general inflection library in docs/decisions/data.md.
     """
     if word.endswith(_IRREGULAR_ENDINGS):
         for plural, single in _IRREGULAR:

@@ -2,7 +2,7 @@
 
 The schemas of `scene_client.schemas` describe these answers: fields in that order, and none that
 would be null. They are made as plain dictionaries, since an answer holds a hundred parts, and to
-make and write each as an object takes twice the time (docs/decisions/answers.md).
+make and write each as an object takes twice the time (docs/decisions/http.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What the service tells Prometheus: counted where it happens, written out when it is asked for.
 
 Every label has few values, whatever clients send: routes by their templates, models only while
-they are served. A replica is one process and tells its own; see docs/decisions/metrics.md.
+they are served. A replica is one process and tells its own; see docs/decisions/queues.md.
 """
 
 from __future__ import annotations
