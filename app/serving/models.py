@@ -18,8 +18,8 @@ from types import MappingProxyType
 from app import reasoning
 from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
 from app.scene.vocabulary import Vocabulary
+from app.serving.admission import WorkQueue
 from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
-from app.serving.queue import WorkQueue
 from app.serving.warm_up import warm_up
 from scene_client.schemas import Failure, ModelReference
 
@@ -55,7 +55,12 @@ class ServedModel:
             digest=self.artifact.digest,
         )
 
-    @property
+    @cached_property
+    def key(self) -> Key:
+        """Its name and version."""
+        return self.artifact.manifest.name, self.artifact.manifest.version
+
+    @cached_property
     def vocabulary(self) -> Vocabulary:
         """Its words."""
         return self.artifact.vocabulary
@@ -88,9 +93,14 @@ class ServedModels:
             ModelUnavailableError: it was refused, or the alias leads nowhere.
             NotReadyError: the same of the default.
         """
+        found = self._resolved.get(reference)
+        if found is not None:
+            return found
         try:
             artifact = self.store.resolve(reference)
-            return self.served[artifact.manifest.name, artifact.manifest.version]
+            found = self.served[artifact.manifest.name, artifact.manifest.version]
+            self._resolved[reference] = found
+            return found
         except (StoreError, ArtifactError, KeyError) as error:
             if reference == DEFAULT:
                 raise NotReadyError("The default model is not usable.") from None
@@ -102,6 +112,11 @@ class ServedModels:
         """The same snapshot with one alias moved."""
         aliases = MappingProxyType({**self.store.aliases, alias: target})
         return replace(self, store=replace(self.store, aliases=aliases))
+
+    @cached_property
+    def _resolved(self) -> dict[str, ServedModel]:
+        # Successes only: clients choose the references, the store bounds those that lead somewhere.
+        return {}
 
     @cached_property
     def usable(self) -> frozenset[str]:
@@ -117,11 +132,6 @@ class ServedModels:
         aliases = {alias: str(target) for alias, target in self.store.aliases.items()}
         text = json.dumps([versions, aliases], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-    @property
-    def backlog(self) -> int:
-        """How many questions wait or are under way."""
-        return sum([model.queue.backlog for model in self.served.values()])
 
     @cached_property
     def failures(self) -> Mapping[str, Failure]:

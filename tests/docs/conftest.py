@@ -85,7 +85,9 @@ def install(folder: Path) -> None:
     for entry in Path(sys.prefix).iterdir():
         if entry.name != "bin" and not entry.name.startswith(".installed"):
             (environment / entry.name).symlink_to(entry)
-    scripts = tomllib.loads((folder / "clients" / "python" / "pyproject.toml").read_text())["project"]["scripts"]
+    scripts = tomllib.loads((folder / "clients" / "python" / "pyproject.toml").read_text())[
+        "project"
+    ]["scripts"]
     for entry in (Path(sys.prefix) / "bin").iterdir():
         if entry.name not in scripts:
             (programs / entry.name).symlink_to(entry)
