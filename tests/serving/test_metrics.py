@@ -24,7 +24,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> ServedModels:
 def unwarmed(root: Path) -> ServedModels:
     store = load_model_set(Store(root))
     served = {
-        key: ServedModel(artifact, {}, WorkQueue(8, Threads(), Backlog(8)))
+        key: ServedModel(artifact, WorkQueue(8, Threads(), Backlog(8)))
         for key, artifact in store.entries.items()
         if isinstance(artifact, Artifact)
     }
