@@ -61,7 +61,7 @@ format: $(EVERYTHING)  ## rewrite the sources in the house format, the blocking 
 	$(BIN)/python -m ruff format .
 	$(BIN)/python scripts/sync_client.py
 
-bench: $(EVERYTHING)  ## run the benchmarks, then the service under load beside an echo, then a stream
+bench: $(EVERYTHING)  ## run the benchmarks, then the service under load beside a plain FastAPI app, then a stream
 	$(BIN)/python -m benchmarks $(ARGS)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.load)
 	$(if $(ARGS),,$(BIN)/python -m benchmarks.stream)

@@ -13,8 +13,6 @@ from logging.config import dictConfig
 from pathlib import Path
 
 from app.serving.logs import log_config
-from app.serving.metrics import Unmeasured
-from app.serving.reading import Limits
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
@@ -27,7 +25,7 @@ def main() -> int:
     """
     settings = Settings()
     dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))
-    runtime = Runtime(settings.store, Limits(), settings.queue_rows, Unmeasured(), poll=0)
+    runtime = Runtime(settings.store)
     asyncio.run(runtime.start())
     runtime.stop()
     compileall.compile_dir(Path(__file__).parent, quiet=1)

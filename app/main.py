@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from app import __version__, api
-from app.serving.metrics import Metrics, Unmeasured
 from app.serving.reading import Limits
 from app.serving.runtime import Runtime
 from app.settings import Settings
@@ -37,10 +36,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     runtime = Runtime(
         settings.store,
         Limits(settings.max_objects, settings.max_relations, settings.max_answer_bytes),
-        settings.queue_rows,
-        Metrics() if settings.metrics else Unmeasured(),
-        settings.store_poll,
-        settings.max_weights_bytes,
+        queue_rows=settings.queue_rows,
+        queue_requests=settings.queue_requests,
+        poll=settings.store_poll,
+        max_weights_bytes=settings.max_weights_bytes,
     )
 
     @asynccontextmanager

@@ -18,7 +18,7 @@ import httpx
 from benchmarks.report import Result
 from benchmarks.timing import Timings
 
-READY, IMPORTS = "python -m app, until /health/ready", "python, importing torch and FastAPI"
+READY, IMPORTS = "python -m app, until /health/ready", "python, importing numba, numpy and FastAPI"
 LIVE, MISSING = "GET /health/live", "POST /missing"
 
 _PATIENCE = 60.0
@@ -167,7 +167,7 @@ def _ask(
 
 
 def _import_libraries() -> None:
-    subprocess.run([sys.executable, "-c", "import torch, fastapi"], check=True)
+    subprocess.run([sys.executable, "-c", "import numba, numpy, fastapi"], check=True)
 
 
 def _seconds(action: Callable[[], None]) -> float:

@@ -221,6 +221,6 @@ def test_the_digest_holds_every_file_that_is_compiled_in(repository: Path) -> No
         "app.inference.scene_chains",
         "app.scene.footprints",
         "app.scene.relations",  # numbers of relations
-        "app.serving.answers",
+        "app.serving.rounding",
     } <= found
     assert not {"app.main", "scene_client.schemas", "app.serving.runtime", "app.settings"} & found

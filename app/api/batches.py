@@ -8,19 +8,19 @@ from typing import Any, Final, TypeVar
 
 from fastapi import APIRouter
 from pydantic import ValidationError
-from starlette.responses import Response
+from pydantic_core import to_json
+from starlette.requests import Request
 
 from app.api import catalogue
-from app.api.answers import entry, failed_entry, respond_all
 from app.api.body import JSONRoute
-from app.api.dependencies import SessionDep
-from app.api.openapi import queued
+from app.api.openapi import operation_id, queued
 from app.api.problems import from_exception, report_defect, unfit
+from app.api.questions import begin
 from app.serving import questions
-from app.serving.answers import Answer
+from app.serving import request as serving
+from app.serving.answers import Answer, written
 from app.serving.models import DEFAULT
-from app.serving.record import SUCCESS
-from app.serving.session import Session
+from app.serving.request import SUCCESS
 from scene_client.schemas import (
     BatchAnswer,
     BatchRequest,
@@ -45,48 +45,56 @@ _PROBLEMS: Final = queued(
     catalogue.NOT_READY,
 )
 
-router = APIRouter(tags=["batches"], route_class=JSONRoute, responses=_PROBLEMS)
+router = APIRouter(
+    tags=["batches"],
+    route_class=JSONRoute,
+    responses=_PROBLEMS,
+    generate_unique_id_function=operation_id,
+)
 
 
 async def _answer_each(
-    session: Session,
+    http: Request,
     batch: BatchRequest[RequestT],
     kind: type[RequestT],
-    question: Callable[[Session, RequestT], Awaitable[Answer]],
-) -> Response:
+    question: Callable[[serving.Request, RequestT], Awaitable[Answer]],
+) -> bytes:
+    request = begin(http)
+
     def count(outcome: str) -> None:
-        session.metrics.entry_answered(question.__name__, outcome)
+        request.metrics.entry_answered(question.__name__, outcome)
 
     results: list[bytes] = []
-    left = session.limits.answer_bytes
-    with session.for_batch([_reference(scene) for scene in batch.scenes]) as held:
+    left = request.limits.answer_bytes
+    with request.for_batch([_reference(scene) for scene in batch.scenes]) as held:
         for place, scene in enumerate(batch.scenes):
             try:
-                held.ticket.check()
-                asked = held.with_answer_bytes(left)
-                result = await question(asked, _validated(scene, place, kind))
-                results.append(entry(result))
+                held.check()
+                one = held.with_answer_bytes(left)
+                answer = written(await question(one, _validated(scene, place, kind)))
+                results.append(b'{"status":200,"result":%b}' % answer)
                 count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
-                outcome, failed = _failed(error, place, session.request_id)
+                outcome, failed = _failed(error, place, request.id)
                 count(outcome)
                 results.append(failed)
             left = max(0, left - len(results[-1]))
-            # Others are served between two scenes, health checks first of all.
+            # Other tasks run between two scenes, health checks first of all.
             await asyncio.sleep(0)
-    return respond_all(session.request_id, results)
+    return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
 
 
 def _failed(error: Exception, place: int, request_id: str) -> tuple[str, bytes]:
     """The outcome and the entry of a scene that could not be answered.
 
-    The error stays in this frame: it knows that of the batch, and would keep it from being freed.
+    The error stays in this frame: it refers to that of the batch, which would then not be freed.
     """
     failure = from_exception(error, at=("scenes", place))
     problem = failure.describe(request_id)
     if problem.status == 500:
         report_defect(error, request_id)
-    return failure.kind.slug, failed_entry(problem)
+    body = problem.model_dump_json(exclude_none=True).encode()
+    return failure.kind.slug, b'{"status":%d,"problem":%b}' % (problem.status, body)
 
 
 def _reference(scene: Any) -> str:
@@ -108,9 +116,9 @@ def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
     summary="Relations of many scenes",
     response_model=BatchAnswer[RelationsAnswer],
 )
-async def relations_batch(request: BatchRequest[RelationsRequest], session: SessionDep) -> Response:
+async def relations_batch(asked: BatchRequest[RelationsRequest], http: Request) -> bytes:
     """As `POST /relations`, for up to 256 scenes."""
-    return await _answer_each(session, request, RelationsRequest, questions.relations)
+    return await _answer_each(http, asked, RelationsRequest, questions.relations)
 
 
 @router.post(
@@ -118,9 +126,9 @@ async def relations_batch(request: BatchRequest[RelationsRequest], session: Sess
     summary="Missing objects of many scenes",
     response_model=BatchAnswer[MissingAnswer],
 )
-async def missing_batch(request: BatchRequest[MissingRequest], session: SessionDep) -> Response:
+async def missing_batch(asked: BatchRequest[MissingRequest], http: Request) -> bytes:
     """As `POST /missing`, for up to 256 scenes."""
-    return await _answer_each(session, request, MissingRequest, questions.missing)
+    return await _answer_each(http, asked, MissingRequest, questions.missing)
 
 
 @router.post(
@@ -128,6 +136,6 @@ async def missing_batch(request: BatchRequest[MissingRequest], session: SessionD
     summary="Outliers of many scenes",
     response_model=BatchAnswer[OutliersAnswer],
 )
-async def outliers_batch(request: BatchRequest[OutliersRequest], session: SessionDep) -> Response:
+async def outliers_batch(asked: BatchRequest[OutliersRequest], http: Request) -> bytes:
     """As `POST /outliers`, for up to 256 scenes."""
-    return await _answer_each(session, request, OutliersRequest, questions.outliers)
+    return await _answer_each(http, asked, OutliersRequest, questions.outliers)

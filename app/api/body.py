@@ -2,23 +2,88 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-from collections.abc import Callable, Coroutine
 from email.message import Message
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from fastapi.routing import APIRoute
+from pydantic import ValidationError
 from pydantic_core import from_json
-from starlette.requests import ClientDisconnect, Request
-from starlette.responses import Response
+from starlette.requests import Request
+from starlette.types import Receive, Scope, Send
 
 from app.api import catalogue
-from app.api.problems import ProblemError
+from app.api.gateway import ADMIN_KEY, carries, too_large
+from app.api.problems import ProblemError, unfit
+from app.settings import Settings
 from scene_client.schemas import FieldError
 
 MAX_MEMBERS: Final = 32
 """No object of any request has as many fields, and every field that is unknown is a fault to tell:
 a hundred times the memory of the request."""
+
+SMALL: Final = 64 * 1024
+"""Bytes of a body that is accepted whatever else is held, if it has arrived when it is read.
+
+Unfinished bodies of one client do not refuse the usual requests of the others.
+"""
+
+
+class Bodies:
+    """Bounds the size of each body, its time, and the bytes of all bodies held at once.
+
+    Args:
+        settings: of the service.
+
+    Attributes:
+        held: bytes of all bodies that are being read or answered.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.limit = settings.max_body_bytes
+        self.budget = settings.held_body_bytes
+        self.patience = settings.client_timeout
+        self.held = 0
+
+    async def read(self, receive: Receive) -> bytes:
+        """A whole body; the caller takes its bytes from `held` when they are answered.
+
+        Raises:
+            ProblemError: the body is too large, too slow, one too many, or broke off.
+        """
+        body: bytes | bytearray = b""
+        try:
+            async with asyncio.timeout(self.patience):
+                more = True
+                while more:
+                    message = await receive()
+                    if message["type"] != "http.request":
+                        raise ProblemError(catalogue.BAD_REQUEST, "The body broke off.")
+                    part, more = message.get("body", b""), message.get("more_body", False)
+                    is_whole = not (more or body)
+                    self.held += len(part)
+                    if is_whole:
+                        body = part
+                    else:
+                        body = bytearray(body) if isinstance(body, bytes) else body
+                        body += part
+                    if len(body) > self.limit:
+                        raise too_large(self.limit)
+                    if self.held > self.budget and not (is_whole and len(body) <= SMALL):
+                        detail = f"All bodies together must not exceed {self.budget} bytes."
+                        raise ProblemError(catalogue.BODIES_FULL, detail)
+        except TimeoutError:
+            self.held -= len(body)
+            raise ProblemError(
+                catalogue.REQUEST_TIMEOUT,
+                f"The body did not come within {self.patience:g} seconds.",
+                headers={"Connection": "close"},
+            ) from None
+        except BaseException:
+            self.held -= len(body)
+            raise
+        return bytes(body)
 
 
 def parse(body: bytes) -> Any:
@@ -29,7 +94,7 @@ def parse(body: bytes) -> Any:
 
     Raises:
         ProblemError: of kind `catalogue.NOT_JSON`; or `catalogue.INVALID_REQUEST`, where an object
-            has more than `MAX_MEMBERS`.
+            has more than `MAX_MEMBERS` members.
     """
     try:
         # The strict parser judges; the lenient one, which alone can see repeated names, reads.
@@ -39,8 +104,13 @@ def parse(body: bytes) -> Any:
         detail = f"An object has more than {MAX_MEMBERS} members."
         errors = [FieldError(pointer="#", message=detail)]
         raise ProblemError(catalogue.INVALID_REQUEST, detail, errors=errors) from None
+    except _RepeatedNameError:
+        detail = "An object has two members of one name."
+        raise ProblemError(catalogue.NOT_JSON, detail) from None
     except ValueError as error:
-        raise _not_json(_reason(error)) from None
+        # The parser's message has the reason and the position, and none of the input.
+        detail = f"The body is not valid JSON: {error}."
+        raise ProblemError(catalogue.NOT_JSON, detail) from None
 
 
 class _RepeatedNameError(ValueError):
@@ -60,61 +130,81 @@ def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members
 
 
-def _reason(error: ValueError) -> str:
-    if isinstance(error, _RepeatedNameError):
-        return "An object has two members of one name."
-    # Of the parser's own message only the reason and the position, which hold none of the input.
-    return f"The body is not valid JSON: {error}."
-
-
-def _not_json(detail: str) -> ProblemError:
-    return ProblemError(catalogue.NOT_JSON, detail)
-
-
-def _is_json(content_type: str | None) -> bool:
-    if content_type is None:
-        return False
+def _is_json(content_type: bytes) -> bool:
+    if content_type == b"application/json":
+        return True
     message = Message()
-    message["content-type"] = content_type
+    message["content-type"] = content_type.decode("latin-1")
     subtype = message.get_content_subtype()
     return message.get_content_maintype() == "application" and (
         subtype == "json" or subtype.endswith("+json")
     )
 
 
-class StrictRequest(Request):
-    """A request whose ``json()`` is `parse`."""
-
-    async def json(self) -> Any:
-        """The body's value; see `parse`."""
-        return parse(await self.body())
-
-
-def _refuse_media_type() -> NoReturn:
-    raise ProblemError(
-        catalogue.UNSUPPORTED_MEDIA_TYPE, "The body must be sent as application/json."
-    )
-
-
 class JSONRoute(APIRoute):
-    """A route whose body must be JSON and is read strictly."""
+    """A route whose body is strict JSON, validated once, and whose endpoint answers with bytes.
 
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """The framework's handler behind the checks of media type and emptiness."""
-        handle = super().get_route_handler()
-        if self.body_field is None:
-            return handle
+    FastAPI documents it. It does not read the body, which it would do leniently. The endpoint is
+    given the validated body as ``asked``, the HTTP request as ``http``, and path parameters.
+    """
 
-        async def read_strictly(request: Request) -> Response:
-            if not _is_json(request.headers.get("content-type")):
-                _refuse_media_type()
-            strict = StrictRequest(request.scope, request.receive)
-            try:
-                body = await strict.body()
-            except ClientDisconnect:
-                raise ProblemError(catalogue.BAD_REQUEST, "The body broke off.") from None
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request.
+
+        Raises:
+            ProblemError, ServingError: it cannot be answered.
+        """
+        if scope["method"] not in (self.methods or ()):
+            await super().handle(scope, receive, send)
+            return
+        http = Request(scope, receive)
+        self.check(http)
+        kind = next((value for name, value in scope["headers"] if name == b"content-type"), b"")
+        if not _is_json(kind):
+            detail = "The body must be sent as application/json."
+            raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, detail)
+        bodies: Bodies = scope["app"].state.bodies
+        body = await bodies.read(receive)
+        try:
             if not body:
-                raise _not_json("The body is empty.")
-            return await handle(strict)
+                raise ProblemError(catalogue.NOT_JSON, "The body is empty.")
+            value = parse(body)
+            form: Any = self.body_field.field_info.annotation  # type: ignore[union-attr]
+            try:
+                asked = form.model_validate(value)
+            except ValidationError as error:
+                raise unfit(error, value) from None
+            answer: bytes = await self.endpoint(asked=asked, http=http, **scope["path_params"])
+            headers = [
+                (b"content-length", b"%d" % len(answer)),
+                (b"content-type", b"application/json"),
+            ]
+            await send({"type": "http.response.start", "status": 200, "headers": headers})
+            await send({"type": "http.response.body", "body": answer})
+        finally:
+            bodies.held -= len(body)
 
-        return read_strictly
+    def check(self, http: Request) -> None:
+        """Refuse a request before its body is read; here none is."""
+
+
+class AdminJSONRoute(JSONRoute):
+    """The same for clients with the admin key."""
+
+    def check(self, http: Request) -> None:
+        """See `check_admin`."""
+        check_admin(http)
+
+
+def check_admin(http: Request) -> None:
+    """Return if the request carries the admin key.
+
+    Raises:
+        ProblemError: of kind `catalogue.UNAUTHORIZED`, also where no key is configured.
+    """
+    if not carries(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
+        raise ProblemError(
+            catalogue.UNAUTHORIZED,
+            "This route needs the service's admin key.",
+            headers={"WWW-Authenticate": "Bearer"},
+        )

@@ -10,8 +10,7 @@ from fastapi import APIRouter
 
 from app import __version__
 from app.api import catalogue
-from app.api.dependencies import RuntimeDep
-from app.api.models import Reference
+from app.api.models import Reference, RuntimeDep
 from app.api.openapi import problems, queued
 from scene_client.schemas import (
     Health,

@@ -7,7 +7,7 @@ import asyncio
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse
 
-from app.api.dependencies import RuntimeDep
+from app.api.models import RuntimeDep
 from app.api.openapi import problems
 from app.serving.metrics import CONTENT_TYPE
 

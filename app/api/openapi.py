@@ -7,11 +7,10 @@ from typing import Any, Final
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
 
-from app.api import catalogue, examples, keys
+from app.api import catalogue, examples
 from app.api.catalogue import ProblemType
 from app.api.example_requests import REQUESTS
-from app.api.middleware.hosts import HEALTH
-from app.api.middleware.turnstile import TIMEOUT_HEADER
+from app.api.gateway import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE, ProblemError
 from scene_client.schemas import MAX_SEED, FieldError, Problem
 
@@ -38,7 +37,7 @@ _ERRORS: Final = {
     ],
 }
 _KEY_SCHEMES: Final = {
-    "api-key": {"type": "apiKey", "in": "header", "name": keys.API_KEY},
+    "api-key": {"type": "apiKey", "in": "header", "name": API_KEY},
     "api-key-as-bearer-token": {"type": "http", "scheme": "bearer"},
 }
 TAGS: Final = [
@@ -165,7 +164,7 @@ def _ask_for_keys(document: dict[str, Any]) -> None:
     document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
     for path, operations in document["paths"].items():
         for operation in operations.values():
-            if path not in keys.OPEN_ROUTES and "security" not in operation:
+            if path not in OPEN_ROUTES and "security" not in operation:
                 operation["security"] = [{name: []} for name in _KEY_SCHEMES]
                 unauthorized = problems(catalogue.UNAUTHORIZED)[catalogue.UNAUTHORIZED.status]
                 operation["responses"][str(catalogue.UNAUTHORIZED.status)] = unauthorized

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Final
 
 from fastapi import APIRouter
-from starlette.responses import Response
+from starlette.requests import Request
 
 from app.api import catalogue
-from app.api.answers import respond
 from app.api.body import JSONRoute
-from app.api.dependencies import SessionDep
-from app.api.openapi import queued
+from app.api.openapi import operation_id, queued
 from app.serving import questions
+from app.serving import request as serving
+from app.serving.answers import written
 from scene_client.schemas import (
     GenerateAnswer,
     GenerateRequest,
@@ -39,7 +39,28 @@ PROBLEMS: Final = queued(
     catalogue.MODEL_UNAVAILABLE,
 )
 
-router = APIRouter(tags=["questions"], route_class=JSONRoute, responses=PROBLEMS)
+router = APIRouter(
+    tags=["questions"],
+    route_class=JSONRoute,
+    responses=PROBLEMS,
+    generate_unique_id_function=operation_id,
+)
+
+# The schemas in the routes describe the answers. Validation of an answer would cost as much as its
+# JSON; the tests validate.
+
+
+def begin(http: Request) -> serving.Request:
+    """The request as the models see it.
+
+    Raises:
+        NotReadyError: nothing has been loaded yet.
+    """
+    state, runtime = http.scope["state"], http.scope["app"].state.runtime
+    found: serving.Request = runtime.request(
+        state["deadline"], state["request_id"], state["record"], http.is_disconnected
+    )
+    return found
 
 
 @router.post(
@@ -47,9 +68,9 @@ router = APIRouter(tags=["questions"], route_class=JSONRoute, responses=PROBLEMS
     summary="How do these objects stand to each other?",
     response_model=RelationsAnswer,
 )
-async def relations(request: RelationsRequest, session: SessionDep) -> Response:
+async def relations(asked: RelationsRequest, http: Request) -> bytes:
     """The likeliest relations between the objects of a scene, best first."""
-    return respond(await questions.relations(session, request))
+    return written(await questions.relations(begin(http), asked))
 
 
 @router.post(
@@ -57,13 +78,13 @@ async def relations(request: RelationsRequest, session: SessionDep) -> Response:
     summary="What else should be here, and where?",
     response_model=MissingAnswer,
 )
-async def missing(request: MissingRequest, session: SessionDep) -> Response:
+async def missing(asked: MissingRequest, http: Request) -> bytes:
     """The likeliest absent objects, and where each would stand.
 
     A class that is present is never proposed again: how many chairs a table wants is outside the
     models.
     """
-    return respond(await questions.missing(session, request))
+    return written(await questions.missing(begin(http), asked))
 
 
 @router.post(
@@ -71,12 +92,12 @@ async def missing(request: MissingRequest, session: SessionDep) -> Response:
     summary="What does not belong here, or stands in the wrong place?",
     response_model=OutliersAnswer,
 )
-async def outliers(request: OutliersRequest, session: SessionDep) -> Response:
+async def outliers(asked: OutliersRequest, http: Request) -> bytes:
     """Every object, least fitting first, and every given relation, least likely first.
 
     Instances of one class are scored alike; only `misplaced` tells them apart.
     """
-    return respond(await questions.outliers(session, request))
+    return written(await questions.outliers(begin(http), asked))
 
 
 @router.post(
@@ -84,6 +105,6 @@ async def outliers(request: OutliersRequest, session: SessionDep) -> Response:
     summary="What would a scene like this look like?",
     response_model=GenerateAnswer,
 )
-async def generate(request: GenerateRequest, session: SessionDep) -> Response:
+async def generate(asked: GenerateRequest, http: Request) -> bytes:
     """Scenes drawn from the model that contain the evidence; the same seed draws the same ones."""
-    return respond(await questions.generate(session, request))
+    return written(await questions.generate(begin(http), asked))

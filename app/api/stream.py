@@ -15,14 +15,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from app.api import catalogue
 from app.api.body import parse
-from app.api.middleware.origins import may_connect
+from app.api.gateway import may_connect
 from app.api.problems import ProblemError, answer, from_exception, unfit
 from app.serving.answers import written
 from app.serving.errors import ServingError
-from app.serving.queue import Ticket
-from app.serving.record import SUCCESS, RequestRecord
+from app.serving.request import SUCCESS, Record, Request
 from app.serving.runtime import Runtime
-from app.serving.session import Session
 from app.serving.stream import Streams, StreamScene, TokenBucket
 from app.settings import Settings
 from scene_client.schemas import FieldError
@@ -105,9 +103,8 @@ class _Conversation:
         self._settings: Settings = socket.app.state.settings
         self._runtime: Runtime = socket.app.state.runtime
         self._request_id: str = socket.state.request_id
-        self._record: RequestRecord = socket.state.record
-        self._counts = self._record.stream
-        self._counts.update(messages=0, answers=0, superseded=0)
+        self._record: Record = socket.state.record
+        self._counts = self._record.stream = {"messages": 0, "answers": 0, "superseded": 0}
         self._scene = StreamScene()
         self._is_open = False
         self._is_ending = False
@@ -183,7 +180,7 @@ class _Conversation:
         if is_first == self._is_open:
             raise _unfit("the first message, and no other, must be open")
         self._check_deadline(command)
-        self._scene.take(command, self._session())
+        self._scene.take(command, self._request())
         if is_first:
             self._is_open = True
             await self._send_model(self._opened())
@@ -214,7 +211,7 @@ class _Conversation:
             if self._is_ending:
                 return 1001, catalogue.DRAINING.slug
             self._due.clear()
-            message, errors = await self._scene.answer(self._session())
+            message, errors = await self._scene.answer(self._request())
             problems = {name: from_exception(error) for name, error in errors.items()}
             if problems:
                 message["problems"] = {
@@ -226,11 +223,10 @@ class _Conversation:
             self._runtime.metrics.stream_answered(outcome, message["superseded"])
             await self._send(written(message).decode())
 
-    def _session(self) -> Session:
-        """The service as it is now: after a promotion the new model answers."""
+    def _request(self) -> Request:
+        """A request to the service as it is now: after a promotion the new model answers."""
         timeout = self._scene.timeout_ms or self._settings.request_timeout_ms
-        ticket = Ticket(monotonic() + timeout / 1e3)
-        return self._runtime.session(self._request_id, ticket, self._record)
+        return self._runtime.request(monotonic() + timeout / 1e3, self._request_id, self._record)
 
     # -- sending --------------------------------------------------------------------------------
 

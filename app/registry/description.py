@@ -16,6 +16,7 @@ from pydantic import (
     FailFast,
     Field,
     JsonValue,
+    PrivateAttr,
     StringConstraints,
     field_validator,
     model_validator,
@@ -200,12 +201,13 @@ class VocabularyEntry(Frozen):
     objects: Many[ClassEntry]
     relations: Many[str] = CANONICAL
     room_types: Many[Text] = ()
+    _words: Vocabulary = PrivateAttr()
 
     @model_validator(mode="after")
     def _is_a_vocabulary(self) -> Self:
         if self.relations != CANONICAL[: len(self.relations)]:
             raise ValueError(f"relations must be the canonical ones in their order: {CANONICAL}")
-        self.vocabulary()
+        self._words = Vocabulary.from_dict(self.model_dump(mode="json", exclude={"relations"}))
         return self
 
     @classmethod
@@ -215,7 +217,7 @@ class VocabularyEntry(Frozen):
 
     def vocabulary(self) -> Vocabulary:
         """The vocabulary itself."""
-        return Vocabulary.from_dict(self.model_dump(mode="json", exclude={"relations"}))
+        return self._words
 
 
 class DataSource(Frozen):

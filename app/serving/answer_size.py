@@ -31,14 +31,14 @@ def of_relations(
 ) -> int:
     """Bytes of `scene_client.schemas.RelationsAnswer`."""
     entries = len(found) + 2 * len(disagreements)
-    return _of_envelope(reading) + entries * (_RELATION + 2 * _longest(reading))
+    return _of_envelope(reading) + entries * (_RELATION + 2 * reading.longest_name)
 
 
 def of_missing(found: Sequence[reasoning.MissingAnswer], reading: Reading) -> int:
     """Bytes of `scene_client.schemas.MissingAnswer`."""
     places = sum([len(entry.placements) for entry in found])
     causes = sum([len(entry.because) for entry in found])
-    name = _longest(reading)
+    name = reading.longest_name
     each = places * (_RELATION + _OFFSET + name) + causes * (_CAUSE + name)
     return _of_envelope(reading) + len(found) * (_OBJECT + name) + each
 
@@ -46,7 +46,7 @@ def of_missing(found: Sequence[reasoning.MissingAnswer], reading: Reading) -> in
 def of_outliers(found: reasoning.OutliersFound, reading: Reading) -> int:
     """Bytes of `scene_client.schemas.OutliersAnswer`."""
     causes = sum([len(entry.because) + len(entry.usually_with) for entry in found.outliers])
-    name = _longest(reading)
+    name = reading.longest_name
     judged = len(found.outliers) * (_OBJECT + 2 * name) + causes * (_CAUSE + name)
     return _of_envelope(reading) + judged + len(found.misplaced) * (_RELATION + 2 * name)
 
@@ -82,16 +82,13 @@ def require(size: int, limit: int, parameter: str) -> None:
 
 
 def _of_envelope(reading: Reading) -> int:
-    name = _longest(reading)
+    unknown = reading.unknown
+    if not (unknown.ignored or unknown.mapped or reading.observed or reading.warnings):
+        return _ENVELOPE
+    name = reading.longest_name
     names = len(reading.ids) * len(reading.warnings)
-    ignored = len(to_json(reading.unknown.ignored))
-    mapped = len(reading.unknown.mapped) * _WARNING
+    ignored = len(to_json(unknown.ignored))
+    mapped = len(unknown.mapped) * _WARNING
     observed = len(reading.observed or ()) * (_RELATION + 2 * name)
     warnings = len(reading.warnings) * _WARNING + names * name
     return _ENVELOPE + ignored + mapped + observed + warnings
-
-
-def _longest(reading: Reading) -> int:
-    """Bytes of the longest name, quotes included."""
-    ids = max([len(to_json(name)) for name in reading.ids], default=0)
-    return max(ids, reading.unknown.vocabulary.longest_label) + 1

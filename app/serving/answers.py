@@ -8,22 +8,17 @@ make and write each as an object takes twice the time (docs/decisions/http.md).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic_core import from_json, to_json
 
 from app import reasoning
-from app.compiling import compiled
 from app.scene.relations import CANONICAL, canonicalise, opposite
 from app.serving.reading import Reading
+from app.serving.rounding import DIGITS, significant
 from scene_client.schemas import ModelReference, SceneRequest
 
 Answer: TypeAlias = dict[str, Any]
-
-DIGITS: Final = 6
-"""Significant digits of probabilities, log-odds and metres."""
 
 
 def envelope(
@@ -172,35 +167,6 @@ def written(answer: Any) -> bytes:
         except ValueError:
             raise ValueError("a number of an answer is not finite") from None
     return body
-
-
-def significant(numbers: Sequence[float]) -> list[float]:
-    """The same numbers to `DIGITS` significant digits."""
-    values = np.array(numbers, dtype=np.float64)
-    exact = _round(values)
-    rounded: list[float] = values.tolist()
-    if not exact:
-        return [float(f"{value:.{DIGITS}g}") for value in rounded]
-    return rounded
-
-
-# Exact doubles: a whole number divided by one of them is the double nearest to the decimal number.
-_POWERS: Final = np.array([10.0**power for power in range(23)])
-
-
-@compiled
-def _round(values: NDArray[np.float64]) -> bool:
-    """Round numbers in place; False if one is too small or too large for exact powers of ten."""
-    exact = True
-    for k in range(len(values)):
-        size = np.abs(values[k])
-        if 1e-16 < size < 1e5:
-            shift = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
-            scale = _POWERS[shift]
-            values[k] = np.rint(values[k] * scale) / scale
-        elif size != 0.0:
-            exact = False
-    return exact
 
 
 def _because(

@@ -8,22 +8,6 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-_EXTRAS = (
-    "request_id",
-    "method",
-    "route",
-    "status",
-    "outcome",
-    "model",
-    "version",
-    "latency_ms",
-    "queue_ms",
-    "compute_ms",
-    "messages",
-    "answers",
-    "superseded",
-    "close_code",
-)
 _MASK = "**********"
 
 
@@ -34,7 +18,10 @@ def _masked(line: str, secrets: Sequence[str]) -> str:
 
 
 class JSONFormatter(logging.Formatter):
-    """One JSON object a line: time, level, process, logger, message, what the request was.
+    """One JSON object a line: time, level, process, logger, message and the fields of a request.
+
+    A record's attribute ``entry`` holds these fields for a line of the access log, ``request_id``
+    the id of the request that met a defect.
 
     Args:
         secrets: texts to mask wherever they turn up; a defect's own words may quote anything.
@@ -54,7 +41,9 @@ class JSONFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        entry |= {name: getattr(record, name) for name in _EXTRAS if hasattr(record, name)}
+        if hasattr(record, "request_id"):
+            entry["request_id"] = record.request_id
+        entry |= getattr(record, "entry", {})
         if record.exc_info:
             entry["exception"] = self.formatException(record.exc_info)
         return _masked(json.dumps(entry), self.secrets)

@@ -1,4 +1,4 @@
-"""What the service tells Prometheus: counted where it happens, written out when it is asked for.
+"""Metrics for Prometheus: counted where it happens, written out when `/metrics` is asked.
 
 Every label has few values, whatever clients send: routes by their templates, models only while
 they are served. A replica is one process and tells its own; see docs/decisions/queues.md.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from functools import partial
 from typing import Final, Literal, get_args
 
 from prometheus_client import (
@@ -22,7 +23,6 @@ from prometheus_client import (
 
 from app.serving.errors import ServingError
 from app.serving.models import DEFAULT, Key, ServedModels
-from scene_client.schemas import ModelReference
 
 CONTENT_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 
@@ -148,12 +148,12 @@ class Metrics:
             "Unix time when its default model had answered; 0 before",
             registry=registry,
         )
-        self._series: dict[Key, _ModelSeries] = {}
         self._infos: set[Info] = set()
         self._is_ready = False
         # Bound once: looking a child up by its labels costs more than counting.
         self._of_request: dict[tuple[str, str, str], Counter] = {}
         self._of_route: dict[str, Histogram] = {}
+        self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
 
     # ------------------------------------------------------------------------- what happened
 
@@ -166,10 +166,16 @@ class Metrics:
 
     def serving(self, models: ServedModels) -> None:
         """These models are served from now on; series of all others go away."""
-        for key in self._series.keys() - models.served.keys():
-            self._forget(key)
-        for key in models.served.keys() - self._series.keys():
-            self._series[key] = _ModelSeries(self, key)
+        for key in self._of_model.keys() - models.served.keys():
+            for question in self._of_model.pop(key):
+                self._compute.remove(*key, question)
+                self._rows.remove(*key, question)
+            self._queue.remove(*key)
+            self._pending.remove(*key)
+        for key, model in models.served.items():
+            self._of_model.setdefault(key, {})
+            self._queue.labels(*key)
+            self._pending.labels(*key).set_function(partial(getattr, model.queue, "rows"))
         infos = set(_infos(models))
         for info in self._infos - infos:
             self._info.remove(*info)
@@ -180,19 +186,18 @@ class Metrics:
             self._is_ready = True
             self._ready.set(time.time())
 
-    def _forget(self, key: Key) -> None:
-        series = self._series.pop(key)
-        self._queue.remove(*key)
-        self._pending.remove(*key)
-        for question in series.questions:
-            self._compute.remove(*key, question)
-            self._rows.remove(*key, question)
-
     def reloaded(self, change: Change, outcome: Outcome) -> None:
         """Somebody tried to change what is served."""
         self._reloads.labels(change, outcome).inc()
 
-    def answered(self, route: str, method: str, outcome: str, seconds: float | None) -> None:
+    def answered(
+        self,
+        route: str,
+        method: str,
+        outcome: str,
+        seconds: float | None,
+        serialised: float | None = None,
+    ) -> None:
         """A request has been answered.
 
         Args:
@@ -200,26 +205,24 @@ class Metrics:
             method: the request's, "-" if HTTP defines no such method.
             outcome: "success", or the name of the problem.
             seconds: how long it took; None for a stream, which lasts as long as its client likes.
+            serialised: seconds from a model's last answer to the response; None without one.
         """
         key = (route, method, outcome)
         counter = self._of_request.get(key)
         if counter is None:
             counter = self._of_request[key] = self._requests.labels(*key)
         counter.inc()
-        if seconds is None:
-            return
-        histogram = self._of_route.get(route)
-        if histogram is None:
-            histogram = self._of_route[route] = self._latency.labels(route)
-        histogram.observe(seconds)
+        if seconds is not None:
+            histogram = self._of_route.get(route)
+            if histogram is None:
+                histogram = self._of_route[route] = self._latency.labels(route)
+            histogram.observe(seconds)
+        if serialised is not None:
+            self._serialisation.observe(serialised)
 
     def entry_answered(self, question: str, outcome: str) -> None:
         """One scene of a batch has been answered, or refused by the named problem."""
         self._entries.labels(question, outcome).inc()
-
-    def serialised(self, seconds: float) -> None:
-        """An answer has been put into names and written as JSON."""
-        self._serialisation.observe(seconds)
 
     def streams(self, count: int) -> None:
         """So many streams are open now."""
@@ -238,101 +241,31 @@ class Metrics:
         self._answers.labels(outcome).inc()
         self._superseded.inc(superseded)
 
-    # What is told about a model that has been removed meanwhile is dropped: it would come back.
+    def computed(self, key: Key, question: str, rows: int, waited: float, seconds: float) -> None:
+        """A model has answered a question about ``rows`` scenes at once, which waited before.
 
-    def waited(self, model: ModelReference, seconds: float) -> None:
-        """A scene has left the queue."""
-        series = self._series.get((model.name, model.version))
-        if series is not None:
-            series.queue.observe(seconds)
-
-    def computed(self, model: ModelReference, question: str, rows: int, seconds: float) -> None:
-        """A model has answered a question about ``rows`` scenes at once."""
-        series = self._series.get((model.name, model.version))
-        if series is not None:
-            compute, size = series.questions.get(question) or series.bind(question)
-            compute.observe(seconds)
-            size.observe(rows)
-
-    def pending(self, model: ModelReference, rows: int) -> None:
-        """So many scenes wait for a model now."""
-        series = self._series.get((model.name, model.version))
-        if series is not None:
-            series.pending.set(rows)
+        Dropped where the model has been removed meanwhile: its series would come back.
+        """
+        series = self._of_model.get(key)
+        if series is None:
+            return
+        bound = series.get(question)
+        if bound is None:
+            bound = series[question] = (
+                self._queue.labels(*key),
+                self._compute.labels(*key, question),
+                self._rows.labels(*key, question),
+            )
+        queue, compute, size = bound
+        queue.observe(waited)
+        compute.observe(seconds)
+        size.observe(rows)
 
     # ------------------------------------------------------------------------- what is told
 
     def exposition(self) -> bytes:
         """Everything in Prometheus' text format."""
         return generate_latest(self.registry)
-
-
-class Unmeasured(Metrics):
-    """Counts nothing: for a service that is not to be measured."""
-
-    def __init__(self) -> None:
-        self.registry = CollectorRegistry()
-
-    def started(self) -> None:
-        """Nothing is counted."""
-
-    def serving(self, models: ServedModels) -> None:
-        """Nothing is counted."""
-
-    def reloaded(self, change: Change, outcome: Outcome) -> None:
-        """Nothing is counted."""
-
-    def answered(self, route: str, method: str, outcome: str, seconds: float | None) -> None:
-        """Nothing is counted."""
-
-    def entry_answered(self, question: str, outcome: str) -> None:
-        """Nothing is counted."""
-
-    def serialised(self, seconds: float) -> None:
-        """Nothing is counted."""
-
-    def streams(self, count: int) -> None:
-        """Nothing is counted."""
-
-    def stream_message(self, kind: str, outcome: str) -> None:
-        """Nothing is counted."""
-
-    def stream_answered(self, outcome: str, superseded: int) -> None:
-        """Nothing is counted."""
-
-    def waited(self, model: ModelReference, seconds: float) -> None:
-        """Nothing is counted."""
-
-    def computed(self, model: ModelReference, question: str, rows: int, seconds: float) -> None:
-        """Nothing is counted."""
-
-    def pending(self, model: ModelReference, rows: int) -> None:
-        """Nothing is counted."""
-
-    def exposition(self) -> bytes:
-        """Nothing."""
-        return b""
-
-
-class _ModelSeries:
-    """The bound series of one model."""
-
-    __slots__ = ("_key", "_metrics", "pending", "questions", "queue")
-
-    def __init__(self, metrics: Metrics, key: Key) -> None:
-        self._metrics = metrics
-        self._key = key
-        self.queue = metrics._queue.labels(*key)
-        self.pending = metrics._pending.labels(*key)
-        self.questions: dict[str, tuple[Histogram, Histogram]] = {}
-
-    def bind(self, question: str) -> tuple[Histogram, Histogram]:
-        bound = (
-            self._metrics._compute.labels(*self._key, question),
-            self._metrics._rows.labels(*self._key, question),
-        )
-        self.questions[question] = bound
-        return bound
 
 
 def _infos(models: ServedModels) -> Iterable[Info]:

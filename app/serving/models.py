@@ -18,8 +18,8 @@ from types import MappingProxyType
 from app import reasoning
 from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
 from app.scene.vocabulary import Vocabulary
+from app.serving.admission import WorkQueue
 from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
-from app.serving.queue import WorkQueue
 from app.serving.warm_up import warm_up
 from scene_client.schemas import Failure, ModelReference
 
@@ -36,12 +36,10 @@ class ServedModel:
 
     Attributes:
         artifact: what the reasoning works with.
-        contexts: its hidden units by their strongest objects and relations, layer by layer.
         queue: its work.
     """
 
     artifact: Artifact
-    contexts: Mapping[str, tuple[reasoning.ContextUnit, ...]]
     queue: WorkQueue
 
     @cached_property
@@ -55,7 +53,12 @@ class ServedModel:
             digest=self.artifact.digest,
         )
 
-    @property
+    @cached_property
+    def key(self) -> Key:
+        """Its name and version."""
+        return self.artifact.manifest.name, self.artifact.manifest.version
+
+    @cached_property
     def vocabulary(self) -> Vocabulary:
         """Its words."""
         return self.artifact.vocabulary
@@ -63,7 +66,16 @@ class ServedModel:
     @cached_property
     def context_sizes(self) -> Mapping[str, int]:
         """How many units each layer has."""
-        return {layer: len(units) for layer, units in self.contexts.items()}
+        spec = self.artifact.spec
+        return {"h1": spec.H1, "h2": spec.H2} if spec.H2 else {"h1": spec.H1}
+
+    @cached_property
+    def contexts(self) -> Mapping[str, tuple[reasoning.ContextUnit, ...]]:
+        """Its hidden units by their strongest objects and relations, layer by layer.
+
+        Takes a fifth of a second the first time.
+        """
+        return reasoning.contexts(self.artifact)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +100,14 @@ class ServedModels:
             ModelUnavailableError: it was refused, or the alias leads nowhere.
             NotReadyError: the same of the default.
         """
+        found = self._resolved.get(reference)
+        if found is not None:
+            return found
         try:
             artifact = self.store.resolve(reference)
-            return self.served[artifact.manifest.name, artifact.manifest.version]
+            found = self.served[artifact.manifest.name, artifact.manifest.version]
+            self._resolved[reference] = found
+            return found
         except (StoreError, ArtifactError, KeyError) as error:
             if reference == DEFAULT:
                 raise NotReadyError("The default model is not usable.") from None
@@ -102,6 +119,11 @@ class ServedModels:
         """The same snapshot with one alias moved."""
         aliases = MappingProxyType({**self.store.aliases, alias: target})
         return replace(self, store=replace(self.store, aliases=aliases))
+
+    @cached_property
+    def _resolved(self) -> dict[str, ServedModel]:
+        # Successes only: clients choose the references, the store bounds those that lead somewhere.
+        return {}
 
     @cached_property
     def usable(self) -> frozenset[str]:
@@ -117,11 +139,6 @@ class ServedModels:
         aliases = {alias: str(target) for alias, target in self.store.aliases.items()}
         text = json.dumps([versions, aliases], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-    @property
-    def backlog(self) -> int:
-        """How many questions wait or are under way."""
-        return sum([model.queue.backlog for model in self.served.values()])
 
     @cached_property
     def failures(self) -> Mapping[str, Failure]:
@@ -172,7 +189,7 @@ def prepare(
             served[key] = known
             continue
         try:
-            contexts = warm_up(artifact)
+            warm_up(artifact)
         except Exception:
             # Whatever a broken model raises, it must not take the others down with it.
             subject = f"{key[0]}@{key[1]}"
@@ -183,5 +200,5 @@ def prepare(
                 detail="it verified, but could not answer a question",
             )
         else:
-            served[key] = ServedModel(artifact, contexts, new_queue())
+            served[key] = ServedModel(artifact, new_queue())
     return ServedModels(store, MappingProxyType(served), MappingProxyType(failures))

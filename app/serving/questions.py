@@ -14,152 +14,121 @@ from app.serving.answers import Answer
 from app.serving.errors import Location, Reason
 from app.serving.models import ServedModel
 from app.serving.reading import Faults, Reading
-from app.serving.session import Session
-from scene_client.schemas import (
-    GenerateRequest,
-    MissingRequest,
-    OutliersRequest,
-    RelationsRequest,
-    SceneRequest,
-)
+from app.serving.request import Request
+from scene_client.schemas import GenerateRequest, MissingRequest, OutliersRequest, RelationsRequest
+
+# Each of the four raises:
+#     RequestError, UnknownModelError, ModelUnavailableError: see `Request.read`.
+#     RequestError: the answer would be too large.
+#     QueueFullError, DeadlinePassedError, DisconnectedError: see `Request.ask`.
 
 DRAWN_SEED_BITS = 53
 """Every JSON reader can hand such a seed back: a double holds it exactly."""
 
 
-async def relations(session: Session, request: RelationsRequest) -> Answer:
-    """How do these objects stand to each other?
-
-    Raises:
-        RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
-        RequestError: the answer would be too large.
-        QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
-    """
-    model, reading = session.read(request)
-    pairs = _pairs(request, reading)
-    found, disagreements = await session.ask(
+async def relations(request: Request, asked: RelationsRequest) -> Answer:
+    """How do these objects stand to each other?"""
+    model, reading = request.read(asked)
+    found, disagreements = await request.ask(
         model,
         reasoning.relations,
         reading.scene,
-        top_k=request.top_k,
-        # What is left out is decided by the probability as it is answered: rounded.
-        min_probability=request.min_probability * (1 - 1e-5),
-        pairs=pairs,
-        include_opposites=request.include_opposites,
+        top_k=asked.top_k,
+        # The rounded probability, as it is answered, decides what is left out.
+        min_probability=asked.min_probability * (1 - 1e-5),
+        pairs=None if asked.pairs is None else _pairs(asked, reading),
+        include_opposites=asked.include_opposites,
     )
-    _require(session, answer_size.of_relations(found, disagreements, reading), "top_k")
+    size = answer_size.of_relations(found, disagreements, reading)
+    answer_size.require(size, request.limits.answer_bytes, "top_k")
+    envelope = answers.envelope(asked, request.id, model.reference, reading)
     return answers.relations(
-        _envelope(session, request, model, reading),
-        found,
-        disagreements,
-        reading,
-        min_probability=request.min_probability,
+        envelope, found, disagreements, reading, min_probability=asked.min_probability
     )
 
 
-async def missing(session: Session, request: MissingRequest) -> Answer:
-    """What else should be here, and where?
-
-    Raises:
-        RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
-        RequestError: the answer would be too large.
-        QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
-    """
-    model, reading = session.read(request)
-    if request.candidates is not None:
-        reading = replace(reading, unknown=reading.unknown.copy())
+async def missing(request: Request, asked: MissingRequest) -> Answer:
+    """What else should be here, and where?"""
+    model, reading = request.read(asked)
     faults = Faults()
-    # The default is for vocabularies of any size; a number of one's own is not cut down in silence.
-    if request.top_k > len(model.vocabulary) and "top_k" in request.model_fields_set:
+    # The default is for vocabularies of any size; a client's own number is never cut silently.
+    if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
         message = f"must not be above {len(model.vocabulary)}, the size of the model's vocabulary"
         faults.add(Reason.INVALID, ("top_k",), message)
-    candidates = _candidates(request, model, reading, faults)
-    at = _place(request, model, reading, faults)
-    faults.raise_any()
-    viewpoint = request.viewpoint
-    found = await session.ask(
+    candidates = at = None
+    if asked.candidates is not None:
+        reading = replace(reading, unknown=reading.unknown.copy())
+        candidates = _candidates(asked.candidates, model, reading, faults)
+    if asked.at is not None:
+        at = _place(asked, model, reading, faults)
+    if faults.found:
+        faults.raise_any()
+    viewpoint = asked.viewpoint
+    found = await request.ask(
         model,
         reasoning.missing,
         reading.scene,
-        top_k=request.top_k,
+        top_k=asked.top_k,
         candidates=candidates,
         at=at,
-        axes=viewer_axes(request.frame_id, None if viewpoint is None else viewpoint.yaw),
-        coverage=request.coverage,
+        axes=viewer_axes(asked.frame_id, None if viewpoint is None else viewpoint.yaw),
+        coverage=asked.coverage,
     )
-    _require(session, answer_size.of_missing(found, reading), "top_k")
-    coverage = request.coverage
+    size = answer_size.of_missing(found, reading)
+    answer_size.require(size, request.limits.answer_bytes, "top_k")
+    coverage = asked.coverage
     if coverage is None:
         coverage = model.artifact.calibration.coverage
-    return answers.missing(_envelope(session, request, model, reading), coverage, found, reading)
+    envelope = answers.envelope(asked, request.id, model.reference, reading)
+    return answers.missing(envelope, coverage, found, reading)
 
 
-async def outliers(session: Session, request: OutliersRequest) -> Answer:
-    """What does not belong here, or stands in the wrong place?
-
-    Raises:
-        RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
-        RequestError: the answer would be too large.
-        QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
-    """
-    model, reading = session.read(request)
-    found = await session.ask(
+async def outliers(request: Request, asked: OutliersRequest) -> Answer:
+    """What does not belong here, or stands in the wrong place?"""
+    model, reading = request.read(asked)
+    found = await request.ask(
         model,
         reasoning.outliers,
         reading.scene,
-        sensitivity=request.sensitivity,
-        threshold=request.threshold,
+        sensitivity=asked.sensitivity,
+        threshold=asked.threshold,
     )
-    _require(session, answer_size.of_outliers(found, reading), "objects")
-    return answers.outliers(_envelope(session, request, model, reading), found, reading)
+    size = answer_size.of_outliers(found, reading)
+    answer_size.require(size, request.limits.answer_bytes, "objects")
+    envelope = answers.envelope(asked, request.id, model.reference, reading)
+    return answers.outliers(envelope, found, reading)
 
 
-async def generate(session: Session, request: GenerateRequest) -> Answer:
-    """What would a scene like this look like?
-
-    Raises:
-        RequestError, UnknownModelError, ModelUnavailableError: see `Session.read`.
-        RequestError: the answer would be too large.
-        QueueFullError, DeadlinePassedError, DisconnectedError: see `Session.ask`.
-    """
-    model, reading = session.read(request, may_be_empty=True)
-    _check_context(request, model)
-    seed = secrets.randbits(DRAWN_SEED_BITS) if request.seed is None else request.seed
+async def generate(request: Request, asked: GenerateRequest) -> Answer:
+    """What would a scene like this look like?"""
+    model, reading = request.read(asked, may_be_empty=True)
+    _check_context(asked, model)
+    seed = secrets.randbits(DRAWN_SEED_BITS) if asked.seed is None else asked.seed
 
     def draw(stop: Callable[[], bool]) -> tuple[reasoning.GeneratedScene, ...]:
         return reasoning.generate(
             model.artifact,
             reading.scene,
-            count=request.count,
+            count=asked.count,
             seed=seed,
-            steps=request.steps,
-            temperature=request.temperature,
-            context=request.context,
+            steps=asked.steps,
+            temperature=asked.temperature,
+            context=asked.context,
             stop=stop,
         )
 
-    drawn = await session.draw(request.count, model, "generate", draw)
-    _require(session, answer_size.of_generated(drawn, reading), "count")
-    return answers.generate(_envelope(session, request, model, reading), seed, drawn)
+    drawn = await request.draw(asked.count, model, "generate", draw)
+    size = answer_size.of_generated(drawn, reading)
+    answer_size.require(size, request.limits.answer_bytes, "count")
+    envelope = answers.envelope(asked, request.id, model.reference, reading)
+    return answers.generate(envelope, seed, drawn)
 
 
-def _require(session: Session, size: int, parameter: str) -> None:
-    answer_size.require(size, session.limits.answer_bytes, parameter)
-
-
-def _envelope(
-    session: Session, request: SceneRequest, model: ServedModel, reading: Reading
-) -> Answer:
-    return answers.envelope(request, session.request_id, model.reference, reading)
-
-
-def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]] | None:
-    if request.pairs is None:
-        return None
+def _pairs(asked: RelationsRequest, reading: Reading) -> list[tuple[int, int]]:
     faults = Faults()
     names = reading.names
     pairs: dict[tuple[int, int], None] = {}
-    for place, pair in enumerate(request.pairs):
+    for place, pair in enumerate(asked.pairs or ()):
         location: Location = ("pairs", place)
         if names.is_ignored(pair.subject) or names.is_ignored(pair.object):
             continue
@@ -176,13 +145,11 @@ def _pairs(request: RelationsRequest, reading: Reading) -> list[tuple[int, int]]
 
 
 def _candidates(
-    request: MissingRequest, model: ServedModel, reading: Reading, faults: Faults
-) -> list[int] | None:
+    labels: list[str], model: ServedModel, reading: Reading, faults: Faults
+) -> list[int]:
     """Classes to rank."""
-    if request.candidates is None:
-        return None
     indices: dict[int, None] = {}
-    for place, label in enumerate(request.candidates):
+    for place, label in enumerate(labels):
         index = model.vocabulary.index(label)
         if index is None:
             index = reading.unknown.resolve(label, label, ("candidates", place), faults)
@@ -192,20 +159,20 @@ def _candidates(
 
 
 def _place(
-    request: MissingRequest, model: ServedModel, reading: Reading, faults: Faults
+    asked: MissingRequest, model: ServedModel, reading: Reading, faults: Faults
 ) -> tuple[str, int] | None:
-    if request.at is None:
+    if asked.at is None:
         return None
     canonical = model.artifact.manifest.vocabulary.relations
-    if request.at.relation not in {*canonical, *map(opposite, canonical)}:
+    if asked.at.relation not in {*canonical, *map(opposite, canonical)}:
         faults.add(Reason.INVALID, ("at", "relation"), "the model does not know this relation")
-    anchor = reading.names.find(request.at.object, ("at", "object"), faults)
-    return None if anchor is None else (request.at.relation, anchor)
+    anchor = reading.names.find(asked.at.object, ("at", "object"), faults)
+    return None if anchor is None else (asked.at.relation, anchor)
 
 
-def _check_context(request: GenerateRequest, model: ServedModel) -> None:
+def _check_context(asked: GenerateRequest, model: ServedModel) -> None:
     faults = Faults()
-    for layer, units in (request.context or {}).items():
+    for layer, units in (asked.context or {}).items():
         size = model.context_sizes.get(layer)
         if size is None:
             layers = tuple(model.context_sizes)

@@ -10,7 +10,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Final
+
+from pydantic_core import to_json
 
 from app.scene.frames import body_pose, is_optical
 from app.scene.geometry import Viewpoint
@@ -26,6 +28,7 @@ from scene_client.schemas import (
     Detection,
     Mapped,
     ObservedRelation,
+    Relation,
     SceneRequest,
     SceneWarning,
     UnknownLabels,
@@ -176,35 +179,47 @@ class Unknown:
         return self._looked_up[key]
 
 
-@dataclass(slots=True)
+@dataclass
 class Reading:
-    """A request as the models see it, made once and never changed.
+    """A request's scene as the models see it, made once and never changed.
 
     Attributes:
         scene: the known objects, what holds between them, and the room.
+        ids: of the scene's objects.
         unknown: what became of the labels that the model does not know.
+        left_out: (id, label) of the objects that were left out.
         observed: relations derived from poses; None where there was nothing to derive from.
-        names: how the request may name its objects.
         flipped: canonical triples of `scene` that the request spelled from the other end.
         warnings: what is probably a mistake.
     """
 
     scene: Scene
+    ids: list[str]
     unknown: Unknown
-    observed: list[ObservedRelation] | None
-    names: Names
-    flipped: frozenset[Triple]
-    warnings: list[SceneWarning]
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+    observed: list[ObservedRelation] | None = None
+    flipped: frozenset[Triple] = frozenset()
+    warnings: list[SceneWarning] = field(default_factory=list)
+
+    @cached_property
+    def names(self) -> Names:
+        """How the request may name its objects; most requests name none."""
+        return Names(self.scene.objects, self.left_out, self.unknown.vocabulary)
+
+    @cached_property
+    def longest_name(self) -> int:
+        """Bytes of the longest name in an answer as JSON."""
+        text = "".join(self.ids)
+        if text.isascii() and '"' not in text and "\\" not in text:
+            longest = max(map(len, self.ids), default=0) + 2
+        else:
+            longest = max(len(to_json(name)) for name in self.ids)
+        return max(longest, self.unknown.vocabulary.longest_label) + 1
 
     @property
     def ignored(self) -> tuple[str, ...]:
         """Names of what the model does not know, left out as the request allowed."""
         return tuple(self.unknown.ignored)
-
-    @property
-    def ids(self) -> list[str]:
-        """The ids of the scene's objects."""
-        return [thing.id for thing in self.scene.objects]
 
 
 class Names:
@@ -280,96 +295,95 @@ def read_scene(
     look_ups: LookUps | None = None,
     *,
     may_be_empty: bool = False,
+    derive: bool = True,
 ) -> Reading:
     """The scene of a request, in the classes of ``vocabulary``.
 
     Args:
         look_ups: those of the whole request, where it holds more than this scene.
+        derive: whether to derive relations and warnings from poses; else the scene is only checked.
 
     Raises:
         RequestError: everything that is wrong with it, of the gravest kind found.
     """
-    given = _given(request, vocabulary, limits, look_ups or LookUps(), may_be_empty=may_be_empty)
-    scene = observe(
-        given.scene,
-        frame_id=request.frame_id,
-        viewpoint=_viewpoint(request),
-        typical_sizes=vocabulary.sizes,
-    )
-    observed = None if scene.poses is None else _relations(scene)
-    warnings = scene_warnings(given.scene, scene, vocabulary, request)
-    return Reading(scene, given.unknown, observed, given.names, given.flipped, warnings)
-
-
-def check_scene(request: SceneRequest, vocabulary: Vocabulary, limits: Limits) -> None:
-    """Check a scene, which may be empty, without deriving relations from its poses.
-
-    Raises:
-        RequestError: as `read_scene` does.
-    """
-    _given(request, vocabulary, limits, LookUps(), may_be_empty=True)
-
-
-class _Given(NamedTuple):
-    """What a request says; see `Reading`."""
-
-    scene: Scene
-    unknown: Unknown
-    names: Names
-    flipped: frozenset[Triple]
-
-
-def _given(
-    request: SceneRequest,
-    vocabulary: Vocabulary,
-    limits: Limits,
-    look_ups: LookUps,
-    *,
-    may_be_empty: bool,
-) -> _Given:
     faults = Faults()
-    if len(request.objects) > limits.objects:
-        faults.add(
-            Reason.INVALID, ("objects",), f"must not hold more than {limits.objects} objects"
-        )
-    if len(request.relations or ()) > limits.relations:
-        faults.add(
-            Reason.INVALID, ("relations",), f"must not hold more than {limits.relations} relations"
-        )
-    if request.relations_complete and request.relations is None:
-        faults.add(Reason.INVALID, ("relations_complete",), "needs relations")
-    faults.raise_any()
-
+    _check_sizes(request, limits, faults)
     ids = _ids(request.objects, faults)
-    unknown = Unknown(vocabulary, request.unknown_labels, look_ups)
+    unknown = Unknown(vocabulary, request.unknown_labels, look_ups or LookUps())
+    reading = Reading(Scene(()), ids, unknown)
     objects: list[SceneObject] = []
-    left_out: list[tuple[str, str]] = []
     optical = request.frame_id is not None and is_optical(request.frame_id)
-    for place, (name, entry) in enumerate(zip(ids, request.objects, strict=True)):
+    has_poses = has_detections = False
+    for place, entry in enumerate(request.objects):
         label = entry if isinstance(entry, str) else entry.label
         index = vocabulary.index(label)
         if index is None:
             location: Location = ("objects", place)
             if not isinstance(entry, str):
                 location = (*location, "label")
-            index = unknown.resolve(label, name, location, faults)
+            index = unknown.resolve(label, ids[place], location, faults)
         if index is None:
-            left_out.append((name, label))
+            reading.left_out.append((ids[place], label))
         elif isinstance(entry, str):
-            objects.append(SceneObject(name, label, index))
+            objects.append(SceneObject(ids[place], label, index))
         else:
-            objects.append(_scene_object(name, entry, index, optical=optical))
-    room = _room(request, vocabulary, unknown, faults)
-    faults.raise_any()
-    if not objects and not may_be_empty:
+            has_detections = True
+            has_poses = has_poses or entry.position is not None
+            objects.append(_scene_object(ids[place], entry, index, optical=optical))
+    room = None if request.room_type is None else _room(request.room_type, unknown, faults)
+    if not objects and not may_be_empty and not faults.found:
         faults.add(Reason.INVALID, ("objects",), "the model knows none of the objects")
+    if faults.found:
         faults.raise_any()
 
-    names = Names(objects, left_out, vocabulary)
-    triples, flipped = _triples(request, names, bool(left_out), faults)
-    faults.raise_any()
-    scene = Scene(tuple(objects), triples, request.relations_complete, room)
-    return _Given(scene, unknown, names, flipped)
+    reading.scene = Scene(tuple(objects), None, False, room)
+    if reading.left_out:
+        left_out = {name for name, _ in reading.left_out}
+        reading.ids = [name for name in ids if name not in left_out]
+    if request.relations is not None:
+        triples, reading.flipped = _triples(request.relations, reading, faults)
+        faults.raise_any()
+        reading.scene = Scene(reading.scene.objects, triples, request.relations_complete, room)
+    if derive and has_detections:
+        _derive(request, reading, vocabulary, has_poses=has_poses)
+    return reading
+
+
+def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
+    if len(request.objects) > limits.objects:
+        faults.add(
+            Reason.INVALID, ("objects",), f"must not hold more than {limits.objects} objects"
+        )
+    if request.relations is None:
+        if request.relations_complete:
+            faults.add(Reason.INVALID, ("relations_complete",), "needs relations")
+    elif len(request.relations) > limits.relations:
+        faults.add(
+            Reason.INVALID, ("relations",), f"must not hold more than {limits.relations} relations"
+        )
+    if faults.found:
+        faults.raise_any()
+
+
+def _derive(
+    request: SceneRequest, reading: Reading, vocabulary: Vocabulary, *, has_poses: bool
+) -> None:
+    """Add to a reading what the poses of its objects say."""
+    given = reading.scene
+    if has_poses and given.relations is None:
+        view = request.viewpoint
+        reading.scene = observe(
+            given,
+            frame_id=request.frame_id,
+            viewpoint=None if view is None else Viewpoint(view.x, view.y, view.yaw),
+            typical_sizes=vocabulary.sizes,
+        )
+        ids = reading.ids
+        reading.observed = [
+            ObservedRelation(ids[i], CANONICAL[a], ids[j])  # type: ignore[arg-type]
+            for a, i, j in reading.scene.relations or ()
+        ]
+    reading.warnings = scene_warnings(given, reading.scene, vocabulary, request)
 
 
 def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
@@ -428,26 +442,20 @@ def _scene_object(
     )
 
 
-def _room(
-    request: SceneRequest, vocabulary: Vocabulary, unknown: Unknown, faults: Faults
-) -> int | None:
-    name = request.room_type
-    if name is None:
-        return None
-    room = vocabulary.room_index(name)
+def _room(name: str, unknown: Unknown, faults: Faults) -> int | None:
+    room = unknown.vocabulary.room_index(name)
     if room is not None:
         return room
     return unknown.resolve(name, name, ("room_type",), faults, is_room=True)
 
 
 def _triples(
-    request: SceneRequest, names: Names, some_ignored: bool, faults: Faults
-) -> tuple[tuple[Triple, ...] | None, frozenset[Triple]]:
+    relations: Sequence[Relation], reading: Reading, faults: Faults
+) -> tuple[tuple[Triple, ...], frozenset[Triple]]:
     """The canonical triples, and those of them that are spelled from the other end."""
-    if request.relations is None:
-        return None, frozenset()
+    names, some_ignored = reading.names, bool(reading.left_out)
     triples: dict[Triple, bool] = {}
-    for place, relation in enumerate(request.relations):
+    for place, relation in enumerate(relations):
         location: Location = ("relations", place)
         if some_ignored and (
             names.is_ignored(relation.subject) or names.is_ignored(relation.object)
@@ -467,17 +475,3 @@ def _triples(
             faults.add(Reason.CONTRADICTION, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])
-
-
-def _viewpoint(request: SceneRequest) -> Viewpoint | None:
-    if request.viewpoint is None:
-        return None
-    return Viewpoint(request.viewpoint.x, request.viewpoint.y, request.viewpoint.yaw)
-
-
-def _relations(scene: Scene) -> list[ObservedRelation]:
-    ids = [thing.id for thing in scene.objects]
-    return [
-        ObservedRelation(ids[i], CANONICAL[a], ids[j])  # type: ignore[arg-type]
-        for a, i, j in scene.relations or ()
-    ]

@@ -15,6 +15,7 @@ from typing import Concatenate, Literal, ParamSpec, TypeVar
 from app.compiling import check_cache, progress
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
 from app.registry.verified import MAX_WEIGHTS_BYTES
+from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.errors import (
     AliasConflictError,
     DrainingError,
@@ -33,10 +34,8 @@ from app.serving.errors import (
 from app.serving.metrics import Change as Counted
 from app.serving.metrics import Metrics
 from app.serving.models import DEFAULT, Key, ServedModels, prepare
-from app.serving.queue import Threads, Ticket, WorkQueue
 from app.serving.reading import Limits
-from app.serving.record import RequestRecord
-from app.serving.session import Session
+from app.serving.request import Record, Request
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
 P = ParamSpec("P")
@@ -86,29 +85,32 @@ class Runtime:
 
     Args:
         store: directory of published models.
-        limits: what one scene may hold.
-        queue_rows: what may wait for one model.
-        metrics: what the service counts.
-        poll: seconds between two looks for changes of the store; 0 for none.
+        limits: of scenes and answers.
+        queue_rows: scenes that may wait for one model.
+        queue_requests: requests that may wait to be read.
+        metrics: of the service.
+        poll: seconds between two checks of the store; 0 for none.
         max_weights_bytes: versions with a larger weights file are refused.
 
     Attributes:
-        draining: nothing new is taken.
+        backlog: the requests that wait to be read.
     """
 
     def __init__(
         self,
         store: Path,
-        limits: Limits,
-        queue_rows: int,
-        metrics: Metrics,
-        poll: float,
+        limits: Limits | None = None,
+        metrics: Metrics | None = None,
+        *,
+        queue_rows: int = 4096,
+        queue_requests: int = 256,
+        poll: float = 0,
         max_weights_bytes: int = MAX_WEIGHTS_BYTES,
     ) -> None:
-        self.metrics = metrics
-        self.draining = False
+        self.metrics = metrics or Metrics()
+        self.backlog = Backlog(queue_requests)
         self._store = Store(store, lock_timeout=_LOCK_TIMEOUT, max_weights_bytes=max_weights_bytes)
-        self._limits = limits
+        self._limits = limits or Limits()
         self._queue_rows = queue_rows
         self._threads = Threads()
         self._poll = poll
@@ -128,25 +130,37 @@ class Runtime:
             raise NotReadyError("The service is starting.")
         return self._models
 
-    def session(
-        self, request_id: str, ticket: Ticket, record: RequestRecord | None = None
-    ) -> Session:
-        """The view of one request, which keeps the snapshot it starts with.
+    def request(
+        self,
+        deadline: float,
+        request_id: str,
+        record: Record | None = None,
+        is_gone: Callable[[], Awaitable[bool]] | None = None,
+    ) -> Request:
+        """A request that sees the current snapshot from beginning to end.
 
         Args:
+            deadline, is_gone: see `Ticket`.
             request_id: goes into every answer.
-            record: takes down what becomes known about the request.
+            record: what becomes known about the request.
 
         Raises:
             NotReadyError: nothing has been loaded yet.
         """
-        record = record or RequestRecord()
-        return Session(self.models, self._limits, request_id, ticket, self.metrics, record)
+        return Request(
+            deadline,
+            is_gone,
+            request_id,
+            record or Record(),
+            models=self.models,
+            limits=self._limits,
+            metrics=self.metrics,
+        )
 
     @property
-    def backlog(self) -> int:
-        """How many questions wait or are under way."""
-        return 0 if self._models is None else self._models.backlog
+    def draining(self) -> bool:
+        """Whether nothing new is begun."""
+        return self.backlog.draining
 
     def check_ready(self) -> None:
         """Return if requests that name no model can be answered.
@@ -159,8 +173,8 @@ class Runtime:
         self.models.resolve(DEFAULT)
 
     def drain(self) -> None:
-        """Take nothing new from now on, and say so to those who ask whether it is ready."""
-        self.draining = True
+        """Begin nothing new, and be not ready, from now on."""
+        self.backlog.draining = True
 
     async def start(self) -> None:
         """Load, verify and warm everything in the store; `models` tells what is wrong."""
@@ -292,7 +306,7 @@ class Runtime:
             return prepare(load_model_set(self._store, known), self._new_queue, previous)
 
     def _new_queue(self) -> WorkQueue:
-        return WorkQueue(self._queue_rows, self._threads)
+        return WorkQueue(self._queue_rows, self._threads, self.backlog)
 
     def _target(self, reference: str) -> AliasTarget:
         try:

@@ -16,8 +16,8 @@ from app.serving import answers, questions
 from app.serving.answers import Answer
 from app.serving.errors import Location, Reason, RequestError, ServingError
 from app.serving.metrics import Metrics
-from app.serving.reading import Faults
-from app.serving.session import Session
+from app.serving.reading import Faults, read_scene
+from app.serving.request import Request
 from scene_client.schemas import (
     MissingOptions,
     MissingRequest,
@@ -63,12 +63,12 @@ class StreamScene:
         timeout: int | None = self._scene.fields.get("timeout_ms")
         return timeout
 
-    def take(self, message: SceneMessage, session: Session) -> None:
+    def take(self, message: SceneMessage, request: Request) -> None:
         """Merge a message into the scene.
 
         Raises:
             RequestError: the message, or the scene with it, is invalid; the scene is as before.
-            UnknownModelError, ModelUnavailableError: see `Session.read`.
+            UnknownModelError, ModelUnavailableError: see `Request.read`.
         """
         faults = Faults()
         if isinstance(message, Whole | Update) and message.seq <= self.seq:
@@ -83,12 +83,14 @@ class StreamScene:
             if places.setdefault(object_id(thing), place) != place:
                 faults.add(Reason.INVALID, ("objects", place, "id"), "another object has this id")
         scene = self._scene.after(message)
-        if len(scene.objects) > session.limits.objects:
-            text = f"the scene would hold more than {session.limits.objects} objects"
+        if len(scene.objects) > request.limits.objects:
+            text = f"the scene would hold more than {request.limits.objects} objects"
             faults.add(Reason.INVALID, ("objects",), text)
         faults.raise_any()
         try:
-            session.check(_request(scene))
+            asked = _request(scene)
+            model = request.models.resolve(asked.model)
+            read_scene(asked, model.vocabulary, request.limits, may_be_empty=True, derive=False)
         except RequestError as error:
             raise _in_message(error, scene, places, message.model_fields_set) from None
         self._scene = scene
@@ -96,10 +98,10 @@ class StreamScene:
             self.seq = message.seq
             self.pending += 1
 
-    async def answer(self, session: Session) -> tuple[Answer, dict[str, ServingError]]:
+    async def answer(self, request: Request) -> tuple[Answer, dict[str, ServingError]]:
         """The answers about the newest scene as a message, and the errors by question."""
         seq, covered = self.seq, self.pending
-        found, errors = await _answers(self._scene, session)
+        found, errors = await _answers(self._scene, request)
         self.pending -= covered
         message = {"type": "answer", "seq": seq, "superseded": max(0, covered - 1), **found}
         return message, errors
@@ -135,32 +137,32 @@ def _in_message(
 
 
 async def _answers(
-    scene: MergedScene, session: Session
+    scene: MergedScene, request: Request
 ) -> tuple[dict[str, Answer], dict[str, ServingError]]:
     """The answers by question, as the routes give them, and the errors of the others."""
     ask = scene.fields.get("ask") or _DEFAULT_ASK
     asked = [name for name in _FORMS if getattr(ask, name) is not None]
-    request = _request(scene)
+    bare = _request(scene)
     try:
-        model, reading = session.read(request, may_be_empty=True)
+        model, reading = request.read(bare, may_be_empty=True)
     except RequestError as error:  # another model than when the messages were taken
         return {}, dict.fromkeys(asked, _in_message(error, scene, {}, frozenset()))
     except ServingError as error:
         return {}, dict.fromkeys(asked, error)
     # One reading and one deadline for all questions.
-    session = replace(session, known=(model, reading), gives_way=True)
+    request = replace(request, known=(model, reading), gives_way=True)
     found: dict[str, Answer] = {}
     errors: dict[str, ServingError] = {}
     for name in asked:
         if not reading.scene.objects:
-            found[name] = answers.envelope(request, session.request_id, model.reference, reading)
+            found[name] = answers.envelope(bare, request.id, model.reference, reading)
             found[name] |= {own: [] for own in _LISTS[name]}
             continue
         options = getattr(ask, name)
         given = {option: getattr(options, option) for option in options.model_fields_set}
         try:
             question = _request(scene, _FORMS[name], **given)
-            found[name] = await getattr(questions, name)(session, question)
+            found[name] = await getattr(questions, name)(request, question)
         except RequestError as error:
             faults = [
                 replace(fault, location=("ask", name, *fault.location)) for fault in error.faults

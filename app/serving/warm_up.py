@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 from app import reasoning
@@ -11,18 +10,15 @@ from app.registry import Artifact
 from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
-from app.serving.answers import significant
+from app.serving.rounding import significant
 
 STEPS = 1
 """Gibbs sweeps of the drawing: more take their time and warm nothing further."""
 
 
-def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...]]:
+def warm_up(artifact: Artifact) -> None:
     """Ask everything once, with and without given relations and with poses: the first call of a
     compiled loop compiles it.
-
-    Returns:
-        The model's contexts, which never change.
 
     Raises:
         ValueError: an answer is not finite.
@@ -51,7 +47,6 @@ def warm_up(artifact: Artifact) -> Mapping[str, tuple[reasoning.ContextUnit, ...
     numbers += [entry.log_score for entry in generated]
     if not all(map(math.isfinite, significant(numbers))):
         raise ValueError("the model gives answers that are not finite")
-    return reasoning.contexts(artifact)
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:

@@ -1,1 +1,1 @@
-"""Throughput and latency of the running service under load, beside an echo of it."""
+"""Throughput and latency of the running service under load, beside a plain FastAPI app."""

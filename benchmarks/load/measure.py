@@ -1,4 +1,4 @@
-"""The service beside its echo, window by window, until both are steady."""
+"""The service beside a plain FastAPI app, window by window, until both are steady."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Comparison:
 
     Attributes:
         kind, route, load: what was asked, and how.
-        service, echo: all windows of each, joined.
+        service, plain: all windows of each, joined.
         ratios: of the rates, window by window.
         steady: the last three windows of both were within a tenth of each other.
     """
@@ -33,24 +33,24 @@ class Comparison:
     route: str
     load: str
     service: Window
-    echo: Window
+    plain: Window
     ratios: tuple[float, ...]
     steady: bool
 
     @property
     def rate_ratio(self) -> float:
-        """Median over windows of the service's rate over the echo's."""
+        """Median over windows of the service's rate over the plain app's."""
         return median(self.ratios)
 
     @property
     def p99_ratio(self) -> float:
-        """The service's p99 over the echo's."""
-        return self.service.quantile(0.99) / self.echo.quantile(0.99)
+        """The service's p99 over the plain app's."""
+        return self.service.quantile(0.99) / self.plain.quantile(0.99)
 
     @property
     def extra_p50(self) -> float:
-        """Seconds that the service's p50 is above the echo's."""
-        return self.service.quantile(0.5) - self.echo.quantile(0.5)
+        """Seconds that the service's p50 is above the plain app's."""
+        return self.service.quantile(0.5) - self.plain.quantile(0.5)
 
 
 def concurrency(connections: int) -> Load:
@@ -82,7 +82,7 @@ def compare(
     """Take turns until both are steady, or ten times.
 
     Args:
-        ports: of the service and of the echo.
+        ports: of the service and of the plain app.
         names: kind, route and load.
         seconds: of one window.
     """
@@ -94,10 +94,10 @@ def compare(
         for port, windows in zip(ports, found, strict=True):
             windows.append(uvloop.run(load(port, requests, seconds)))
         steady = len(found[0]) >= _FEWEST and all(map(is_steady, found))
-    service, echo = (joined(windows) for windows in found)
+    service, plain = (joined(windows) for windows in found)
     pairs = zip(*found, strict=True)
     ratios = tuple(ours.rate / theirs.rate for ours, theirs in pairs)
-    return Comparison(*names, service, echo, ratios, steady)
+    return Comparison(*names, service, plain, ratios, steady)
 
 
 def is_steady(windows: Sequence[Window]) -> bool:

@@ -1,4 +1,4 @@
-"""The service and its echo, each a process of its own on a core of its own."""
+"""The service and a plain FastAPI app, each a process of its own on a core of its own."""
 
 from __future__ import annotations
 
@@ -60,11 +60,10 @@ def service(store: Path, **settings: str) -> Iterator[Server]:
 
 
 @contextmanager
-def echo(**settings: str) -> Iterator[Server]:
-    """``python -m benchmarks.load.echo``."""
+def plain() -> Iterator[Server]:
+    """``python -m benchmarks.load.plain``."""
     port = _free_port()
-    variables = {f"SCENE_{name.upper()}": value for name, value in settings.items()}
-    with _running(["-m", "benchmarks.load.echo", str(port)], port, variables) as server:
+    with _running(["-m", "benchmarks.load.plain", str(port)], port, {}) as server:
         yield server
 
 

@@ -17,8 +17,8 @@ import pytest
 
 from app import reasoning
 from app.registry import Artifact, Store
-from app.serving.answers import significant
 from app.serving.reading import Limits, read_scene
+from app.serving.rounding import significant
 from benchmarks.load.connections import prepared
 from scene_client.schemas import MissingRequest
 from tests.chaos.load import ConstantLoad

@@ -6,9 +6,7 @@ import asyncio
 import signal
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +14,7 @@ import httpx
 import pytest
 
 from app import reasoning
-from app.api.middleware.turnstile import PACE, REFUSALS, Turnstile
-from app.serving.queue import WorkQueue
+from app.serving.admission import WorkQueue
 from tests.http.conftest import launch, serve
 from tests.http.test_problems import problem
 
@@ -179,169 +176,6 @@ async def test_a_batch_stops_where_its_deadline_passes(
     answered = statuses.count(200)
     assert 0 < answered < 20
     assert statuses == [200] * answered + [504] * (20 - answered)
-
-
-async def _call(app: Turnstile, path: str = "/relations", headers: Any = ()) -> int:
-    """The status that a request gets, straight through the middleware."""
-    statuses = []
-
-    async def receive() -> Any:
-        return {"type": "http.disconnect"}
-
-    async def send(message: Any) -> None:
-        if message["type"] == "http.response.start":
-            statuses.append(message["status"])
-
-    scope = {"type": "http", "path": path, "headers": list(headers), "state": {}, "app": _App()}
-    await app(scope, receive, send)
-    return statuses[0]
-
-
-class _App:
-    """As much of an application as an answer needs."""
-
-    class state:  # noqa: N801
-        class settings:  # noqa: N801
-            retry_after = 1
-
-
-def _turnstile(begun: list[str], limit: int, backlog: Callable[[], int] = lambda: 0) -> Turnstile:
-    async def answer(scope: Any, receive: Any, send: Any) -> None:
-        begun.append(scope["path"])
-        await send({"type": "http.response.start", "status": 200, "headers": []})
-
-    return Turnstile(answer, limit=limit, timeout=10.0, longest_ms=60_000, backlog=backlog)
-
-
-@pytest.mark.anyio
-async def test_requests_that_come_at_once_are_begun_a_few_in_a_tick_and_in_order() -> None:
-    begun: list[str] = []
-    ticks: list[int] = []
-    turnstile = _turnstile(begun, limit=1000)
-
-    async def clock() -> None:
-        while len(begun) < 300:
-            ticks.append(len(begun))
-            await asyncio.sleep(0)
-
-    paths = [f"/{number}" for number in range(300)]
-    *statuses, _ = await asyncio.gather(*(_call(turnstile, path) for path in paths), clock())
-    assert statuses == [200] * 300
-    assert begun == paths
-    steps = [after - before for before, after in pairwise(ticks)]
-    assert max(steps) <= PACE
-    # Nobody waits where there is room.
-    assert await _call(turnstile) == 200
-
-
-@pytest.mark.anyio
-async def test_too_many_at_once_are_refused_and_health_passes_by() -> None:
-    begun: list[str] = []
-    turnstile = _turnstile(begun, limit=10)
-    paths = ["/relations"] * (PACE + 10 + 5) + ["/health/live"]
-    statuses = await asyncio.gather(*(_call(turnstile, path) for path in paths))
-    assert statuses == [200] * (PACE + 10) + [429] * 5 + [200]
-    assert begun.index("/health/live") == PACE
-
-
-@pytest.mark.anyio
-async def test_no_more_is_begun_than_the_models_keep_up_with() -> None:
-    begun: list[str] = []
-    done = 0
-    turnstile = _turnstile(begun, limit=1000, backlog=lambda: len(begun) - done)
-    waiting: list[int] = []
-
-    async def work() -> None:
-        nonlocal done
-        while done < 300:
-            waiting.append(len(begun) - done)
-            done = min(done + 3, len(begun))
-            await asyncio.sleep(0)
-
-    *statuses, _ = await asyncio.gather(*(_call(turnstile) for _ in range(300)), work())
-    assert statuses == [200] * 300
-    assert max(waiting) == PACE
-
-
-@pytest.mark.anyio
-async def test_who_would_spend_the_time_in_the_line_is_refused_at_once() -> None:
-    begun: list[str] = []
-    held = PACE
-    turnstile = _turnstile(begun, limit=100, backlog=lambda: held)
-    first = asyncio.ensure_future(_call(turnstile, "/first"))
-    await asyncio.sleep(0.02)
-    hurried = [(b"x-request-timeout-ms", b"30")]
-    assert await _call(turnstile, "/hurried", hurried) == 429
-    patient = asyncio.ensure_future(_call(turnstile, "/patient"))
-    await asyncio.sleep(0)
-    held = 0
-    assert await first == await patient == 200
-    assert begun == ["/first", "/patient"]
-
-
-@pytest.mark.anyio
-async def test_the_pace_of_the_line_is_learnt_and_decides_how_long_it_gets() -> None:
-    """At 2 ms each, who has 200 ms may stand behind some 25 others, and not behind 100."""
-    begun: list[str] = []
-    done = 0
-    ended = False
-    turnstile = _turnstile(begun, limit=1000, backlog=lambda: len(begun) - done)
-
-    async def work() -> None:
-        nonlocal done
-        while not ended:
-            await asyncio.sleep(0.002)
-            done = min(done + 1, len(begun))
-
-    worker = asyncio.ensure_future(work())
-    learning = [_call(turnstile) for _ in range(PACE + 30)]
-    assert set(await asyncio.gather(*learning)) == {200}
-    while done < len(begun):  # noqa: ASYNC110 - what is waited for is counted, and no event
-        await asyncio.sleep(0.001)
-    hurried = [(b"x-request-timeout-ms", b"200")]
-    statuses = await asyncio.gather(
-        *(_call(turnstile, "/relations", hurried) for _ in range(PACE + 100))
-    )
-    ended = True
-    await worker
-    counts = Counter(statuses)
-    assert set(counts) == {200, 429}
-    assert PACE < counts[200] < PACE + 50
-
-
-@pytest.mark.anyio
-async def test_refusals_hold_up_no_tick_either() -> None:
-    turnstile = _turnstile([], limit=1)
-    statuses: list[int] = []
-    ticks: list[int] = []
-
-    async def call() -> None:
-        statuses.append(await _call(turnstile))
-
-    async def clock() -> None:
-        while len(statuses) < PACE + 200:
-            ticks.append(statuses.count(429))
-            await asyncio.sleep(0)
-
-    await asyncio.gather(*(call() for _ in range(PACE + 200)), clock())
-    assert Counter(statuses) == {200: PACE + 1, 429: 199}
-    steps = [after - before for before, after in pairwise(ticks)]
-    assert max(steps) == REFUSALS
-
-
-@pytest.mark.anyio
-async def test_what_waited_past_its_deadline_is_not_begun() -> None:
-    begun: list[str] = []
-    turnstile = _turnstile(begun, limit=100)
-
-    async def block() -> None:
-        time.sleep(0.05)  # noqa: ASYNC251 - the event loop is what is to be held up
-
-    late = [(b"x-request-timeout-ms", b"10")]
-    first = [_call(turnstile) for _ in range(PACE)]
-    *statuses, _ = await asyncio.gather(*first, _call(turnstile, "/late", late), block())
-    assert statuses == [200] * PACE + [504]
-    assert "/late" not in begun
 
 
 @pytest.mark.system

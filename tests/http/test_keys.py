@@ -9,7 +9,6 @@ from typing import Any
 import httpx
 import pytest
 
-from app.api import keys
 from tests.http.conftest import ADMIN_KEY, serve
 from tests.http.test_documentation import operations
 from tests.http.test_problems import problem
@@ -207,7 +206,7 @@ async def test_a_websocket_without_a_key_is_closed_before_it_opens(
 
 async def test_the_document_tells_where_a_key_is_needed(document: dict[str, Any]) -> None:
     schemes = document["components"]["securitySchemes"]
-    assert schemes["api-key"] == {"type": "apiKey", "in": "header", "name": keys.API_KEY}
+    assert schemes["api-key"] == {"type": "apiKey", "in": "header", "name": "X-API-Key"}
     assert schemes["api-key-as-bearer-token"] == {"type": "http", "scheme": "bearer"}
     for _, path, operation in operations(document):
         named = {name for entry in operation.get("security", ()) for name in entry}

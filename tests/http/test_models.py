@@ -15,7 +15,6 @@ import httpx
 import pytest
 
 from app.scene.relations import CANONICAL
-from app.serving.queue import Ticket
 from tests.http.conftest import ADMIN_KEY, NAMED, serve
 from tests.http.stores import VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
@@ -323,14 +322,11 @@ async def test_requests_are_answered_while_the_store_is_read(
 async def test_a_request_keeps_the_models_it_started_with(store: Path) -> None:
     async with serve(store) as client:
         runtime = client.app.state.runtime  # type: ignore[attr-defined]
-        session = runtime.session("x", Ticket(math.inf))
+        request = runtime.request(math.inf, "x")
         publish(store, "home", "2.0.0", seed=2, alias="default")
         await runtime.refresh("y")
-        assert session.models.resolve("default").reference.version == "1.0.0"
-        assert (
-            runtime.session("z", Ticket(math.inf)).models.resolve("default").reference.version
-            == "2.0.0"
-        )
+        assert request.models.resolve("default").reference.version == "1.0.0"
+        assert runtime.request(math.inf, "z").models.resolve("default").reference.version == "2.0.0"
 
 
 async def test_replaced_models_are_freed(store: Path, admin: dict[str, str]) -> None:

@@ -276,7 +276,7 @@ async def test_no_line_is_made_that_nobody_reads(
     def make(*_: Any) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("app.serving.record.RequestRecord.known", make)
+    monkeypatch.setattr("app.serving.request.Record.known", make)
     with caplog.at_level(logging.WARNING, "app.access"):
         assert (await client.post("/missing", json=SCENE)).status_code == 200
     assert lines(caplog) == []

@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from app.scene.relations import CANONICAL, opposite
-from app.serving.answers import significant
+from app.serving.rounding import significant
 from scene_client.schemas import (
     GenerateAnswer,
     MissingAnswer,

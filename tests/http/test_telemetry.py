@@ -89,7 +89,8 @@ async def test_a_request_is_a_span_named_by_its_route(
         for span in exporter.get_finished_spans()
         if span.parent and first.context and span.parent.span_id == first.context.span_id
     }
-    assert "fastapi.endpoint" in children
+    # The questions are not resolved by the framework, so it has no spans of their parts.
+    assert children == set()
     assert MARKER not in "".join(span.to_json() for span in exporter.get_finished_spans())
 
 

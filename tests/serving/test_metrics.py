@@ -9,9 +9,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from app.registry import AliasTarget, Artifact, Store, load_model_set
-from app.serving.metrics import Metrics, Unmeasured
+from app.serving.admission import Backlog, Threads, WorkQueue
+from app.serving.metrics import Metrics
 from app.serving.models import ServedModel, ServedModels
-from app.serving.queue import Threads, WorkQueue
 from tests.http.stores import make_store
 
 
@@ -24,7 +24,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> ServedModels:
 def unwarmed(root: Path) -> ServedModels:
     store = load_model_set(Store(root))
     served = {
-        key: ServedModel(artifact, {}, WorkQueue(limit=8, threads=Threads()))
+        key: ServedModel(artifact, WorkQueue(8, Threads(), Backlog(8)))
         for key, artifact in store.entries.items()
         if isinstance(artifact, Artifact)
     }
@@ -105,12 +105,9 @@ def test_a_moved_alias_leaves_no_trace(models: ServedModels) -> None:
 def test_series_of_a_removed_model_go_away_and_stay_away(models: ServedModels) -> None:
     metrics = Metrics()
     metrics.serving(models)
-    old = models.served["plain", "1.0.0"].reference
-    kept = models.served["home", "1.0.0"].reference
-    for model in (old, kept):
-        metrics.waited(model, 0.001)
-        metrics.computed(model, "missing", 3, 0.002)
-        metrics.pending(model, 5)
+    old = "plain", "1.0.0"
+    for key in (old, ("home", "1.0.0")):
+        metrics.computed(key, "missing", 3, 0.001, 0.002)
 
     def names(of: str) -> set[str]:
         return {key[0] for key in samples(metrics) if of in key}
@@ -123,31 +120,29 @@ def test_series_of_a_removed_model_go_away_and_stay_away(models: ServedModels) -
     assert names("plain") == set()
     assert names("home") == everything
     # A request that still holds the old snapshot reports late.
-    metrics.waited(old, 0.001)
-    metrics.computed(old, "missing", 1, 0.002)
-    metrics.pending(old, 1)
+    metrics.computed(old, "missing", 1, 0.001, 0.002)
     assert names("plain") == set()
     metrics.serving(models)
-    metrics.computed(old, "missing", 1, 0.002)
+    metrics.computed(old, "missing", 1, 0.001, 0.002)
     assert samples(metrics)["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
 
 
 def test_what_a_model_did_is_told_by_question(models: ServedModels) -> None:
     metrics = Metrics()
     metrics.serving(models)
-    model = models.served["home", "1.0.0"].reference
-    metrics.waited(model, 0.001)
-    metrics.computed(model, "relations", 8, 0.25)
-    metrics.computed(model, "relations", 2, 0.05)
-    metrics.pending(model, 17)
-    metrics.serialised(0.5)
+    key = "home", "1.0.0"
+    metrics.computed(key, "relations", 8, 0.0, 0.25)
+    metrics.computed(key, "relations", 2, 0.001, 0.05)
+    models.served[key].queue.take(7)
+    metrics.answered("/relations", "POST", "success", 1.0, 0.5)
     found = samples(metrics)
     label = ("home", "relations", "1.0.0")
     assert found["scene_compute_duration_seconds_sum", *label] == pytest.approx(0.3)
     assert found["scene_batch_rows_sum", *label] == 10
     assert found["scene_batch_rows_count", *label] == 2
     assert found["scene_queue_duration_seconds_sum", "home", "1.0.0"] == pytest.approx(0.001)
-    assert found["scene_pending_rows", "home", "1.0.0"] == 17
+    assert found["scene_pending_rows", "home", "1.0.0"] == 7
+    models.served[key].queue.give_back(7)
     assert found["scene_serialisation_duration_seconds_sum",] == 0.5
 
 
@@ -169,24 +164,6 @@ def test_applications_do_not_share_what_they_count() -> None:
     first, second = Metrics(), Metrics()
     first.answered("/missing", "POST", "success", 0.1)
     assert not any(key[0] == "scene_requests_total" for key in samples(second))
-
-
-def test_nothing_counts_where_nothing_is_to_be_measured(models: ServedModels) -> None:
-    silent = Unmeasured()
-    model = models.served["home", "1.0.0"].reference
-    silent.started()
-    silent.serving(models)
-    silent.answered("/missing", "POST", "success", 0.1)
-    silent.entry_answered("missing", "success")
-    silent.waited(model, 0.1)
-    silent.computed(model, "missing", 1, 0.1)
-    silent.pending(model, 1)
-    silent.serialised(0.1)
-    silent.reloaded("refresh", "success")
-    assert silent.exposition() == b""
-    # Whatever can be told to the one can be told to the other.
-    public = {name for name in vars(Metrics) if not name.startswith("_")}
-    assert public <= set(vars(Unmeasured))
 
 
 def test_the_documentation_lists_every_metric(repository: Path) -> None:

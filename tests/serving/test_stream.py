@@ -17,11 +17,10 @@ from hypothesis import strategies as st
 from app.serving import questions
 from app.serving.answers import written
 from app.serving.errors import DeadlinePassedError, RequestError, UnknownModelError
-from app.serving.metrics import Unmeasured
-from app.serving.queue import Ticket
+from app.serving.metrics import Metrics
 from app.serving.reading import Limits
+from app.serving.request import Request
 from app.serving.runtime import Runtime
-from app.serving.session import Session
 from app.serving.stream import Streams, StreamScene, TokenBucket
 from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest
 from scene_client.stream_messages import Open, Update, Whole
@@ -37,11 +36,11 @@ class Service:
 
     def __init__(self, store: Path, limits: Limits | None = None) -> None:
         self.runner = asyncio.Runner()
-        self.runtime = Runtime(store, limits or Limits(), 256, Unmeasured(), poll=0)
+        self.runtime = Runtime(store, limits, queue_rows=256)
         self.runner.run(self.runtime.start())
 
-    def view(self) -> Session:
-        return self.runtime.session("request", Ticket(monotonic() + 60))
+    def view(self) -> Request:
+        return self.runtime.request(monotonic() + 60, "request")
 
     def answer(self, scene: StreamScene) -> dict[str, Any]:
         message, errors = self.runner.run(scene.answer(self.view()))
@@ -262,7 +261,7 @@ def test_a_late_answer_covers_its_messages(service: Service) -> None:
     stream = StreamScene()
     service.take(stream, type="open", objects=["bed"])
     service.take(stream, type="update", seq=1, objects=["lamp"])
-    late = service.runtime.session("request", Ticket(monotonic() - 1))
+    late = service.runtime.request(monotonic() - 1, "request")
     message, errors = service.runner.run(stream.answer(late))
     assert message == {"type": "answer", "seq": 1, "superseded": 0}
     assert {name: type(error) for name, error in errors.items()} == {
@@ -339,7 +338,7 @@ def test_a_rate_limit_lets_bursts_pass_and_slows_the_rest(monkeypatch: pytest.Mo
 
 
 def test_places_are_counted_and_drained_once() -> None:
-    streams = Streams(2, Unmeasured())
+    streams = Streams(2, Metrics())
     ended: list[str] = []
     with streams.place(lambda: ended.append("first")):
         assert not streams.is_full

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from scene_client.asynchronous import AsyncClient
-from scene_client.errors import (
-    AnswerError,
-    ClientError,
-    DeadlineError,
-    InvalidRequestError,
-    ProblemError,
-    UnreachableError,
-)
-from scene_client.offline import OfflineClient
-from scene_client.stream import StreamClient, StreamClosedError, StreamProblemError
-from scene_client.sync import Client
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from scene_client.asynchronous import AsyncClient
+    from scene_client.errors import (
+        AnswerError,
+        ClientError,
+        DeadlineError,
+        InvalidRequestError,
+        ProblemError,
+        UnreachableError,
+    )
+    from scene_client.offline import OfflineClient
+    from scene_client.stream import StreamClient, StreamClosedError, StreamProblemError
+    from scene_client.sync import Client
 
 __version__ = "1.0.0"
 
@@ -31,3 +35,20 @@ __all__ = [
     "StreamProblemError",
     "UnreachableError",
 ]
+
+# Imported when first asked for: the service needs the schemas alone, and starts faster without
+# httpx and websockets.
+_MODULES = {
+    "AsyncClient": "asynchronous",
+    "Client": "sync",
+    "OfflineClient": "offline",
+    "StreamClient": "stream",
+    "StreamClosedError": "stream",
+    "StreamProblemError": "stream",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES.get(name, 'errors')}"), name)

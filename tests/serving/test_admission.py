@@ -1,4 +1,4 @@
-"""The queue of one model: order, bounds, deadlines, and what runs where."""
+"""Admission: when requests begin; order, bounds and deadlines of the work of one model."""
 
 from __future__ import annotations
 
@@ -7,15 +7,26 @@ import gc
 import math
 import threading
 import weakref
+from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
 from functools import partial
+from itertools import pairwise
 from time import monotonic, sleep, thread_time
 from typing import Any
 
 import pytest
 
+from app.serving.admission import (
+    CHEAP,
+    PACE,
+    REFUSALS,
+    Backlog,
+    Done,
+    Threads,
+    Ticket,
+    WorkQueue,
+)
 from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
-from app.serving.queue import CHEAP, Done, Threads, Ticket, WorkQueue
 
 pytestmark = pytest.mark.anyio
 
@@ -31,7 +42,7 @@ def threads() -> Iterator[Threads]:
 
 @pytest.fixture
 async def queue(threads: Threads) -> WorkQueue:
-    queue = WorkQueue(limit=8, threads=threads)
+    queue = WorkQueue(8, threads, Backlog(8))
 
     def busy() -> None:
         end = thread_time() + 10 * CHEAP
@@ -103,7 +114,7 @@ async def test_one_failure_is_one_request_s(queue: WorkQueue, ask: Any) -> None:
     )
     assert isinstance(results[0], ZeroDivisionError)
     assert results[1].result == "fine"
-    assert queue.backlog == 0
+    assert queue.backlog.pending == 0
 
 
 @pytest.mark.parametrize("ask", WAYS)
@@ -146,10 +157,10 @@ async def test_questions_are_counted_until_they_are_answered_and_drawings_are_no
         for _ in "ab"
     ]
     await asyncio.sleep(0)
-    assert queue.backlog == 2
+    assert queue.backlog.pending == 2
     release.set()
     await asyncio.gather(*waiting)
-    assert queue.backlog == 0
+    assert queue.backlog.pending == 0
 
 
 async def test_questions_of_streams_give_way_and_hold_up_no_request(queue: WorkQueue) -> None:
@@ -157,7 +168,7 @@ async def test_questions_of_streams_give_way_and_hold_up_no_request(queue: WorkQ
 
     async def ask(name: str, *, gives_way: bool) -> None:
         def note() -> None:
-            order.append(f"{name}, {queue.backlog} counted")
+            order.append(f"{name}, {queue.backlog.pending} counted")
 
         await queue.run(note, ENDLESS, kind="cheap", size=1, gives_way=gives_way)
 
@@ -168,7 +179,7 @@ async def test_questions_of_streams_give_way_and_hold_up_no_request(queue: WorkQ
     )
     # All of one tick: the request is first, and alone is counted.
     assert order == ["request, 1 counted", "stream 1, 1 counted", "stream 2, 1 counted"]
-    assert queue.backlog == 0
+    assert queue.backlog.pending == 0
 
 
 async def test_costly_questions_of_streams_let_requests_go_first(queue: WorkQueue) -> None:
@@ -295,7 +306,7 @@ async def test_a_drawing_hears_that_it_was_given_up(queue: WorkQueue) -> None:
 def took(queue: WorkQueue, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Ask a question that takes so long; whether the event loop was held up by it."""
     now = 0.0
-    monkeypatch.setattr("app.serving.queue.thread_time", lambda: now)
+    monkeypatch.setattr("app.serving.admission.thread_time", lambda: now)
 
     async def took(seconds: float, *, size: int, kind: str = "q") -> bool:
         def job() -> str:
@@ -356,7 +367,7 @@ async def test_no_model_waits_for_the_costly_work_of_another(
 ) -> None:
     release = threading.Event()
     costly = [asyncio.ensure_future(in_thread(queue, lambda: release.wait(30))) for _ in range(8)]
-    other = WorkQueue(limit=8, threads=threads)
+    other = WorkQueue(8, threads, Backlog(8))
     # Only its answer lets them end.
     assert (await in_thread(other, lambda: "fine")).result == "fine"
     assert not any(job.done() for job in costly)
@@ -400,7 +411,7 @@ async def test_waiting_and_computing_are_told_apart(
     queue: WorkQueue, monkeypatch: pytest.MonkeyPatch, ask: Any
 ) -> None:
     now = 0.0
-    monkeypatch.setattr("app.serving.queue.monotonic", lambda: now)
+    monkeypatch.setattr("app.serving.admission.monotonic", lambda: now)
 
     def job() -> None:
         nonlocal now
@@ -421,3 +432,144 @@ async def test_a_request_that_is_cancelled_leaves_the_queue_in_order(queue: Work
     waiting.cancel()
     assert (await queue.run(lambda: 2, ENDLESS, kind="q", size=1)).result == 2
     assert not begun
+
+
+# ---------------------------------------------------------------------------------- the backlog
+
+
+async def enter(
+    backlog: Backlog,
+    begun: list[str],
+    name: str = "-",
+    allowed: float = 10.0,
+    *,
+    is_pending: bool = False,
+) -> str:
+    """What becomes of a request that enters; its work may be pending from then on."""
+    try:
+        await backlog.enter(allowed, monotonic() + allowed)
+    except (QueueFullError, DeadlinePassedError) as error:
+        return type(error).__name__
+    begun.append(name)
+    backlog.pending += is_pending
+    return "begun"
+
+
+FULL, LATE = "QueueFullError", "DeadlinePassedError"
+
+
+async def test_requests_of_one_moment_begin_a_few_in_a_tick_and_in_order() -> None:
+    backlog = Backlog(1000)
+    begun: list[str] = []
+    ticks: list[int] = []
+
+    async def clock() -> None:
+        while len(begun) < 300:
+            ticks.append(len(begun))
+            await asyncio.sleep(0)
+
+    names = [f"/{number}" for number in range(300)]
+    *outcomes, _ = await asyncio.gather(*(enter(backlog, begun, name) for name in names), clock())
+    assert outcomes == ["begun"] * 300
+    assert begun == names
+    steps = [after - before for before, after in pairwise(ticks)]
+    assert max(steps) <= PACE
+    # Without others a request begins at once.
+    assert await enter(backlog, begun) == "begun"
+
+
+async def test_a_full_backlog_refuses() -> None:
+    backlog = Backlog(10)
+    outcomes = await asyncio.gather(*(enter(backlog, []) for _ in range(PACE + 10 + 5)))
+    assert outcomes == ["begun"] * (PACE + 10) + [FULL] * 5
+
+
+async def test_no_more_requests_begin_than_the_models_keep_up_with() -> None:
+    backlog = Backlog(1000)
+    begun: list[str] = []
+    done = 0
+    pending: list[int] = []
+
+    async def work() -> None:
+        nonlocal done
+        while done < 300:
+            pending.append(backlog.pending)
+            ready = min(3, backlog.pending)
+            done += ready
+            backlog.pending -= ready
+            await asyncio.sleep(0)
+
+    requests = (enter(backlog, begun, is_pending=True) for _ in range(300))
+    *outcomes, _ = await asyncio.gather(*requests, work())
+    assert outcomes == ["begun"] * 300
+    assert max(pending) == PACE
+
+
+async def test_a_request_that_would_spend_its_time_waiting_is_refused_at_once() -> None:
+    backlog = Backlog(100)
+    begun: list[str] = []
+    backlog.pending = PACE
+    first = asyncio.ensure_future(enter(backlog, begun, "first"))
+    await asyncio.sleep(0.02)
+    assert await enter(backlog, begun, "hurried", 0.03) == FULL
+    patient = asyncio.ensure_future(enter(backlog, begun, "patient"))
+    await asyncio.sleep(0)
+    backlog.pending = 0
+    assert await first == await patient == "begun"
+    assert begun == ["first", "patient"]
+
+
+async def test_the_measured_pace_decides_how_long_the_backlog_gets() -> None:
+    """At 2 ms each, a request with 200 ms may wait behind some 25 others, and not behind 100."""
+    backlog = Backlog(1000)
+    ended = False
+
+    async def work() -> None:
+        while not ended:
+            await asyncio.sleep(0.002)
+            backlog.pending -= min(1, backlog.pending)
+
+    worker = asyncio.ensure_future(work())
+    learning = [enter(backlog, [], is_pending=True) for _ in range(PACE + 30)]
+    assert set(await asyncio.gather(*learning)) == {"begun"}
+    while backlog.pending:  # noqa: ASYNC110 - a count is waited for, and no event
+        await asyncio.sleep(0.001)
+    hurried = [enter(backlog, [], allowed=0.2, is_pending=True) for _ in range(PACE + 100)]
+    counts = Counter(await asyncio.gather(*hurried))
+    ended = True
+    await worker
+    assert set(counts) == {"begun", FULL}
+    assert PACE < counts["begun"] < PACE + 50
+
+
+async def test_refusals_hold_up_no_tick_either() -> None:
+    backlog = Backlog(1)
+    outcomes: list[str] = []
+    ticks: list[int] = []
+
+    async def call() -> None:
+        outcomes.append(await enter(backlog, []))
+
+    async def clock() -> None:
+        while len(outcomes) < PACE + 200:
+            ticks.append(outcomes.count(FULL))
+            await asyncio.sleep(0)
+
+    await asyncio.gather(*(call() for _ in range(PACE + 200)), clock())
+    assert Counter(outcomes) == {"begun": PACE + 1, FULL: 199}
+    steps = [after - before for before, after in pairwise(ticks)]
+    assert max(steps) == REFUSALS
+
+
+async def test_a_request_that_waited_past_its_deadline_does_not_begin() -> None:
+    backlog = Backlog(100)
+    begun: list[str] = []
+
+    async def block() -> None:
+        sleep(0.05)  # noqa: ASYNC251 - the event loop is what is to be held up
+
+    first = [enter(backlog, begun) for _ in range(PACE)]
+    late = enter(backlog, begun, "late", 0.01)
+    *outcomes, _ = await asyncio.gather(*first, late, block())
+    assert outcomes == ["begun"] * PACE + [LATE]
+    assert "late" not in begun

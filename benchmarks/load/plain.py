@@ -1,0 +1,49 @@
+"""``python -m benchmarks.load.plain PORT``: the yardstick, a plain FastAPI app.
+
+It validates the same requests with the same models and sends a prepared answer. It has no model, no
+middleware, no metrics and no log.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import uvicorn
+from fastapi import FastAPI, Request, Response
+
+from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest
+
+app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+_answers: dict[str, bytes] = {}
+
+
+@app.put("/answers/{question}")
+async def prepare(question: str, request: Request) -> None:
+    """Keep the body as the answer to a question."""
+    _answers[question] = await request.body()
+
+
+@app.post("/relations")
+async def relations(_: RelationsRequest) -> Response:
+    return Response(_answers["relations"], media_type="application/json")
+
+
+@app.post("/missing")
+async def missing(_: MissingRequest) -> Response:
+    return Response(_answers["missing"], media_type="application/json")
+
+
+@app.post("/outliers")
+async def outliers(_: OutliersRequest) -> Response:
+    return Response(_answers["outliers"], media_type="application/json")
+
+
+@app.get("/health/ready")
+async def ready() -> dict[str, str]:
+    return {"status": "ready"}
+
+
+if __name__ == "__main__":
+    uvicorn.run(
+        app, port=int(sys.argv[1]), http="httptools", access_log=False, log_level="critical"
+    )

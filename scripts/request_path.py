@@ -1,0 +1,115 @@
+"""``python -m scripts.request_path``: the files and functions of ours that one request passes.
+
+Counted are Python functions of `app` and `scene_client` that run for one warm request in process,
+with the loops that they compile. Generated methods and comprehensions are part of their function.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from numba.core.dispatcher import Dispatcher
+
+from app.main import create_app
+from app.settings import Settings
+
+ROOT = Path(__file__).resolve().parent.parent
+OURS = (f"{ROOT / 'app'}/", f"{ROOT / 'clients'}/")
+INSIDE = {"<listcomp>", "<genexpr>", "<setcomp>", "<dictcomp>", "<lambda>"}
+SCENE = {
+    "objects": ["bed", "lamp", "chair", "desk", "pillow", "book", "sofa", "table", "sink",
+                "toilet", "cabinet", "window"]
+}  # fmt: skip
+
+
+async def ask(app: Any, path: str, body: bytes) -> int:
+    """Send one request to an application; the status of its answer."""
+    statuses: list[int] = []
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    async def send(message: dict[str, Any]) -> None:
+        statuses.append(message.get("status", 0))
+
+    headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
+    scope = {
+        "type": "http", "method": "POST", "path": path, "raw_path": path.encode(),
+        "query_string": b"", "root_path": "", "scheme": "http", "headers": headers, "state": {},
+    }  # fmt: skip
+    await app(scope, receive, send)
+    return statuses[0]
+
+
+@contextmanager
+def compiled_calls(found: set[tuple[str, str]]) -> Iterator[None]:
+    """Note the compiled functions that Python calls, which a profiler does not see."""
+    replaced: list[tuple[Any, str, Any]] = []
+    for module in [m for name, m in sys.modules.items() if name.startswith("app.")]:
+        for name, value in list(vars(module).items()):
+            if isinstance(value, Dispatcher):
+                replaced.append((module, name, value))
+                setattr(module, name, noted(value, found))
+    try:
+        yield
+    finally:
+        for module, name, value in replaced:
+            setattr(module, name, value)
+
+
+def noted(loop: Any, found: set[tuple[str, str]]) -> Callable[..., Any]:
+    code = loop.py_func.__code__
+
+    @wraps(loop.py_func)
+    def call(*args: Any) -> Any:
+        found.add((str(Path(code.co_filename).relative_to(ROOT)), code.co_name))
+        return loop(*args)
+
+    return call
+
+
+async def passed(path: str, body: bytes, requests: int = 20) -> set[tuple[str, str]]:
+    """(file, function) of everything that one request passes."""
+    app = create_app(Settings())
+    found: set[tuple[str, str]] = set()
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(OURS) and code.co_name not in INSIDE:
+            found.add((str(Path(code.co_filename).relative_to(ROOT)), code.co_qualname))
+
+    async with app.router.lifespan_context(app):
+        for _ in range(requests):
+            assert await ask(app, path, body) == 200
+        with compiled_calls(found):
+            sys.setprofile(note)
+            try:
+                await ask(app, path, body)
+            finally:
+                sys.setprofile(None)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("path", nargs="?", default="/missing")
+    path = parser.parse_args().path
+    found = sorted(asyncio.run(passed(path, json.dumps(SCENE).encode())))
+    files = sorted({file for file, _ in found})
+    for file in files:
+        names = ", ".join(name for other, name in found if other == file)
+        sys.stdout.write(f"{file}: {names}\n")
+    sys.stdout.write(f"one {path}: {len(files)} files, {len(found)} functions\n")
+
+
+if __name__ == "__main__":
+    main()
