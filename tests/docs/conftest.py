@@ -1,4 +1,4 @@
-"""A copy of the repository with the service running in it, as a new engineer would have it."""
+"""A copy of the repository and a running service, as a new engineer would have them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LEFT_OUT = shutil.ignore_patterns(
 
 @dataclass(frozen=True)
 class Workplace:
-    """A copy of the repository, and the service that `make run` started in it."""
+    """A copy of the repository, and the service that `make run` started."""
 
     folder: Path
     address: str
@@ -42,9 +42,10 @@ def workplace(
     tmp_path_factory: pytest.TempPathFactory,
     require_system_tool: Callable[[str], Path],
 ) -> Iterator[Workplace]:
-    """`make run` in a fresh copy of the repository.
+    """`make run`, and a fresh copy of the repository for the commands of the pages.
 
-    All is as in a checkout but for `.venv`, see `install`; compiled loops are copied too.
+    All in the copy is as in a checkout but for `.venv`, see `install`. The service runs from the
+    repository itself: numba's cache belongs to a path, and a copy would compile for a minute.
     """
     for tool in ("make", "curl", "bash"):
         require_system_tool(tool)
@@ -58,8 +59,8 @@ def workplace(
     log = folder.parent / "log"
     with log.open("w") as stream:
         process = subprocess.Popen(
-            ["make", "run", f"PORT={port}"],
-            cwd=folder,
+            ["make", "run", f"PORT={port}", f"VENV={folder / '.venv'}"],
+            cwd=repository,
             env=place.environment,
             stdout=stream,
             stderr=subprocess.STDOUT,
