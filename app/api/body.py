@@ -1,4 +1,4 @@
-"""Strict reading of JSON bodies; docs/decisions says why each leniency is refused."""
+"""Strict reading of JSON bodies; docs/decisions/http.md says why each leniency is refused."""
 
 from __future__ import annotations
 
