@@ -11,13 +11,19 @@ import torch
 
 from app.registry import Thresholds
 from tests.reasoning.artifacts import LARGER, artifact_of
-from tests.training.evaluation.scenes import flat, knowing, random_scenes, scene, tensors
-from tests.training.evaluation.test_completion import larger_machine
+from tests.training.evaluation.scenes import (
+    flat,
+    knowing,
+    larger_machine,
+    random_scenes,
+    scene,
+    tensors,
+)
 from training.batches import seen_triples
 from training.evaluation.answers import QUESTIONS
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.cases import some_scenes
-from training.evaluation.contenders import Contender, artifact_contender, machine_contender
+from training.evaluation.contenders import Contender, artifact_contender
 from training.evaluation.density import DensitySettings
 from training.evaluation.report import (
     SourceReport,
@@ -103,7 +109,9 @@ def test_a_report_goes_on_with_the_same_questions_alone(tmp_path):
 @pytest.mark.parametrize("name", LARGER)
 def test_scenes_that_hold_no_question_have_no_outcome(name):
     """A source without relations, and scenes of one class: nothing is asked, nothing fails."""
-    contender = machine_contender(larger_machine(name), TRAIN, EFFORT)
+    contender = artifact_contender(
+        artifact_of(larger_machine(name)), TRAIN, EFFORT, calibrated=False
+    )
     asked = [task for task in TASKS if task.startswith(("T1", "T2", "T3"))]
     silent = Setting(tensors([scene([k]) for k in range(3)], V), NO_STRUCTURE, TRAIN, SEEN)
     report = SourceReport("silent", digest(silent))
