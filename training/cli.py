@@ -38,12 +38,12 @@ from training.experiments.ablate import ablate
 from training.experiments.benchmark import benchmark
 from training.experiments.compare import Comparison, compare_command, show
 from training.experiments.gate import MARGIN, WorseError, judge, seat
+from training.experiments.tune import tune
 from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run
 from training.runs import FinishedRun, RunError, load_run, save_run
 from training.trainer import Trainer, subset
-from training.tuning.command import tune
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 app.command()(example)

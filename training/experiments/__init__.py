@@ -1,4 +1,4 @@
-"""Rows × tasks: what `python -m training benchmark`, `ablate` and `compare` run.
+"""Rows × tasks: what `python -m training benchmark`, `ablate`, `compare` and `tune` run.
 
 A row can be asked the tasks of `training.evaluation`: a trained machine, a baseline, one of two
 models side by side. Every command measures rows (measure.py), summarises them with bootstrap
@@ -11,6 +11,7 @@ plots.py        plots beside the tables
 benchmark.py    all baselines and machines on the same scenes; the seed protocol; shuffled scenes
 ablate.py       a configuration and the same with one thing changed
 compare.py      two models on scenes that neither has learnt from
+tune.py         settings searched on validation scenes
 sides.py        the two models of a comparison
 heldout.py      scenes that neither of two models has learnt from
 translation.py  a model asked in another model's classes
