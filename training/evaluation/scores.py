@@ -28,9 +28,14 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
         for row, padded in enumerate(batch.classes):
             n = int((padded >= 0).sum())
             scene, first = _instances(padded[:n], batch.counts[row, :n])
-            triples = stated[row].nonzero().tolist()
-            told = tuple((a, int(first[x]), int(first[y])) for a, x, y in triples)
-            scene = Scene(scene.objects, told or None)
+            told = set(map(tuple, stated[row].nonzero().tolist()))
+            # a(x, y) and a(y, x) both hold of classes where they hold of different instances.
+            last = first + batch.counts[row, :n].clamp(min=1) - 1
+            triples = [
+                (a, *(last[[x, y]] if (a, y, x) in told and x > y else first[[x, y]]).tolist())
+                for a, x, y in sorted(told)
+            ]
+            scene = Scene(scene.objects, tuple(triples) or None)
             values = posterior(artifact, scene).relation_log_odds()
             found[row, : len(values), :n, :n] = torch.from_numpy(values)
         return found

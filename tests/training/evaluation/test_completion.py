@@ -8,19 +8,22 @@ import pytest
 import torch
 
 from app.scene import ObjectClass, Vocabulary
+from tests.reasoning.artifacts import artifact_of
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,
     WIDE_STRUCTURE,
     flat,
     knowing,
+    larger_machine,
     random_scenes,
     scene,
     tensors,
 )
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
 from training.evaluation.completion import complete_scenes
-from training.evaluation.relations import rank
+from training.evaluation.relations import rank, telling
+from training.evaluation.scores import relation_score
 
 DATA = tensors(random_scenes(20), WIDE)
 
@@ -99,3 +102,17 @@ def test_the_split_depends_on_the_scene_alone():
     assert [entry.key.tolist() for entry in whole] == [entry.key.tolist() for entry in alone]
     other = complete_scenes(DATA, WIDE_STRUCTURE, flat, seed=1)
     assert [x.key.tolist() for x in whole] != [x.key.tolist() for x in other]
+
+
+def test_classes_related_both_ways_are_stated_of_different_instances():
+    """Two lamps on either side of a bed: left(lamp, bed) and left(bed, lamp) hold of classes."""
+    artifact = artifact_of(larger_machine("triway-local"))
+    both = scene([0, 1, 1], [(0, 0, 1), (0, 1, 0)])
+    data = tensors([both, scene([0, 1, 1], [(0, 0, 1)])], artifact.spec.V)
+    batch = data.batch(torch.arange(2))
+    told = telling(batch, batch.holds > 0)
+    values = relation_score(artifact, given=True)(told)
+    blind = relation_score(artifact, given=False)(told)
+    assert torch.isfinite(values).all()
+    assert not torch.allclose(values[0], values[1])
+    torch.testing.assert_close(blind[0], blind[1])

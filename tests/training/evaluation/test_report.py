@@ -27,7 +27,6 @@ from training.evaluation.contenders import Contender, artifact_contender
 from training.evaluation.density import DensitySettings
 from training.evaluation.report import (
     SourceReport,
-    compare,
     digest,
     evaluate,
     measure,
@@ -183,23 +182,6 @@ def test_pooled_sources_are_their_union():
     for _ in run(CONTENDER, setting, whole, tasks=("T1a relations", "T3 outliers, uniform")):
         pass
     assert values_of(together) == pytest.approx(values_of(whole))
-
-
-def test_two_contenders_are_compared_scene_by_scene():
-    ignorant = Contender(objects=flat_objects, relations=flat)
-    reports = []
-    for contender in (CONTENDER, ignorant):
-        report = SourceReport("toy", digest(SETTING))
-        for _ in run(contender, SETTING, report, tasks=("T1a relations", "T2 missing")):
-            pass
-        reports.append(report)
-    rows = {(row.task, row.metric): row.figure for row in compare(*reports)}
-    values = [report.outcomes["T2 missing"].metrics["MRR"].value for report in reports]
-    assert rows["T2 missing", "MRR"].value == pytest.approx(values[0] - values[1])
-    same = compare(reports[0], reports[0])
-    assert all(row.figure.low == row.figure.high == 0 for row in same)
-    with pytest.raises(ValueError, match="different questions"):
-        compare(reports[0], replace(reports[1], scenes="others"))
 
 
 def test_references_stand_on_either_side():
