@@ -56,7 +56,11 @@ def build(
     routes = (*questions.router.routes, *batches.router.routes)
     asked = [route for route in routes if isinstance(route, JSONRoute)]
     # Where requests are traced, the framework must see the route.
-    direct = {} if settings.opentelemetry else {route.path: route for route in asked}
+    direct = (
+        {}
+        if settings.opentelemetry
+        else {settings.root_path + route.path: route for route in asked}
+    )
     app.add_middleware(Gateway, settings=settings, runtime=runtime, direct=direct)
     app.router.routes.extend(asked)
     for router in (
