@@ -82,6 +82,7 @@ def test_training_imports_nothing_that_only_checks_need():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", SHAPES)
 def test_from_rooms_to_answers(tmp_path, variant):
     H2, K = SHAPES[variant]

@@ -12,6 +12,8 @@ from training.experiments.ablate import PRIMARY
 from training.runs import load_run
 from training.trainer import Trainer
 
+pytestmark = pytest.mark.slow
+
 CONFIG = """
 name = "rooms-triway"
 [data]

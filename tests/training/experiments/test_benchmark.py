@@ -31,6 +31,8 @@ from training.experiments.rows import Material, Row, baseline_rows
 from training.runs import load_run
 from training.trainer import Trainer
 
+pytestmark = pytest.mark.slow
+
 CONFIG = """
 name = "rooms-{variant}"
 [data]
