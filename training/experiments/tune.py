@@ -227,10 +227,11 @@ class Search:
             ConfigError: the folder holds a search over another configuration or other scenes.
         """
         import optuna
+        from optuna.storages.journal import JournalFileBackend
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.folder.mkdir(parents=True, exist_ok=True)
-        backend = optuna.storages.journal.JournalFileBackend(str(self.folder / "study.log"))
+        backend = JournalFileBackend(str(self.folder / "study.log"))
         warm_up = math.ceil(self.config.training.epochs * _WARM_UP) - 1
         study = optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
@@ -259,13 +260,12 @@ class Search:
 
         if not study.trials:
             study.enqueue_trial({}, user_attrs={"as it is": True})
-        for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        for halted in study.get_trials(states=(TrialState.RUNNING,)):
             # Stopped in the middle: its checkpoint lies in its folder.
-            study.enqueue_trial(
-                trial.params, user_attrs={"as it is": "as it is" in trial.user_attrs}
-            )
-            study.tell(trial.number, state=TrialState.FAIL)
-        while sum("settings" in trial.user_attrs for trial in study.trials) < trials:
+            original = halted.user_attrs.get("as it is", False)
+            study.enqueue_trial(halted.params, user_attrs={"as it is": original})
+            study.tell(halted.number, state=TrialState.FAIL)
+        while sum("settings" in known.user_attrs for known in study.trials) < trials:
             trial = study.ask()
             original = trial.user_attrs.get("as it is", False)
             settings = {} if original else _suggested(trial, self.space)
