@@ -260,13 +260,12 @@ class Search:
 
         if not study.trials:
             study.enqueue_trial({}, user_attrs={"as it is": True})
-        for stopped in study.get_trials(states=(TrialState.RUNNING,)):
-            # Its checkpoint lies in its folder.
-            study.enqueue_trial(
-                stopped.params, user_attrs={"as it is": "as it is" in stopped.user_attrs}
-            )
-            study.tell(stopped.number, state=TrialState.FAIL)
-        while sum("settings" in trial.user_attrs for trial in study.trials) < trials:
+        for halted in study.get_trials(states=(TrialState.RUNNING,)):
+            # Stopped in the middle: its checkpoint lies in its folder.
+            original = halted.user_attrs.get("as it is", False)
+            study.enqueue_trial(halted.params, user_attrs={"as it is": original})
+            study.tell(halted.number, state=TrialState.FAIL)
+        while sum("settings" in known.user_attrs for known in study.trials) < trials:
             trial = study.ask()
             original = trial.user_attrs.get("as it is", False)
             settings = {} if original else _suggested(trial, self.space)
