@@ -246,7 +246,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     },
     "health_live": {"status": "live"},
     "health_ready": {"status": "ready"},
-    "server_metadata": {"name": "scene-boltzmann", "version": "0.1.0", "extensions": []},
+    "server_metadata": {"name": "scene-boltzmann", "version": "1.0.0", "extensions": []},
     "server_live": {"live": True},
     "server_ready": {"ready": True},
     "model_metadata": {

@@ -30,7 +30,7 @@ from training.domain.look import Facts, look
 MINIMA: Final = (8, 5, 3, 2)
 COVERED: Final = 0.97
 _TABLE: Final = (2, 3, 5, 8, 16, 30)
-# What a larger vocabulary costs is told in docs/scaling.md.
+# What a larger vocabulary costs is told in docs/benchmarks.md.
 _MOST_CLASSES: Final = 2000
 _SPLIT_SEEDS: Final = 50
 # Shares of the parts that are near enough to what was asked for.
