@@ -12,6 +12,7 @@ MINUTES ?= 10
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadscope
 INDEX := $(if $(TORCH_INDEX_URL),--extra-index-url $(TORCH_INDEX_URL))
 
 # A stamp says that the environment holds what its lock file asks for; it is made anew when the lock
@@ -20,16 +21,26 @@ SERVICE := $(VENV)/.installed-service
 EVERYTHING := $(VENV)/.installed-everything
 
 .DEFAULT_GOAL := help
-.PHONY: help run test docs chaos soak audit setup format bench lock clean
+.PHONY: checks help run test test-fast test-slow docs chaos soak audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
 
 run: $(SERVICE)  ## serve the shipped models on 127.0.0.1 (PORT=8000)
 	SCENE_HOST=127.0.0.1 SCENE_PORT=$(PORT) exec $(BIN)/python -m app
 
-test: $(EVERYTHING)  ## lint, format, types, import rules, then the tests
+test: checks  ## lint, format, types, import rules, then all tests but the slow ones
+	$(PYTEST) -m "not slow" $(ARGS)
+
+test-slow: $(EVERYTHING)  ## the slow tests: training runs from end to end (minutes)
+	$(BIN)/python -m app.compile
+	$(PYTEST) -m slow $(ARGS)
+
+test-fast: checks  ## lint, format, types, import rules, then the tests of mathematics and scenes
+	$(PYTEST) -m "not slow" tests/boltzmann tests/enumeration tests/registry tests/scene $(ARGS)
+
+checks: $(EVERYTHING)
 	@# Compiled once, beside the checks, and not by every process of the tests.
 	@set -e; $(BIN)/python -m app.compile & compiling=$$!; trap 'kill $$compiling 2>/dev/null || :' EXIT; set -x; \
 	$(BIN)/python -m ruff check --quiet .; \
@@ -37,7 +48,6 @@ test: $(EVERYTHING)  ## lint, format, types, import rules, then the tests
 	$(BIN)/python -m mypy --no-error-summary; \
 	$(BIN)/lint-imports --no-logo; \
 	wait $$compiling
-	$(BIN)/python -m pytest --numprocesses auto --dist loadscope $(ARGS)
 
 docs: $(EVERYTHING)  ## the documentation as a site that works without internet (build/site)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

@@ -11,22 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NoReturn
 
-import httpx
 import torch
 import typer
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
 from app.registry import Artifact, RegistryError, Store, load_model_set
 from app.registry.references import AliasTarget
-from training.ablation.command import ablate
-from training.batches import SceneTensors
-from training.benchmark.command import benchmark
 from training.checkpoints import CheckpointError
-from training.comparison.command import compare_command, show
-from training.comparison.compare import Comparison
-from training.comparison.gate import MARGIN, WorseError, judge, seat
 from training.config import (
     DATA,
     Config,
@@ -40,17 +32,18 @@ from training.config import (
 from training.datasets import DatasetError
 from training.domain.command import init
 from training.domain.example import example
-from training.evaluation.cases import some_scenes
 from training.evaluation.everyday import EVERYDAY
-from training.evaluation.report import Row, by_source, evaluate
-from training.evaluation.service import ServiceError, directly, over_http
-from training.evaluation.service import metrics as service_metrics
+from training.evaluation.report import Row, evaluate
+from training.experiments.ablate import ablate
+from training.experiments.benchmark import benchmark
+from training.experiments.compare import Comparison, compare_command, show
+from training.experiments.gate import MARGIN, WorseError, judge, seat
+from training.experiments.tune import tune
 from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run
 from training.runs import FinishedRun, RunError, load_run, save_run
 from training.trainer import Trainer, subset
-from training.tuning.command import tune
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 app.command()(example)
@@ -174,16 +167,11 @@ def evaluate_command(
     store: StorePath = _STORE,
     source: Annotated[list[str] | None, typer.Option(help="only these sources")] = None,
     part: Annotated[str, typer.Option(help="train, validation or test")] = "test",
-    url: Annotated[
-        str | None, typer.Option(help="ask a running service too, and compare what it answers")
-    ] = None,
-    limit: Annotated[int, typer.Option(min=1, help="scenes a source, with --url")] = 30,
     output: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
 ) -> None:
     """Evaluate stored models on the split they were trained with: what a model card shows.
 
-    With --url the tasks are put to a service as well, scene by scene, as distinct classes; it must
-    serve the same model. The baselines' figures are those of `benchmark`.
+    The baselines' figures are those of `benchmark`.
     """
     try:
         tables: dict[str, list[Row]] = {}
@@ -205,9 +193,6 @@ def evaluate_command(
                 raise ConfigError(f"{reference} kept no {part} scenes back")
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
-                if url is not None:
-                    tables |= _asked(url, reference, artifact, test, tensors.structure, limit)
-                    continue
                 tables[reference] = evaluate(
                     artifact,
                     test,
@@ -216,7 +201,7 @@ def evaluate_command(
                     everyday=EVERYDAY,
                     progress=status.update,
                 )
-    except (ConfigError, DatasetError, RegistryError, ServiceError) as error:
+    except (ConfigError, DatasetError, RegistryError) as error:
         _fail(error)
     _show(tables)
     if output is not None:
@@ -350,28 +335,6 @@ def _promote(
     store.set_alias(gate.alias, target, expected=before.target)
     was = f", before {before.target}" if before.target is not None else ""
     console.print(f"promoted: {gate.alias} → {target}{was}", soft_wrap=True)
-
-
-def _asked(
-    url: str,
-    reference: str,
-    artifact: Artifact,
-    scenes: SceneTensors,
-    structure: Tensor,
-    limit: int,
-) -> dict[str, list[Row]]:
-    """The figures of a model as it is, and as a service answers for it."""
-    tables: dict[str, list[Row]] = {reference: [], f"{reference} at {url}": []}
-    with httpx.Client(base_url=url, timeout=60) as client:
-        ways = (directly(artifact), over_http(client, reference, artifact))
-        for source, every in by_source(scenes):
-            some = some_scenes(every, limit, 0)
-            for rows, asked in zip(tables.values(), ways, strict=True):
-                found = service_metrics(asked, some, structure)
-                for name, metric in found.items():
-                    task, _, figure = name.partition(" ")
-                    rows.append(Row(task, source, figure, metric.figure()))
-    return tables
 
 
 def _show(tables: dict[str, list[Row]]) -> None:

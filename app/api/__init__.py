@@ -19,7 +19,7 @@ from app.api import (
     stream,
     telemetry,
 )
-from app.api.body import Bodies
+from app.api.body import Bodies, JSONRoute
 from app.api.gateway import Gateway
 from app.serving.runtime import Runtime
 from app.serving.stream import Streams
@@ -53,9 +53,16 @@ def build(
     app.state.bodies = Bodies(settings)
     app.state.streams = Streams(settings.max_streams, runtime.metrics)
     problems.install(app)
-    app.add_middleware(Gateway, settings=settings, runtime=runtime)
-    # Not included but added: each included router takes its share of the time of a request.
-    app.router.routes.extend((*questions.router.routes, *batches.router.routes))
+    routes = (*questions.router.routes, *batches.router.routes)
+    asked = [route for route in routes if isinstance(route, JSONRoute)]
+    # Where requests are traced, the framework must see the route.
+    direct = (
+        {}
+        if settings.opentelemetry
+        else {settings.root_path + route.path: route for route in asked}
+    )
+    app.add_middleware(Gateway, settings=settings, runtime=runtime, direct=direct)
+    app.router.routes.extend(asked)
     for router in (
         stream.router,
         # Before what it shares addresses with: the first that fits an address names its methods.

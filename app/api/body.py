@@ -99,7 +99,7 @@ def parse(body: bytes) -> Any:
     try:
         # The strict parser judges; the lenient one, which alone can see repeated names, reads.
         from_json(body, allow_inf_nan=False)
-        return json.loads(body, object_pairs_hook=_members)
+        return _DECODER.decode(body.decode())
     except _TooManyMembersError:
         detail = f"An object has more than {MAX_MEMBERS} members."
         errors = [FieldError(pointer="#", message=detail)]
@@ -128,6 +128,9 @@ def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) != len(pairs):
         raise _RepeatedNameError
     return members
+
+
+_DECODER: Final = json.JSONDecoder(object_pairs_hook=_members)
 
 
 def _is_json(content_type: bytes) -> bool:

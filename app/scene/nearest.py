@@ -4,10 +4,9 @@
     words      the same last word, and how many of the others are shared: "coffee mug" is a "mug"
 
 The similarity of two names is the larger of the two. Words for size, colour and material are passed
-over where the whole name finds less: a "big lamp" is a "lamp". `training.evaluation.nearest`
-measures how often the nearest class is right. Word vectors are left out: the class with the largest
-cosine is right for 40 % of held-out aliases, and at no cosine for 85 % or more (GloVe 6B, 100
-dimensions, 20,000 words).
+over where the whole name finds less: a "big lamp" is a "lamp". Word vectors are left out: the class
+with the largest cosine is right for 40 % of held-out aliases, and at no cosine for 85 % or more
+(GloVe 6B, 100 dimensions, 20,000 words).
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ name is longer than the longest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from pydantic_core import to_json
@@ -22,73 +22,79 @@ _OBJECT: Final = 200  # missing, or judged
 _OFFSET: Final = 250
 _WARNING: Final = 400
 _UNIT: Final = 12  # the number of a hidden unit
+# Of 128 characters, the longest that the contract allows, each of at most four bytes.
+_LONGEST_NAME: Final = 4 * 128 + 3
 
 
 def of_relations(
-    found: Sequence[reasoning.RelationAnswer],
-    disagreements: Sequence[reasoning.Disagreement],
-    reading: Reading,
-) -> int:
-    """Bytes of `scene_client.schemas.RelationsAnswer`."""
+    found: Sequence[reasoning.RelationAnswer], disagreements: Sequence[reasoning.Disagreement]
+) -> Callable[[int], int]:
+    """Bytes of a `RelationsAnswer` without its envelope, by the bytes of the longest name."""
     entries = len(found) + 2 * len(disagreements)
-    return _of_envelope(reading) + entries * (_RELATION + 2 * reading.longest_name)
+    return lambda name: entries * (_RELATION + 2 * name)
 
 
-def of_missing(found: Sequence[reasoning.MissingAnswer], reading: Reading) -> int:
-    """Bytes of `scene_client.schemas.MissingAnswer`."""
-    places = sum([len(entry.placements) for entry in found])
-    causes = sum([len(entry.because) for entry in found])
-    name = reading.longest_name
-    each = places * (_RELATION + _OFFSET + name) + causes * (_CAUSE + name)
-    return _of_envelope(reading) + len(found) * (_OBJECT + name) + each
+def of_missing(found: Sequence[reasoning.MissingAnswer]) -> Callable[[int], int]:
+    """The same of a `MissingAnswer`."""
+    places = causes = 0
+    for entry in found:
+        places += len(entry.placements)
+        causes += len(entry.because)
+    fixed = places * (_RELATION + _OFFSET) + causes * _CAUSE + len(found) * _OBJECT
+    return lambda name: fixed + (places + causes + len(found)) * name
 
 
-def of_outliers(found: reasoning.OutliersFound, reading: Reading) -> int:
-    """Bytes of `scene_client.schemas.OutliersAnswer`."""
-    causes = sum([len(entry.because) + len(entry.usually_with) for entry in found.outliers])
-    name = reading.longest_name
-    judged = len(found.outliers) * (_OBJECT + 2 * name) + causes * (_CAUSE + name)
-    return _of_envelope(reading) + judged + len(found.misplaced) * (_RELATION + 2 * name)
+def of_outliers(found: reasoning.OutliersFound) -> Callable[[int], int]:
+    """The same of an `OutliersAnswer`."""
+    causes = 0
+    for entry in found.outliers:
+        causes += len(entry.because) + len(entry.usually_with)
+    judged, misplaced = len(found.outliers), len(found.misplaced)
+    fixed = judged * _OBJECT + causes * _CAUSE + misplaced * _RELATION
+    return lambda name: fixed + (2 * judged + causes + 2 * misplaced) * name
 
 
-def of_generated(drawn: Sequence[reasoning.GeneratedScene], reading: Reading) -> int:
-    """Bytes of `scene_client.schemas.GenerateAnswer`."""
-    name = reading.unknown.vocabulary.longest_label
+def of_generated(drawn: Sequence[reasoning.GeneratedScene]) -> Callable[[int], int]:
+    """The same of a `GenerateAnswer`."""
     objects = sum([len(scene.objects) for scene in drawn])
     relations = sum([len(scene.relations) for scene in drawn])
     units = sum([len(layer) for scene in drawn for layer in scene.context.values()])
-    scenes = len(drawn) * _OBJECT + objects * name + relations * (_RELATION + 2 * name)
-    return _of_envelope(reading) + scenes + units * _UNIT
+    fixed = len(drawn) * _OBJECT + relations * _RELATION + units * _UNIT
+    return lambda name: fixed + (objects + 2 * relations) * name
 
 
-def require(size: int, limit: int, parameter: str) -> None:
+def require(size: Callable[[int], int], reading: Reading, limit: int, parameter: str) -> None:
     """Refuse an answer that would be too large.
 
     Args:
-        size: bytes of it.
+        size: bytes of it beside its envelope, by the bytes of the longest name.
+        reading: of the scene that it is about.
         limit: bytes that it may have.
         parameter: what the client can lower.
 
     Raises:
         RequestError: it is too large.
     """
-    if size > limit:
+    if estimate(size, reading, _LONGEST_NAME) <= limit:
+        return
+    exact = estimate(size, reading, reading.longest_name())
+    if exact > limit:
         message = (
-            f"the answer would take up to {size} bytes, and {limit} are left of "
+            f"the answer would take up to {exact} bytes, and {limit} are left of "
             f"SCENE_MAX_ANSWER_BYTES: lower `{parameter}`, send fewer objects, relations or "
             "scenes, or shorter ids"
         )
         raise RequestError(Reason.ANSWER_TOO_LARGE, [Fault((parameter,), message)])
 
 
-def _of_envelope(reading: Reading) -> int:
+def estimate(size: Callable[[int], int], reading: Reading, name: int) -> int:
+    """Bytes of a whole answer whose longest name has so many."""
     unknown = reading.unknown
+    bare = _ENVELOPE + size(name)
     if not (unknown.ignored or unknown.mapped or reading.observed or reading.warnings):
-        return _ENVELOPE
-    name = reading.longest_name
+        return bare
     names = len(reading.ids) * len(reading.warnings)
     ignored = len(to_json(unknown.ignored))
     mapped = len(unknown.mapped) * _WARNING
     observed = len(reading.observed or ()) * (_RELATION + 2 * name)
-    warnings = len(reading.warnings) * _WARNING + names * name
-    return _ENVELOPE + ignored + mapped + observed + warnings
+    return bare + ignored + mapped + observed + len(reading.warnings) * _WARNING + names * name

@@ -31,11 +31,16 @@ class JSONFormatter(logging.Formatter):
         super().__init__()
         # As they stand in a JSON string.
         self.secrets = [json.dumps(secret)[1:-1] for secret in secrets]
+        self._second, self._text = -1, ""
 
     def format(self, record: logging.LogRecord) -> str:
         """The record as a line."""
+        second = int(record.created)
+        if second != self._second:
+            self._second = second
+            self._text = datetime.fromtimestamp(second, UTC).isoformat().removesuffix("+00:00")
         entry: dict[str, Any] = {
-            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "time": f"{self._text}.{int(record.msecs):03d}+00:00",
             "level": record.levelname.lower(),
             "process": record.process,
             "logger": record.name,

@@ -39,8 +39,8 @@ async def relations(request: Request, asked: RelationsRequest) -> Answer:
         pairs=None if asked.pairs is None else _pairs(asked, reading),
         include_opposites=asked.include_opposites,
     )
-    size = answer_size.of_relations(found, disagreements, reading)
-    answer_size.require(size, request.limits.answer_bytes, "top_k")
+    size = answer_size.of_relations(found, disagreements)
+    answer_size.require(size, reading, request.limits.answer_bytes, "top_k")
     envelope = answers.envelope(asked, request.id, model.reference, reading)
     return answers.relations(
         envelope, found, disagreements, reading, min_probability=asked.min_probability
@@ -74,8 +74,8 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         axes=viewer_axes(asked.frame_id, None if viewpoint is None else viewpoint.yaw),
         coverage=asked.coverage,
     )
-    size = answer_size.of_missing(found, reading)
-    answer_size.require(size, request.limits.answer_bytes, "top_k")
+    size = answer_size.of_missing(found)
+    answer_size.require(size, reading, request.limits.answer_bytes, "top_k")
     coverage = asked.coverage
     if coverage is None:
         coverage = model.artifact.calibration.coverage
@@ -93,8 +93,8 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         sensitivity=asked.sensitivity,
         threshold=asked.threshold,
     )
-    size = answer_size.of_outliers(found, reading)
-    answer_size.require(size, request.limits.answer_bytes, "objects")
+    size = answer_size.of_outliers(found)
+    answer_size.require(size, reading, request.limits.answer_bytes, "objects")
     envelope = answers.envelope(asked, request.id, model.reference, reading)
     return answers.outliers(envelope, found, reading)
 
@@ -118,8 +118,8 @@ async def generate(request: Request, asked: GenerateRequest) -> Answer:
         )
 
     drawn = await request.draw(asked.count, model, "generate", draw)
-    size = answer_size.of_generated(drawn, reading)
-    answer_size.require(size, request.limits.answer_bytes, "count")
+    size = answer_size.of_generated(drawn)
+    answer_size.require(size, reading, request.limits.answer_bytes, "count")
     envelope = answers.envelope(asked, request.id, model.reference, reading)
     return answers.generate(envelope, seed, drawn)
 

@@ -206,7 +206,6 @@ class Reading:
         """How the request may name its objects; most requests name none."""
         return Names(self.scene.objects, self.left_out, self.unknown.vocabulary)
 
-    @cached_property
     def longest_name(self) -> int:
         """Bytes of the longest name in an answer as JSON."""
         text = "".join(self.ids)
@@ -388,6 +387,9 @@ def _derive(
 
 def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
     """The id of every object: its own, or its label, numbered where the label is not enough."""
+    labels: list[str] = [entry for entry in entries if isinstance(entry, str)]
+    if len(set(labels)) == len(entries):
+        return labels
     taken: dict[str, None] = {}
     labels = []
     for place, entry in enumerate(entries):

@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from app.serving import answer_size
 from scene_client.schemas import MAX_BATCH
 from tests.http.conftest import launch, serve
 from tests.http.stores import VOCABULARY
@@ -97,9 +98,11 @@ async def test_no_answer_is_larger_than_estimated(
     client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch, question: str, body: dict[str, Any]
 ) -> None:
     sizes: list[int] = []
-    monkeypatch.setattr(
-        "app.serving.answer_size.require", lambda size, _limit, _parameter: sizes.append(size)
-    )
+
+    def note(size: Any, reading: Any, *_: Any) -> None:
+        sizes.append(answer_size.estimate(size, reading, reading.longest_name()))
+
+    monkeypatch.setattr(answer_size, "require", note)
     for variant in ("", "plain", "deep"):
         asked = {**body, **({"model": variant} if variant else {}), "frame_id": "f" * 256}
         answer = await client.post(f"/{question}", json=asked)

@@ -70,6 +70,7 @@ def test_log_odds_agree_with_those_of_the_yardstick():
     assert result.facts["largest difference from scikit-learn"] < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_scaling():
     results = scaling(classes=(20, 45), H1=66, K=3, N=8, objects=4, rounds=2)

@@ -17,7 +17,7 @@ from scene_client.vision_msgs import SceneFields, from_message
 from tests.client import callers
 from tests.http.conftest import LiveService
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,8 @@ from scripts.site import DIRECTIVE, SOURCES, checks
 from tests.conftest import REPOSITORY
 from tests.docs.conftest import Workplace
 
+pytestmark = pytest.mark.slow
+
 DOCS = REPOSITORY / "docs"
 MODELS = DOCS / "models.md"
 _LOADS = {("script", "src"), ("img", "src"), ("iframe", "src"), ("source", "src"), ("link", "href")}

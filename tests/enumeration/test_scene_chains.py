@@ -246,6 +246,7 @@ def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
     assert (found[:, 40 + condition.held] == 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temperature", [1.0, 1.6])
 @pytest.mark.parametrize("layers", [0, 4])
 def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, temperature):

@@ -12,8 +12,7 @@ from app.reasoning import misplaced, outliers
 from app.registry import Calibration
 from tests.reasoning.artifacts import artifact_of
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, rooms
-from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
-from tests.training.evaluation.test_completion import larger_machine
+from tests.training.evaluation.scenes import WIDE, larger_machine, random_scenes, scene, tensors
 from training.calibrate import calibrate, fit_misplaced, fit_relations, rising_curve
 from training.calibrate_objects import (
     ALARMS,

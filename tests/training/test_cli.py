@@ -9,20 +9,15 @@ import sys
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
-import torch
 from typer.testing import CliRunner
 
 from app.reasoning import generate, missing, outliers, relations
 from app.registry import Store
 from app.scene import Scene, SceneObject
-from tests.http.conftest import launch
-from tests.http.stores import make_store
 from training.cli import app
 from training.config import load_config
-from training.evaluation.service import ServiceError, over_http
 from training.offsets import fit_offsets
 from training.pipeline import prepare
 
@@ -57,24 +52,6 @@ def run(*arguments: str) -> str:
     return result.output
 
 
-def same_through_a_service(folder, *store: str) -> None:
-    """A live service's answers have the harness's figures."""
-    service = launch(folder / "store", folder / "log")
-    url, figures = f"http://127.0.0.1:{service.port}", folder / "served.json"
-    try:
-        run("evaluate", "default", *store, "--url", url, "--limit", "8", "--json", str(figures))
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=30)
-    ours, served = (
-        {(row["task"], row["metric"]): row["value"] for row in rows}
-        for rows in json.loads(figures.read_text()).values()
-    )
-    assert {task for task, _ in ours} == {"T1a", "T1b", "T2", "T2-at", "T3", "T3b"}
-    assert served == pytest.approx(ours, abs=1e-6)
-
-
 def same_offsets_as_training_alone_teaches(artifact, config) -> None:
     """Scenes held out for testing have no part in them."""
     parts = prepare(config, Path()).parts
@@ -105,18 +82,7 @@ def test_training_imports_nothing_that_only_checks_need():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
-def test_what_is_no_service_is_told(tmp_path):
-    """A page where a service was expected, and nobody at all."""
-    store = make_store(tmp_path / "store")
-    artifact = Store(store).load("home", "1.0.0")
-    for reply in ("<html>", "[]", "{}"):
-        transport = httpx.MockTransport(lambda _, reply=reply: httpx.Response(200, text=reply))
-        with httpx.Client(transport=transport, base_url="http://nobody") as client:
-            asked = over_http(client, "default", artifact)
-            with pytest.raises(ServiceError, match="no answer of this service"):
-                asked.objects(torch.zeros(1, len(artifact.vocabulary)))
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", SHAPES)
 def test_from_rooms_to_answers(tmp_path, variant):
     H2, K = SHAPES[variant]
@@ -139,7 +105,6 @@ def test_from_rooms_to_answers(tmp_path, variant):
         "T1", "T1a", "T1b", "T2", "T2-at", "T3", "T3b", "T4", "Calibration", "Offsets",
     }  # fmt: skip
     same_offsets_as_training_alone_teaches(artifact, load_config(str(config)))
-    same_through_a_service(tmp_path, *folders[2:])
     calibration = artifact.calibration
     assert calibration.outlier.slope < 0  # the likelier an object, the less an intruder
     limits = calibration.outlier_thresholds

@@ -170,6 +170,7 @@ def toy_machine(name):
     return machine.set_triples(TOY_TRIPLES).initialise(torch.Generator().manual_seed(1), 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize("name", SMALL)
 def test_every_objective_trains_every_machine(objective, name):

@@ -90,9 +90,13 @@ def test_every_command_says_what_it_did(workplace) -> None:
 
 def test_the_model_is_worth_having(workplace) -> None:
     _, comparison = workplace.compare(workplace.run, "baselines")
-    values = {row["task"]: row["a"] for row in comparison["differences"] if row["primary"]}
-    assert values["T2 missing"] > 0.6
-    assert values["T3 outliers, uniform"] > 0.8
+    values = {
+        (cell["task"], cell["metric"]): cell["figure"]["value"]
+        for cell in comparison["cells"]
+        if cell["row"] == comparison["ours"]
+    }
+    assert values["T2 missing", "MRR"] > 0.6
+    assert values["T3 outliers, uniform", "hit@1"] > 0.8
     assert comparison["certain"]
 
 
@@ -125,7 +129,7 @@ def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
     output, comparison = workplace.compare(workplace.run)
     assert comparison["b"].startswith("my-lab@1.0.0")
     assert {row["verdict"] for row in comparison["differences"]} == {"undecided"}
-    assert {row["difference"]["value"] for row in comparison["differences"]} == {0.0}
+    assert {row["figure"]["value"] for row in comparison["differences"]} == {0.0}
     assert "Answers that differ" not in output
     output = workplace.publish(workplace.run, "1.0.1", "--promote")
     assert "promoted: default → my-lab@1.0.1, before my-lab@1.0.0" in output
@@ -147,9 +151,9 @@ def test_a_worse_version_is_refused_unless_somebody_insists(workplace) -> None:
 
     _, comparison = workplace.compare(run, before)
     (missing,) = [
-        row["difference"]
+        row["figure"]
         for row in comparison["differences"]
-        if (row["task"], row["primary"]) == ("T2 missing", True)
+        if (row["task"], row["metric"]) == ("T2 missing", "MRR")
     ]
     assert missing["high"] < -0.02
 

@@ -66,17 +66,21 @@ def things(scene: Scene, structure: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def missing_probabilities(
-    artifact: Artifact, scene: Scene, coverage: float | None = None
+    artifact: Artifact,
+    scene: Scene,
+    coverage: float | None = None,
+    at: tuple[str, int] | None = None,
 ) -> Floats:
     """Probability of every class that `/missing` may propose, (V,); -inf for the others.
 
     Args:
         coverage: as the question has it; the model's default for None.
+        at: a relation and the object that it leads to, of the place that is asked about.
     """
     vocabulary = artifact.vocabulary
     found = np.full(len(vocabulary), -np.inf)
     for answer in reasoning.missing(
-        artifact, scene, top_k=len(vocabulary), coverage=coverage, details=False
+        artifact, scene, top_k=len(vocabulary), coverage=coverage, at=at, details=False
     ):
         found[vocabulary.index(answer.label)] = answer.probability
     return found

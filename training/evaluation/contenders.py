@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 
 from app.registry import Artifact
 from training.batches import SceneTensors
-from training.evaluation import missing
 from training.evaluation.alarms import Alarm, calibrated_alarm
 from training.evaluation.density import DensitySettings, ObjectDensity, machine_density
 from training.evaluation.generation import Sampler
-from training.evaluation.missing import ObjectScore, RoomScore
+from training.evaluation.missing import ObjectScore, RoomScore, machine_score
 from training.evaluation.placed import PlacedScore
 from training.evaluation.relations import RelationScore
 from training.evaluation.sampling import machine_sampler
-from training.evaluation.scores import machine_scores, served_placed_score
+from training.evaluation.scores import placed_score, relation_score
 from training.machines import BoltzmannMachine
 from training.machines.arrays import machine_of
 
@@ -54,45 +53,37 @@ class Contender:
     parameters: int | None = None
 
 
-def machine_contender(
-    machine: BoltzmannMachine,
-    train: SceneTensors,
-    settings: DensitySettings = DensitySettings(),  # noqa: B008
-    seed: int = 0,
-) -> Contender:
-    """A machine as it was trained, without a calibration.
-
-    Args:
-        train: training scenes, for the density's annealing.
-    """
-    objects, scores = missing.machine_score(machine), machine_scores(machine)
-    density = None
-    if machine.spec.form == "local":
-        density = cache(partial(machine_density, machine, train, settings, seed))
-    return Contender(
-        objects=objects,
-        relations=scores.relations,
-        completion=scores.completion,
-        placed=scores.placed,
-        placement=scores.completion,
-        sampler=machine_sampler(machine),
-        density=density,
-        objects_in_rooms=objects if machine.spec.C else None,
-        machine=machine,
-        parameters=machine.parameter_count,
-    )
-
-
 def artifact_contender(
     artifact: Artifact,
     train: SceneTensors,
     settings: DensitySettings = DensitySettings(),  # noqa: B008
     seed: int = 0,
+    *,
+    calibrated: bool = True,
 ) -> Contender:
-    """A published model, with its calibration."""
-    return replace(
-        machine_contender(machine_of(artifact.weights), train, settings, seed),
-        placed=served_placed_score(artifact),
-        alarm=calibrated_alarm(artifact.calibration),
-        artifact=artifact,
+    """A model, published or in memory.
+
+    Args:
+        train: training scenes, for the density's annealing.
+        calibrated: ask for its probabilities and its alarm too; otherwise only the scores that a
+            machine has without a calibration.
+    """
+    machine = machine_of(artifact.weights)
+    objects, completion = machine_score(machine), relation_score(artifact, given=True)
+    density = None
+    if machine.spec.form == "local":
+        density = cache(partial(machine_density, machine, train, settings, seed))
+    return Contender(
+        objects=objects,
+        relations=relation_score(artifact, given=False),
+        completion=completion,
+        placed=placed_score(artifact),
+        placement=completion,
+        sampler=machine_sampler(machine),
+        density=density,
+        objects_in_rooms=objects if machine.spec.C else None,
+        machine=machine,
+        parameters=machine.parameter_count,
+        alarm=calibrated_alarm(artifact.calibration) if calibrated else None,
+        artifact=artifact if calibrated else None,
     )

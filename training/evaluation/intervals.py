@@ -10,7 +10,7 @@ Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -67,6 +67,14 @@ class Metric(ABC):
     @abstractmethod
     def value(self) -> float: ...
 
+    def at(self, weight: Floats) -> float:
+        """The metric where scene k counts weight[k] times; nan where it is undefined.
+
+        Raises:
+            NotImplementedError: the metric is of a whole set and keeps only its resamples.
+        """
+        raise NotImplementedError(f"{type(self).__name__} cannot be weighted by scene")
+
     @abstractmethod
     def resampled(self, resamples: int, seed: int) -> Floats:
         """The metric over resampled scenes, (resamples,); nan where it is undefined."""
@@ -87,17 +95,35 @@ class Metric(ABC):
         return Figure(self.value, low, high, self.n)
 
 
-def paired_difference(a: Metric, b: Metric, *, resamples: int = RESAMPLES, seed: int = 0) -> Figure:
+def paired_difference(
+    a: Metric,
+    b: Metric,
+    *,
+    groups: Sequence[str] | None = None,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Figure:
     """a minus b on the same scenes, with the interval of the difference.
+
+    Args:
+        groups: of each scene; groups are drawn then, not scenes, since scenes of one group are
+            near-duplicates (Field and Welsh, "Bootstrapping clustered data", 2007).
 
     Raises:
         ValueError: the two were measured on different numbers of scenes.
     """
-    if a.scenes != b.scenes:
-        raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes}")
-    x, y = a.draws(resamples, seed), b.draws(resamples, seed)
-    both = min(len(x), len(y))
-    low, high = interval(x[:both] - y[:both])
+    if a.scenes != b.scenes or (groups is not None and len(groups) != a.scenes):
+        of = "" if groups is None else f", of {len(groups)} groups"
+        raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes}{of}")
+    if groups is None:
+        x, y = a.draws(resamples, seed), b.draws(resamples, seed)
+        both = min(len(x), len(y))
+        draws = x[:both] - y[:both]
+    else:
+        names, place = np.unique(np.array(groups), return_inverse=True)
+        weights = scene_weights(len(names), resamples, seed)
+        draws = np.array([a.at(weight[place]) - b.at(weight[place]) for weight in weights])
+    low, high = interval(draws)
     return Figure(a.value - b.value, low, high, min(a.n, b.n))
 
 

@@ -97,6 +97,20 @@ class Ratio(SceneMetric):
         )
 
 
+def lowest_is(scene: Ints, value: Floats, right: NDArray[np.bool_], scenes: int) -> Ratio:
+    """hit@1: share of scenes whose item of the lowest value is a right one, ties in expectation.
+
+    Args:
+        scene, value, right: (N,) of each item.
+    """
+    lowest = np.full(scenes, np.inf)
+    np.minimum.at(lowest, scene, value)
+    least = value == lowest[scene]
+    ties = np.bincount(scene[least], minlength=scenes)
+    hits = np.bincount(scene[least & right], minlength=scenes)
+    return Ratio(hits / np.maximum(ties, 1), (ties > 0).astype(np.float64))
+
+
 @dataclass(frozen=True, eq=False)
 class Macro(SceneMetric):
     """The mean over groups (classes, say) of the mean over a group's items.

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from training.batches import SceneTensors
 from training.evaluation.cases import scene_rng
-from training.evaluation.metrics import Ratio, Scored
+from training.evaluation.metrics import Ratio, Scored, lowest_is
 from training.evaluation.missing import ObjectScore
 
 
@@ -55,13 +55,7 @@ class IntruderScores:
     def hit_at_1(self) -> Ratio:
         """Share of scenes whose intruder has the lowest log-odds (ties in expectation)."""
         rows = ~self.clean
-        scene, odds, bad = self.scene[rows], self.log_odds[rows], self.intruder[rows]
-        lowest = np.full(self.scenes, np.inf)
-        np.minimum.at(lowest, scene, odds)
-        least = odds == lowest[scene]
-        ties = np.bincount(scene[least], minlength=self.scenes)
-        hits = np.bincount(scene[least & bad], minlength=self.scenes)
-        return Ratio(hits / np.maximum(ties, 1), (ties > 0).astype(np.float64))
+        return lowest_is(self.scene[rows], self.log_odds[rows], self.intruder[rows], self.scenes)
 
     def auroc(self) -> Scored:
         """Area under the ROC of -log-odds, intruders against the objects they joined."""

@@ -15,18 +15,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import logsigmoid
 
 from training.batches import SceneTensors
 from training.evaluation.cases import scene_rng
 from training.evaluation.metrics import Ratio
 from training.evaluation.missing import LeaveOneOut, rank_blocks
-from training.machines import BoltzmannMachine, Triway
-from training.machines.draws import draw_hidden
-from training.machines.edges import find_triples, pair_edges, triple_keys
-from training.machines.mean_field import Evidence
-from training.oracle.drawn import presence_log_odds
-from training.oracle.units import NO_UNIT, mean_log_p
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,63 +121,3 @@ def leave_one_out_at(
 
     skipped = len(scenes) - len(row.unique())
     return PlacedRanking(rank_blocks(blocks(), len(scenes), skipped), places.relation.numpy())
-
-
-def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> PlacedScore:
-    """log p(i, unlisted classes absent) + log p(the relation | i present), in batches."""
-
-    def score(places: Places) -> Tensor:
-        every = torch.arange(machine.spec.V).unsqueeze(0)
-        edges = None
-        if machine.spec.form == "seed":
-            edges = machine.edges(*_present(places.v, places.counts))
-        evidence = Evidence(places.v, edges)
-        context = draw_hidden(machine, evidence, draws=draws)
-        log_odds = presence_log_odds(machine, evidence, every, context)
-        # Weights of the draws as if each class were there, (M, B, V).
-        gain = context.h1 @ machine.W.T
-        if edges is not None:
-            gain = gain + machine.attraction(places.v, context.h1, edges, every)
-        weight = torch.softmax(context.log_weight.unsqueeze(-1) + gain, dim=0)
-        on, _ = mean_log_p(weight, _logits(machine, places, context.h1))
-        return logsigmoid(log_odds) + on.clamp(min=NO_UNIT)
-
-    return score
-
-
-def _logits(machine: BoltzmannMachine, places: Places, h1: Tensor) -> Tensor:
-    """ℓ of the named relation between every class and the anchor, each class present, (M, B, V)."""
-    V, A = machine.spec.V, machine.spec.A
-    every, anchor = torch.arange(V).expand(len(places.v), -1), places.anchor.unsqueeze(1)
-    present = torch.ones_like(places.v)
-    if not isinstance(machine, Triway):
-        subject = torch.where(places.outgoing.unsqueeze(1), every, anchor)
-        object_ = torch.where(places.outgoing.unsqueeze(1), anchor, every)
-        keys = triple_keys(places.relation.unsqueeze(1), subject, object_, V)
-        unit, exists = find_triples(machine.triple_keys, keys)
-        if not machine.spec.T:
-            return torch.full((len(h1), *keys.shape), NO_UNIT)
-        edges = machine.edges(torch.zeros(1, 0, dtype=torch.int64))
-        values = machine.relation_logits(edges, present, h1)
-        return torch.where(exists, values.gather(-1, unit.expand(len(h1), -1, -1)), NO_UNIT)
-    logits = h1.new_empty(*h1.shape[:2], V)
-    logs = places.counts.gather(1, anchor).clamp(min=1).log()
-    for outgoing in (True, False):
-        rows = (places.outgoing == outgoing).nonzero().squeeze(1)
-        if not len(rows):
-            continue
-        ours, others, log = every[rows], anchor[rows], logs[rows]
-        if outgoing:
-            pairs = pair_edges(ours, A, objects=others, log_objects=log)
-        else:
-            pairs = pair_edges(others, A, objects=ours, log_subjects=log)
-        grid = pairs.unflatten(machine.relation_logits(pairs, present[rows], h1[:, rows]))
-        grid = grid.squeeze(-1 if outgoing else -2)
-        logits[:, rows] = grid[:, torch.arange(len(rows)), places.relation[rows]]
-    return logits
-
-
-def _present(v: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Classes (B, n), -1 where padded, and their counts."""
-    value, index = v.topk(int(v.sum(1).max()), dim=1)
-    return torch.where(value > 0, index, -1), counts.gather(1, index).long().clamp(min=1)

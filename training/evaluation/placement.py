@@ -18,7 +18,7 @@ from torch import Tensor
 
 from training.batches import SceneTensors
 from training.evaluation.cases import scene_rng
-from training.evaluation.metrics import Ratio, Scored
+from training.evaluation.metrics import Ratio, Scored, lowest_is
 from training.evaluation.relations import RelationScore, scorable, telling
 
 _TRIES = 50
@@ -43,12 +43,7 @@ class PlacementScores:
 
     def hit_at_1(self) -> Ratio:
         """Share of scenes whose false triple has the lowest score (ties in expectation)."""
-        lowest = np.full(self.scenes, np.inf)
-        np.minimum.at(lowest, self.scene, self.score)
-        least = self.score == lowest[self.scene]
-        ties = np.bincount(self.scene[least], minlength=self.scenes)
-        hits = np.bincount(self.scene[least & self.false], minlength=self.scenes)
-        return Ratio(hits / np.maximum(ties, 1), (ties > 0).astype(np.float64))
+        return lowest_is(self.scene, self.score, self.false, self.scenes)
 
     def auroc(self) -> Scored:
         """Area under the ROC, false triples against true ones."""

@@ -26,7 +26,7 @@ from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.contenders import Contender, artifact_contender
 from training.evaluation.everyday import LINES, SOURCE, facts_digest
 from training.evaluation.evidence import KINDS
-from training.evaluation.intervals import Figure, paired_difference
+from training.evaluation.intervals import Figure
 from training.evaluation.metrics import metric_from_dict, metric_to_dict, pool
 from training.evaluation.offsets import METRICS, OFFSETS_TASKS
 from training.evaluation.seed_protocol import SEED_TASKS
@@ -233,26 +233,6 @@ def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceRep
             skipped = sum(part.skipped for part in parts)
             joined.outcomes[task] = Outcome(metrics, sum(part.scenes for part in parts), skipped)
     return joined
-
-
-def compare(a: SourceReport, b: SourceReport) -> list[Row]:
-    """a minus b in every metric that both have, with paired intervals.
-
-    Raises:
-        ValueError: the reports are of different scenes or questions.
-    """
-    if a.scenes != b.scenes:
-        raise ValueError(f"the two reports on {a.source} and {b.source} are of different questions")
-    rows = []
-    for task, ours in a.outcomes.items():
-        theirs = b.outcomes.get(task)
-        if ours is None or theirs is None:
-            continue
-        for name, metric in ours.metrics.items():
-            if name in theirs.metrics:
-                difference = paired_difference(metric, theirs.metrics[name])
-                rows.append(Row(task, a.source, name, difference))
-    return rows
 
 
 def evaluate(

@@ -25,6 +25,8 @@ from training.evaluation import missing, relations
 from training.evaluation.relations import RelationScore, candidates, rank, score_scenes
 from training.trainer import Trainer, TrainingData
 
+pytestmark = pytest.mark.slow
+
 TOLERANCE = 0.1
 POPULARITY, RELATION_POPULARITY = OBJECTS[0], RELATIONS[0]
 

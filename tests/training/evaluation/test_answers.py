@@ -12,8 +12,7 @@ from app.reasoning import missing, relations
 from app.registry import CountSlope
 from tests.reasoning.artifacts import LARGER, artifact_of, calibration
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
-from tests.training.evaluation.scenes import random_scenes, scene, tensors
-from tests.training.evaluation.test_completion import larger_machine
+from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
 from training.cases import scene_of
 from training.evaluation.answers import (
     QUESTIONS,

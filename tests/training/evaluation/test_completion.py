@@ -7,42 +7,25 @@ import dataclasses
 import pytest
 import torch
 
-from app.reasoning.posterior import posterior
-from app.scene import ObjectClass, Scene, SceneObject, Vocabulary
-from tests.reasoning.artifacts import LARGER, artifact_of
+from app.scene import ObjectClass, Vocabulary
+from tests.reasoning.artifacts import artifact_of
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,
     WIDE_STRUCTURE,
     flat,
     knowing,
+    larger_machine,
     random_scenes,
     scene,
     tensors,
 )
 from training.datasets import AnnotatedObject, AnnotatedScene, encode
-from training.evaluation.completion import complete_scenes, given_score, given_units, random_half
-from training.evaluation.relations import rank, spread_units, telling
-from training.evaluation.scores import machine_scores
-from training.machines import Triway, build
-from training.machines.log_odds import relation_log_odds
-from training.machines.mean_field import Evidence
-from training.oracle.units import NO_UNIT
+from training.evaluation.completion import complete_scenes
+from training.evaluation.relations import rank, telling
+from training.evaluation.scores import relation_score
 
 DATA = tensors(random_scenes(20), WIDE)
-
-
-def larger_machine(name):
-    spec = LARGER[name]
-    generator = torch.Generator().manual_seed(3)
-    machine = build(spec)
-    keys = torch.randperm(spec.A * spec.V**2, generator=generator)[: spec.T].sort().values
-    V = spec.V
-    table = torch.stack([keys // V // V, keys // V % V, keys % V], 1)
-    machine.set_triples(table.int()).initialise(generator, 0.7)
-    with torch.no_grad():
-        machine.b.copy_(torch.randn(V, generator=generator))
-    return machine.requires_grad_(False)
 
 
 def test_perfect_and_ignorant_scores():
@@ -121,52 +104,15 @@ def test_the_split_depends_on_the_scene_alone():
     assert [x.key.tolist() for x in whole] != [x.key.tolist() for x in other]
 
 
-def in_scene(instance_classes, triples=()):
-    """What a robot would post: objects, and relations between the first of each class."""
-    first = {int(c): k for k, c in reversed(list(enumerate(instance_classes)))}
-    things = tuple(SceneObject(str(k), "x", int(c)) for k, c in enumerate(instance_classes))
-    return Scene(things, tuple((a, first[i], first[j]) for a, i, j in triples))
-
-
-@pytest.mark.parametrize("name", LARGER)
-def test_the_scores_are_the_service_s(name):
-    """T1a knows no relation; T1b judges observed ones without themselves, the others given them."""
-    machine = larger_machine(name)
-    artifact, scores = artifact_of(machine), machine_scores(machine)
-    given = [(0, 1, 2), (1, 5, 0), (3, 2, 6)]
-    entry = scene([0, 1, 2, 5, 5, 6], given)
-    # A larger scene beside it pads its rows. The seed form draws, even where nothing is given, and
-    # draws depend on the scene beside.
-    local = machine.spec.form == "local"
-    beside = [scene([0, 1, 2, 3, 4, 5, 6, 7], [(0, 1, 2)])] if local else []
-    data = tensors([entry, *beside], machine.spec.V)
-    batch = data.batch(torch.arange(len(data)))
-    batch = telling(batch, batch.holds > 0)
-    n = len(entry.evidence.classes)
-    for score, triples in ((scores.completion, given), (scores.relations, ()))[: 1 + local]:
-        asked = posterior(artifact, in_scene(entry.instance_classes, triples))
-        ours = score(batch)[0, :, :n, :n].clamp(min=NO_UNIT)
-        expected = torch.from_numpy(asked.relation_log_odds())
-        torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("name", LARGER)
-def test_unobserved_relations_get_their_log_odds(name):
-    machine = larger_machine(name)
-    data = tensors(random_scenes(6, machine.spec.V), machine.spec.V)
-    index = torch.arange(6)
-    batch = data.batch(index)
-    batch = telling(batch, random_half(batch.holds > 0, data, index, seed=0))
-    edges, r, observed = given_units(machine, batch)
-    expected, _ = relation_log_odds(machine, edges, Evidence(batch.v, edges, r, observed))
-    if isinstance(machine, Triway):
-        expected = expected.view(batch.holds.shape)
-        assert bool(observed.any())
-    else:
-        expected = spread_units(machine, batch.classes, expected)
-    # Further out, 1 - p has few digits left in single precision.
-    sure = ~batch.observed & (expected.abs() < 6)
-    assert int(sure.sum()) > 0
-    torch.testing.assert_close(
-        given_score(machine)(batch)[sure], expected[sure], rtol=1e-3, atol=1e-3
-    )
+def test_classes_related_both_ways_are_stated_of_different_instances():
+    """Two lamps on either side of a bed: left(lamp, bed) and left(bed, lamp) hold of classes."""
+    artifact = artifact_of(larger_machine("triway-local"))
+    both = scene([0, 1, 1], [(0, 0, 1), (0, 1, 0)])
+    data = tensors([both, scene([0, 1, 1], [(0, 0, 1)])], artifact.spec.V)
+    batch = data.batch(torch.arange(2))
+    told = telling(batch, batch.holds > 0)
+    values = relation_score(artifact, given=True)(told)
+    blind = relation_score(artifact, given=False)(told)
+    assert torch.isfinite(values).all()
+    assert not torch.allclose(values[0], values[1])
+    torch.testing.assert_close(blind[0], blind[1])

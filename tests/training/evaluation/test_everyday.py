@@ -177,11 +177,11 @@ def test_no_training_or_tuning_asks_the_facts():
     }
     users.discard("training/evaluation/everyday.py")
     assert users == {
-        "training/benchmark/compare.py",
-        "training/benchmark/summary.py",
         "training/cli.py",
         "training/evaluation/report.py",
         "training/evaluation/tasks.py",
+        "training/experiments/benchmark.py",
+        "training/experiments/results.py",
         "training/publish.py",
     }
 

@@ -15,10 +15,7 @@ from tests.training.evaluation.scenes import (
     random_scenes,
     scene,
     tensors,
-    toy,
 )
-from tests.training.test_objectives import toy_machine
-from training.evaluation.completion import given_score
 from training.evaluation.placement import alter, placement_scores
 
 DATA = tensors(random_scenes(30), WIDE)
@@ -83,11 +80,3 @@ def test_scenes_with_one_triple_are_skipped_and_counted():
     scores = placement_scores(data, NO_STRUCTURE, flat)
     assert (scores.scenes, scores.skipped, scores.scene.tolist()) == (2, 1, [1, 1])
     assert len(placement_scores(tensors([scene([0, 1])]), NO_STRUCTURE, flat).scene) == 0
-
-
-@pytest.mark.parametrize("name", ["rbm", "gbm", "triway-seed", "triway-local"])
-def test_every_machine_can_be_evaluated(name):
-    data = tensors([toy([0, 1, 2], [(0, 1, 2), (1, 0, 2)]), toy([0, 3, 4], [(1, 0, 3), (0, 0, 3)])])
-    scores = placement_scores(data, NO_STRUCTURE, given_score(toy_machine(name)))
-    assert scores.false.sum() == 2
-    assert 0 <= scores.hit_at_1().value <= 1

@@ -11,17 +11,22 @@ import torch
 
 from app.registry import Thresholds
 from tests.reasoning.artifacts import LARGER, artifact_of
-from tests.training.evaluation.scenes import flat, knowing, random_scenes, scene, tensors
-from tests.training.evaluation.test_completion import larger_machine
+from tests.training.evaluation.scenes import (
+    flat,
+    knowing,
+    larger_machine,
+    random_scenes,
+    scene,
+    tensors,
+)
 from training.batches import seen_triples
 from training.evaluation.answers import QUESTIONS
 from training.evaluation.asking import SENSITIVITIES
 from training.evaluation.cases import some_scenes
-from training.evaluation.contenders import Contender, artifact_contender, machine_contender
+from training.evaluation.contenders import Contender, artifact_contender
 from training.evaluation.density import DensitySettings
 from training.evaluation.report import (
     SourceReport,
-    compare,
     digest,
     evaluate,
     measure,
@@ -103,7 +108,9 @@ def test_a_report_goes_on_with_the_same_questions_alone(tmp_path):
 @pytest.mark.parametrize("name", LARGER)
 def test_scenes_that_hold_no_question_have_no_outcome(name):
     """A source without relations, and scenes of one class: nothing is asked, nothing fails."""
-    contender = machine_contender(larger_machine(name), TRAIN, EFFORT)
+    contender = artifact_contender(
+        artifact_of(larger_machine(name)), TRAIN, EFFORT, calibrated=False
+    )
     asked = [task for task in TASKS if task.startswith(("T1", "T2", "T3"))]
     silent = Setting(tensors([scene([k]) for k in range(3)], V), NO_STRUCTURE, TRAIN, SEEN)
     report = SourceReport("silent", digest(silent))
@@ -175,23 +182,6 @@ def test_pooled_sources_are_their_union():
     for _ in run(CONTENDER, setting, whole, tasks=("T1a relations", "T3 outliers, uniform")):
         pass
     assert values_of(together) == pytest.approx(values_of(whole))
-
-
-def test_two_contenders_are_compared_scene_by_scene():
-    ignorant = Contender(objects=flat_objects, relations=flat)
-    reports = []
-    for contender in (CONTENDER, ignorant):
-        report = SourceReport("toy", digest(SETTING))
-        for _ in run(contender, SETTING, report, tasks=("T1a relations", "T2 missing")):
-            pass
-        reports.append(report)
-    rows = {(row.task, row.metric): row.figure for row in compare(*reports)}
-    values = [report.outcomes["T2 missing"].metrics["MRR"].value for report in reports]
-    assert rows["T2 missing", "MRR"].value == pytest.approx(values[0] - values[1])
-    same = compare(reports[0], reports[0])
-    assert all(row.figure.low == row.figure.high == 0 for row in same)
-    with pytest.raises(ValueError, match="different questions"):
-        compare(reports[0], replace(reports[1], scenes="others"))
 
 
 def test_references_stand_on_either_side():

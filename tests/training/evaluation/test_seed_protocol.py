@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from tests.reasoning.artifacts import LARGER
-from tests.training.evaluation.scenes import random_scenes, scene, tensors
-from tests.training.evaluation.test_completion import larger_machine
+from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
 from training.batches import relation_units
 from training.evaluation.contenders import Contender
 from training.evaluation.seed_protocol import (

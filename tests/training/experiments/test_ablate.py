@@ -1,0 +1,228 @@
+"""The ablate command end to end on generated rooms: what it trains, compares and resumes."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from training.cli import app
+from training.experiments.ablate import PRIMARY
+from training.runs import load_run
+from training.trainer import Trainer
+
+pytestmark = pytest.mark.slow
+
+CONFIG = """
+name = "rooms-triway"
+[data]
+sources = ["rooms"]
+vocabulary = "rooms"
+rooms = 60
+[machine]
+variant = "triway"
+form = "local"
+H1 = 6
+H2 = 0
+K = 2
+[objective]
+name = "composite"
+[training]
+epochs = 5
+learning_rate = 0.03
+"""
+ROWS = """
+[[row]]
+name = "seed-form"
+what = "the paper's energy"
+changes = { "machine.form" = "seed" }
+[[row]]
+name = "no-counts"
+what = "instances are not counted"
+changes = { "machine.without" = ["n"] }
+[[row]]
+name = "product-rbm"
+what = "an RBM with the same factors"
+changes = { "machine.variant" = "product_rbm" }
+[[row]]
+name = "diverging"
+what = "far too fast"
+changes = { "training.learning_rate" = 1e30 }
+"""
+
+
+def arguments(folder, *, rows=ROWS):
+    config, path = folder / "config.toml", folder / "rows.toml"
+    config.write_text(CONFIG)
+    path.write_text(rows)
+    where = ("--rows", str(path), "--folder", str(folder / "ablation"))
+    # In this process, where tests can look on.
+    return "ablate", str(config), *where, "--epochs", "2", "--workers", "1"
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, list(arguments))
+    return result.exit_code, " ".join(result.output.split())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a finished ablation, most of it made by two workers."""
+    folder = tmp_path_factory.mktemp("ablation")
+    code, output = run(*arguments(folder), "--workers", "2")
+    assert code == 0, output
+    return folder
+
+
+def results(folder):
+    return json.loads((folder / "ablation/rooms-triway/results.json").read_text())
+
+
+def test_every_row_is_compared_with_the_full_model_on_both_parts(finished):
+    found = results(finished)
+    assert found["ours"] == "rooms-triway"
+    cells = {
+        (cell["row"], cell["source"], cell["task"], cell["metric"]): cell["figure"]["value"]
+        for cell in found["cells"]
+    }
+    sources = {f"{part} {name}" for part in ("validation", "test") for name in ("rooms", "pooled")}
+    rows = {"rooms-triway", "seed-form", "no-counts", "product-rbm"}
+    # Some parts hold no pair that training tells little of.
+    little = ("accuracy, unseen pairs", "accuracy, rare classes")
+    metrics = {(task, name) for task, names in PRIMARY.items() for name in names} - {
+        ("T1 pairs", name) for name in little
+    }
+    cells = {key: value for key, value in cells.items() if key[-1] not in little}
+    assert set(cells) == {(r, s, *m) for r in rows for s in sources for m in metrics}
+    for gap in found["differences"]:
+        key = (gap["source"], gap["task"], gap["metric"])
+        if gap["metric"] in little:
+            continue
+        assert gap["figure"]["value"] == pytest.approx(
+            cells["rooms-triway", *key] - cells[gap["row"], *key]
+        )
+
+
+def test_a_row_that_diverges_is_reported_and_left_out(finished):
+    failures = results(finished)["failures"]
+    assert list(failures) == ["diverging"]
+    assert failures["diverging"].startswith("seed 0: ")
+    assert "- diverging was not measured: seed 0" in markdown(finished)
+
+
+def test_a_row_that_diverges_leaves_the_others_to_the_workers(tmp_path, monkeypatch):
+    """Workers do not see what is changed in this process: nothing is trained here."""
+    monkeypatch.setattr(Trainer, "run", None)
+    rows = ("--row", "diverging", "--row", "no-counts")
+    code, output = run(*arguments(tmp_path), *rows, "--workers", "2")
+    assert code == 0, output
+    found = results(tmp_path)
+    assert list(found["failures"]) == ["diverging"]
+    assert {cell["row"] for cell in found["cells"]} == {"rooms-triway", "no-counts"}
+
+
+def test_the_tables_say_what_a_precision_means(finished):
+    assert "An unlisted relation counts as wrong." in markdown(finished)
+
+
+def markdown(folder):
+    return (folder / "ablation/rooms-triway/results.md").read_text()
+
+
+def test_the_table_has_the_row_minus_the_full_model(finished):
+    text = markdown(finished)
+    section = text[text.index("### T2 missing: MRR") :]
+    assert "In brackets: the row minus rooms-triway" in section
+    header, _, *lines = section.split("\n\n")[2].splitlines()
+    columns = [column.strip() for column in header.split("|")]
+    assert columns[2:-1] == [
+        "weights", "validation pooled", "test pooled", "validation rooms", "test rooms",
+    ]  # fmt: skip
+    assert [line.split(" |")[0].strip("| ") for line in lines] == [
+        "**rooms-triway**", "seed-form", "no-counts", "product-rbm",
+    ]  # fmt: skip
+    gap = next(
+        d["figure"]
+        for d in results(finished)["differences"]
+        if (d["row"], d["source"], d["task"]) == ("seed-form", "test pooled", "T2 missing")
+    )
+    (shown,) = [
+        line.split("|")[columns.index("test pooled")]
+        for line in lines
+        if line.startswith("| seed-form")
+    ]
+    low, high = (float(bound) for bound in shown.partition("(")[2].rstrip(") ").split(", "))
+    assert (low, high) == pytest.approx((-gap["high"], -gap["low"]), abs=6e-4)
+
+
+def test_costs_count_trained_weights_alone(finished):
+    run = load_run(finished / "ablation/rooms-triway/no-counts/seed-0/run")
+    held = {"n": run.machine.n.numel(), "kappa": run.machine.kappa.numel()}
+    assert not run.machine.n.any()
+    trained = run.machine.parameter_count - sum(held.values())
+    assert results(finished)["parameters"]["no-counts"] == trained
+    assert f"| no-counts | {trained:,} | " in markdown(finished)
+    assert "| no-counts | instances are not counted | " in markdown(finished)
+
+
+def test_the_same_command_trains_nothing_again(finished, monkeypatch):
+    before = results(finished)
+    rows = ("--row", "seed-form", "--row", "no-counts", "--row", "product-rbm")
+    monkeypatch.setattr(Trainer, "run", None)
+    code, output = run(*arguments(finished), *rows)
+    assert code == 0, output
+    after = results(finished)
+    assert (after["cells"], after["differences"]) == (before["cells"], before["differences"])
+    assert after["failures"] == {}
+
+
+def test_an_interrupted_ablation_goes_on(finished, tmp_path, monkeypatch):
+    whole, epochs = Trainer._epoch, []
+
+    def interrupted(self, progress):
+        epochs.append((self.config.name, len(self.epochs)))
+        if len(epochs) == 4:
+            raise KeyboardInterrupt
+        whole(self, progress)
+
+    chosen = ("--row", "no-counts")
+    monkeypatch.setattr(Trainer, "_epoch", interrupted)
+    code, output = run(*arguments(tmp_path), *chosen)
+    assert code == 130
+    assert "goes on from there" in output
+    code, output = run(*arguments(tmp_path), *chosen)
+    assert code == 0, output
+    assert epochs[-2:] == [("no-counts", 1), ("no-counts", 1)]
+    first, again = (
+        [cell for cell in results(folder)["cells"] if cell["row"] == "no-counts"]
+        for folder in (finished, tmp_path)
+    )
+    assert again == first
+
+
+@pytest.mark.parametrize(
+    ("others", "message"),
+    [
+        (("--row", "nobody"), "no rows ['nobody'], only seed-form, no-counts"),
+        (("--rows", "nowhere.toml"), "no ablation nowhere.toml"),
+    ],
+)
+def test_bad_requests_are_named(tmp_path, others, message):
+    code, output = run(*arguments(tmp_path), *others)
+    assert code == 1
+    assert message in output
+    assert not (tmp_path / "ablation").exists()
+
+
+def test_another_configuration_under_the_same_name_is_refused(finished):
+    code, output = run(*arguments(finished), "--limit", "20")
+    assert code == 1
+    assert "another configuration of rooms-triway" in output
+
+
+def test_a_configuration_without_rows_says_so(tmp_path):
+    _, config, *_ = arguments(tmp_path)
+    code, output = run("ablate", config)
+    assert code == 1
+    assert "name a TOML file with --rows" in output

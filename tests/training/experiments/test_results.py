@@ -1,0 +1,146 @@
+"""Tables and their remarks; splits that fill no table."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from training.cli import app
+from training.evaluation.intervals import Figure
+from training.evaluation.metrics import Ratio
+from training.evaluation.report import SourceReport
+from training.evaluation.setting import Outcome
+from training.experiments.results import Asked, Cell, Difference, Results, remarks, summarise
+
+CONFIG = """
+name = "rooms-rbm"
+[data]
+sources = ["rooms"]
+vocabulary = "rooms"
+rooms = 60
+split = "{split}"
+[machine]
+variant = "rbm"
+form = "local"
+H1 = 4
+H2 = 0
+K = 2
+[objective]
+name = "composite"
+[training]
+epochs = 1
+"""
+
+
+def arguments(folder, *others, split="group"):
+    path = folder / f"{split}.toml"
+    path.write_text(CONFIG.format(split=split))
+    return (
+        str(path), "--folder", str(folder / "reports"), "--quick", "--workers", "1",
+        "--task", "T2 missing", "--baseline", "popularity", *others,
+    )  # fmt: skip
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, ["benchmark", *arguments])
+    return result.exit_code, " ".join(result.output.split())
+
+
+def test_a_random_split_fills_no_table(tmp_path):
+    for others in ((), ("--shuffled",), ("--shuffled", "--seed-protocol")):
+        code, output = run(*arguments(tmp_path, *others, split="random"))
+        assert code == 1
+        assert "rooms-rbm: data.split" in output
+        assert "--seed-protocol" in output
+    assert not (tmp_path / "reports").exists()
+
+
+def test_a_random_split_is_asked_as_the_seed_paper_asks(tmp_path):
+    code, output = run(*arguments(tmp_path, "--seed-protocol", split="random"))
+    assert code == 0, output
+    folder = tmp_path / "reports/rooms"
+    assert not (folder / "results.json").exists()
+    assert json.loads((folder / "seed-protocol/results.json").read_text())["cells"]
+
+
+def figure(value):
+    return Figure(value, value, value, 1)
+
+
+@pytest.mark.parametrize(
+    ("task", "metric", "said"),
+    [
+        ("T1a relations", "R-precision, distinct classes", True),
+        ("T1b completion", "R-precision", True),
+        ("T2 missing", "MRR", False),
+    ],
+)
+def test_precision_of_relations_says_what_counts_as_wrong(task, metric, said):
+    text = Results("a", (Cell("a", task, "x", metric, figure(0.5), (0.5,)),), ()).markdown()
+    assert ("An unlisted relation counts as wrong" in text) is said
+
+
+@pytest.mark.parametrize(
+    ("metric", "low", "high", "verdict"),
+    [
+        ("MRR", 0.1, 0.2, "better"),
+        ("MRR", -0.1, 0.2, "undecided"),
+        ("MRR", -0.2, -0.1, "worse"),
+        ("MMD², free", -0.2, -0.1, "better"),
+        ("ECE, missing", 0.1, 0.2, "worse"),
+        ("mirrored relations, free", -0.2, -0.1, "better"),
+        ("on-top cycles, free", 0.1, 0.2, "worse"),
+    ],
+)
+def test_a_verdict_needs_the_whole_interval_on_the_better_side(metric, low, high, verdict):
+    figure = Figure((low + high) / 2, low, high, 1)
+    assert Difference("a", "T", "x", metric, figure).verdict == verdict
+
+
+def test_what_was_asked_is_in_the_results():
+    metrics = {"MMD²": Ratio(np.array([0.5]), np.ones(1))}
+    outcome = Outcome(metrics, 7, 2, {"bandwidth": 4.0})
+    report = SourceReport("x", "", {"T4 generate": outcome, "Density": None})
+    (asked,) = summarise({("a", 0): {"x": report}}, "a").to_dict()["asked"]
+    assert asked == {
+        "row": "a", "seed": 0, "task": "T4 generate", "source": "x", "scenes": 7, "skipped": 2,
+        "notes": {"bandwidth": 4.0},
+    }  # fmt: skip
+
+
+def test_remarks_stand_below_the_tables_of_their_task():
+    cells = (Cell("a", "T4 generate", "x", "MMD², free", figure(0.1), (0.1,)),)
+    asked = (
+        Asked("a", 0, "T4 generate", "x", 7, 0, {"bandwidth": 4.5, "drawn scenes": 1200}),
+        Asked("a", 0, "T2 missing", "x", 90, 8, {}),
+    )
+    text = Results("a", cells, (), asked=asked).markdown()
+    assert text.endswith(
+        "\n\n|  | bandwidth | drawn scenes |\n|---|---|---|\n| x | 4.500 | 1,200 |\n"
+    )
+    assert "could not be scored" not in text
+
+
+def test_notes_go_by_source_or_by_row_or_by_both():
+    def asked(row, source, value):
+        return Asked(row, 0, "Density", source, 5, 0, {"log Z, AIS": value})
+
+    def keys(*some):
+        (table,) = remarks(some)
+        return [line.split(" | ")[0].strip("| ") for line in table.splitlines()[2:]]
+
+    rows = asked("a", "x", 1.5), asked("a", "y", 1.5), asked("b", "x", 2.5), asked("b", "y", 2.5)
+    assert keys(*rows) == ["a, seed 0", "b, seed 0"]
+    assert keys(asked("a", "x", 1.5), asked("b", "x", 1.5), asked("b", "y", 2.5)) == ["x", "y"]
+    assert keys(*rows, asked("b", "z", 3.5)) == [
+        "a, seed 0, x", "a, seed 0, y", "b, seed 0, x", "b, seed 0, y", "b, seed 0, z",
+    ]  # fmt: skip
+
+
+def test_skipped_scenes_are_told_by_source():
+    asked = [Asked(r, 0, "T2", s, 90, k, {}) for r, s, k in [("a", "x", 8), ("b", "x", 9)]]
+    asked.append(Asked("a", 0, "T2", "y", 1200, 0, {}))
+    assert remarks(asked) == ["Scenes that could not be scored: x 8–9 of 90."]

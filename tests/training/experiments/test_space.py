@@ -1,0 +1,74 @@
+"""Search spaces: what is read from TOML, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from training.config import Config, ConfigError, load_config, with_settings
+from training.experiments.tune import load_space, shipped_spaces
+
+CONFIG = Config.model_validate(
+    {
+        "name": "rooms-triway",
+        "data": {"sources": ["rooms"], "vocabulary": "rooms", "rooms": 60},
+        "machine": {"variant": "triway", "form": "local", "H1": 8, "H2": 0, "K": 4},
+        "objective": {"name": "composite"},
+    }
+)
+
+
+def read(folder, text):
+    path = folder / "space.toml"
+    path.write_text(text)
+    return load_space(path, CONFIG)
+
+
+@pytest.mark.parametrize("name", shipped_spaces())
+def test_shipped_spaces_fit_their_configurations(name):
+    assert load_space(shipped_spaces()[name], load_config(name))
+
+
+def test_choices_and_intervals_are_read(tmp_path):
+    space = read(
+        tmp_path,
+        '"machine.H1" = { low = 4, high = 6 }\n"training.averaging" = [0.0, 0.9]\n'
+        '"objective.presence_weight" = { low = 0.01, high = 1.0, log = true }\n',
+    )
+    sizes, averages, weights = space.values()
+    assert (sizes.low, sizes.high) == (4, 6)
+    assert averages.choices == (0.0, 0.9)
+    assert (weights.low, weights.high, weights.log) == (0.01, 1.0, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('"training.rate" = [0.1]', "no setting 'training.rate': training has optimiser"),
+        ('"epochs" = [3]', "no setting 'epochs': name it section.entry"),
+        ('"training.epochs" = [0]', "training.epochs: Input should be greater"),
+        ('"training.seed" = [0, 1]', "'training.seed' is no setting to search"),
+        ('"data.limit" = [20]', "'data.limit' is no setting to search"),
+        ('"machine.H1" = [', "is not TOML"),
+        ('"machine.H1" = 3', "write a list of choices, or"),
+        ('"machine.H1" = []', "write a list of choices, or"),
+        ('"machine.H1" = { low = 3 }', "machine.H1: high: Field required"),
+        ('"machine.H1" = { low = 3, high = 2 }', "low must be below high"),
+        ('"machine.H1" = { low = 0, high = 2, log = true }', "low"),
+        ('"machine.H1" = { low = "a", high = 2 }', "machine.H1: low"),
+        ("", "names no setting"),
+    ],
+)
+def test_bad_spaces_say_what_is_wrong(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message):
+        read(tmp_path, text)
+
+
+def test_a_missing_space_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"no search space .*nowhere.toml"):
+        load_space(tmp_path / "nowhere.toml", CONFIG)
+
+
+def test_changed_settings_leave_the_rest_alone():
+    changed = with_settings(CONFIG, {"machine.H1": 5, "training.patience": 2})
+    assert (changed.machine.H1, changed.training.patience) == (5, 2)
+    assert with_settings(changed, {"machine.H1": 8, "training.patience": None}) == CONFIG

@@ -1,0 +1,172 @@
+"""The tune command end to end on generated rooms: what it records, resumes and writes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import optuna
+import pytest
+from optuna.distributions import CategoricalDistribution
+from optuna.storages.journal import JournalFileBackend
+from typer.testing import CliRunner
+
+from training.cli import app
+from training.config import load_config
+from training.experiments.tune import Search
+from training.pipeline import prepare
+from training.trainer import Trainer
+
+CONFIG = """
+name = "rooms-triway"
+[data]
+sources = ["rooms"]
+vocabulary = "rooms"
+rooms = {rooms}
+[machine]
+variant = "triway"
+form = "local"
+H1 = 6
+H2 = 0
+K = 2
+[objective]
+name = "composite"
+[training]
+epochs = 7
+"""
+SPACE = '"training.learning_rate" = [0.03, 1e30]\n"machine.H1" = { low = 3, high = 5 }\n'
+
+
+def arguments(folder, *, rooms=60, space=SPACE):
+    config, path = folder / "config.toml", folder / "space.toml"
+    config.write_text(CONFIG.format(rooms=rooms))
+    path.write_text(space)
+    where = ("--space", str(path), "--folder", str(folder / "tuning"))
+    return "tune", str(config), *where, "--epochs", "2", "--no-prune"
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, list(arguments))
+    return result.exit_code, " ".join(result.output.split())
+
+
+def recorded(folder):
+    backend = JournalFileBackend(str(folder / "tuning/rooms-triway/study.log"))
+    storage = optuna.storages.JournalStorage(backend)
+    trials = optuna.load_study(study_name="rooms-triway", storage=storage).trials
+    return [trial for trial in trials if "settings" in trial.user_attrs]
+
+
+def settings_of(folder):
+    return [trial.user_attrs["settings"] for trial in recorded(folder)]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a finished search of six trials beside the configuration as it is."""
+    folder = tmp_path_factory.mktemp("tune")
+    code, output = run(*arguments(folder), "--trials", "6")
+    assert code == 0, output
+    return folder
+
+
+def test_every_trial_is_recorded(finished):
+    first, *others = recorded(finished)
+    assert first.user_attrs["settings"] == {}
+    assert len(others) == 6
+    for trial in (first, *others):
+        diverges = trial.user_attrs["settings"].get("training.learning_rate") == 1e30
+        assert trial.state.name == ("FAIL" if diverges else "COMPLETE")
+        assert bool(trial.user_attrs["reason"]) == diverges
+        if not diverges:
+            assert set(trial.user_attrs["figures"]) == {"MRR", "R-precision"}
+            assert len(trial.intermediate_values) == 2
+
+
+def test_the_best_configuration_loads_and_keeps_its_own_epochs(finished):
+    best = max(
+        (trial for trial in recorded(finished) if trial.value is not None),
+        key=lambda trial: trial.value,
+    )
+    path = finished / "tuning/rooms-triway/best.toml"
+    config = load_config(str(path))
+    assert config.name == "rooms-triway-tuned"
+    assert config.training.epochs == 7
+    assert best.user_attrs["settings"].get("machine.H1", 6) == config.machine.H1
+    assert path.read_text().startswith("# rooms-triway, ")
+
+
+def test_the_same_command_runs_nothing_again(finished, monkeypatch):
+    before = settings_of(finished)
+    monkeypatch.setattr(Trainer, "run", None)
+    code, output = run(*arguments(finished), "--trials", "6")
+    assert code == 0, output
+    assert settings_of(finished) == before
+
+
+def test_an_interrupted_search_goes_on_within_its_trial(tmp_path, monkeypatch):
+    whole, epochs = Trainer._epoch, []
+
+    def interrupted(self, progress):
+        if len(epochs) == 3:  # the second epoch of the second trial
+            epochs.append(None)
+            raise KeyboardInterrupt
+        epochs.append((self.config.machine.H1, len(self.epochs)))
+        whole(self, progress)
+
+    space = '"machine.H1" = [4]\n'
+    monkeypatch.setattr(Trainer, "_epoch", interrupted)
+    code, output = run(*arguments(tmp_path, space=space), "--trials", "1")
+    assert code == 130
+    assert "goes on from there" in output
+    assert settings_of(tmp_path) == [{}]
+    code, output = run(*arguments(tmp_path, space=space), "--trials", "1")
+    assert code == 0, output
+    assert epochs == [(6, 0), (6, 1), (4, 0), None, (4, 1)]
+    assert settings_of(tmp_path) == [{}, {"machine.H1": 4}]
+    assert not list(tmp_path.rglob("checkpoint.pt"))
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ('"training.rate" = [0.1]', "no setting 'training.rate'"),
+        ('"machine.H1" = 3', "space.toml: machine.H1"),
+    ],
+)
+def test_bad_spaces_are_refused_before_anything_runs(tmp_path, space, message):
+    code, output = run(*arguments(tmp_path, space=space))
+    assert code == 1
+    assert message in output
+    assert not (tmp_path / "tuning").exists()
+
+
+def test_other_scenes_are_another_search(finished, tmp_path):
+    other = arguments(tmp_path, rooms=70)
+    code, output = run(*other, "--folder", str(finished / "tuning"))
+    assert code == 1
+    assert "another configuration or other scenes" in output
+
+
+def test_a_configuration_without_a_space_says_so(tmp_path):
+    _, config, *_ = arguments(tmp_path)
+    code, output = run("tune", config)
+    assert code == 1
+    assert "name a TOML file with --space" in output
+
+
+def test_a_trial_below_the_median_is_given_up(tmp_path):
+    """Test scenes are never looked at: training and judging go as well without any."""
+    arguments(tmp_path)
+    config = load_config(str(tmp_path / "config.toml"))
+    data = replace(prepare(config, tmp_path).training_data(), test=None)
+    space = {"training.learning_rate": CategoricalDistribution([0.03])}
+    search = Search(tmp_path / "study", config, data, space, "both")
+    study = search.open("scenes", 0, prune=True)
+    search.run(study, 5)
+    search.space = {"training.learning_rate": CategoricalDistribution([1e-6])}
+    again = search.open("scenes", 0, prune=True)
+    again.sampler = optuna.samplers.RandomSampler(0)
+    trial = again.ask()
+    with pytest.raises(optuna.TrialPruned):
+        search.value_of(trial, {"training.learning_rate": 1e-6})
+    assert 3 <= len(again.trials[-1].intermediate_values) < 7

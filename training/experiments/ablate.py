@@ -1,0 +1,257 @@
+"""`python -m training ablate`: a configuration, and the same with one thing changed."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from rich.console import Console
+
+from training.batches import seen_triples
+from training.checkpoints import CheckpointError
+from training.config import Config, ConfigError, data_folder, load_config, with_settings
+from training.datasets import DatasetError
+from training.evaluation.report import SourceReport, pooled, settings_by_source
+from training.evaluation.setting import Setting
+from training.experiments.measure import (
+    BenchmarkError,
+    Plan,
+    Reports,
+    measure_rows,
+    place_of,
+    shown,
+)
+from training.experiments.results import grid, only, summarise, write
+from training.experiments.rows import Material, machine_row
+from training.pipeline import prepare
+from training.runs import RunError, load_run
+from training.trainer import TrainingData
+
+PRIMARY: dict[str, tuple[str, ...]] = {
+    "T1a relations": ("R-precision, instance counts",),
+    "T1 pairs": ("accuracy", "accuracy, unseen pairs", "accuracy, rare classes"),
+    "T1b completion": ("R-precision",),
+    "T2 missing": ("MRR",),
+    "T2-at missing at a place": ("MRR",),
+    "T3 outliers, uniform": ("hit@1", "AUROC"),
+}
+"""What is compared; the reports hold every metric of these tasks."""
+
+console = Console()
+
+
+def ablate(
+    configuration: Annotated[str, typer.Argument(help="the full model's configuration")],
+    rows: Annotated[
+        Path | None, typer.Option(help="the rows; by default the shipped ones of its name")
+    ] = None,
+    row: Annotated[list[str] | None, typer.Option(help="only these, and the full model")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="training seeds of every row")] = 1,
+    limit: Annotated[int | None, typer.Option(min=10, help="scenes a source")] = None,
+    asked: Annotated[int, typer.Option(min=1, help="scenes a source where a task is slow")] = 300,
+    epochs: Annotated[int | None, typer.Option(min=1, help="at most, for every row")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="processes, of one thread each")] = 2,
+    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="for runs and results")] = Path(
+        "runs/ablation"
+    ),
+    fresh: Annotated[bool, typer.Option("--fresh", help="forget earlier runs")] = False,
+) -> None:
+    """Train the full model and each of its ablations, and compare them on the same scenes.
+
+    Writes results.json and results.md into <folder>/<configuration>. A row that diverges is
+    reported and left out. Ctrl-C loses at most an epoch or a task; the same command goes on from
+    there.
+    """
+    try:
+        configs = _configs(configuration, rows, row, limit, epochs)
+        place = folder / configs[0].name
+        with console.status("reading and encoding scenes"):
+            material = Material.of(
+                prepare(configs[0], data_folder(configuration, configs[0], data))
+            )
+        plan = Plan(place, material, _settings(material.data, asked), tasks=tuple(PRIMARY))
+        entries = [
+            machine_row(with_settings(config, {"training.seed": seed}))
+            for config in configs
+            for seed in range(seeds)
+        ]
+        with shown(console, "ablation", len(entries) * len(plan.settings)) as progress:
+            measured, failures = measure_rows(
+                *(plan, entries, progress),
+                workers=workers,
+                fresh=fresh,
+                failures=(FloatingPointError,),
+            )
+    except (
+        ConfigError, DatasetError, BenchmarkError, CheckpointError, BrokenProcessPool,
+    ) as error:  # fmt: skip
+        console.print(f"[red]error:[/red] {error}")
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        console.print("stopped; the same command goes on from there")
+        raise typer.Exit(130) from None
+    if configs[0].name in failures:
+        console.print(f"[red]error:[/red] {configs[0].name}: {failures[configs[0].name]}")
+        raise typer.Exit(1)
+    with console.status("resampling scenes"):
+        reports: Reports = {row: _with_pools(found) for row, found in measured.items()}
+        weights, seconds = _costs(place, configs, seeds)
+        results = summarise(reports, configs[0].name, weights)
+    parts = [
+        grid(
+            ["", "", "training, s"],
+            ([c.name, c.description, f"{seconds.get(c.name, 0):.0f}"] for c in configs),
+        ),
+        results.markdown(PRIMARY, changes=True),
+        *(f"- {row} was not measured: {why}" for row, why in failures.items()),
+    ]
+    text = "\n\n".join(parts).rstrip() + "\n"
+    write(place, results.to_dict() | {"failures": failures}, text)
+    console.print(text, markup=False, soft_wrap=True)
+    console.print(f"every figure: {place / 'results.json'}")
+
+
+def _configs(
+    reference: str,
+    path: Path | None,
+    names: Sequence[str] | None,
+    limit: int | None,
+    epochs: int | None,
+) -> list[Config]:
+    """The full model and the rows, within the limits.
+
+    Raises:
+        ConfigError: see `load_rows`; no rows come with the configuration; an unknown row.
+    """
+    full = load_config(reference)
+    if limit is not None:
+        full = with_settings(full, {"data.limit": limit})
+    shipped = shipped_ablations()
+    if path is None and full.name not in shipped:
+        raise ConfigError(
+            f"no ablation comes with {full.name}, only with {', '.join(shipped)}: name a TOML "
+            "file with --rows"
+        )
+    found = load_rows(path or shipped[full.name], full)
+    if unknown := sorted(set(names or ()) - {config.name for config in found}):
+        raise ConfigError(f"no rows {unknown}, only {', '.join(c.name for c in found)}")
+    chosen = [full, *(config for config in found if not names or config.name in names)]
+    if epochs is None:
+        return chosen
+    return [
+        with_settings(config, {"training.epochs": min(epochs, config.training.epochs)})
+        for config in chosen
+    ]
+
+
+def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
+    """The scenes of each source, of both parts; at most `limit` where a task is slow."""
+    seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
+    parts = {"validation": scenes.validation, "test": scenes.test}
+    return {
+        f"{part} {source}": setting
+        for part, some in parts.items()
+        for source, setting in settings_by_source(
+            some, scenes.structure, scenes.train, seen, limit=limit
+        )
+    }
+
+
+def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
+    """The metrics of `PRIMARY`, pools first."""
+    pools = {
+        f"{part} pooled": pooled(
+            [report for name, report in reports.items() if name.startswith(part)], f"{part} pooled"
+        )
+        for part in ("validation", "test")
+    }
+    return {name: only(report, PRIMARY) for name, report in (pools | reports).items()}
+
+
+def _costs(
+    folder: Path, configs: Sequence[Config], seeds: int
+) -> tuple[dict[str, int], dict[str, float]]:
+    """Trained weights by row, those held at zero left out, and mean seconds of training."""
+    weights, seconds = {}, {}
+    for config in configs:
+        places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]
+        try:
+            runs = [load_run(place) for place in places]
+        except RunError:
+            continue
+        held = {"kappa", *config.machine.without}
+        parameters = runs[0].machine.named_parameters()
+        weights[config.name] = sum(p.numel() for name, p in parameters if name not in held)
+        seconds[config.name] = sum(run.seconds for run in runs) / seeds
+    return weights, seconds
+
+
+# ------------------------------------------------------------------------------- rows from a file
+
+
+class _Change(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    what: str
+    start: str | None = Field(default=None, alias="from")
+    changes: dict[str, Any] = Field(default_factory=dict)
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    row: tuple[_Change, ...] = Field(min_length=1)
+
+
+def shipped_ablations() -> dict[str, Path]:
+    """The ablations that come with the package, by the name of the full model."""
+    folder = Path(__file__).parents[1] / "configs/ablations"
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_rows(path: Path, full: Config) -> list[Config]:
+    """The configurations of a file, on the scenes of the full model, which is not among them.
+
+    The name of each is its row's, the description says what it changes.
+
+    Raises:
+        ConfigError: no such file, not TOML, a setting that does not exist or fit, a name twice, or
+            a row that changes nothing.
+    """
+    try:
+        file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError as error:
+        raise ConfigError(f"no ablation {path}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path.name} is not TOML: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{path.name}: {place}: {first['msg']}") from error
+    configs: dict[str, Config] = {}
+    for row in file.row:
+        if row.name in configs or row.name == full.name:
+            raise ConfigError(f"{path.name}: two rows are called {row.name}")
+        configs[row.name] = _config(row, full, path.name)
+    return list(configs.values())
+
+
+def _config(row: _Change, full: Config, file: str) -> Config:
+    try:
+        start = load_config(row.start) if row.start else full
+        changed = with_settings(start, row.changes).model_copy(update={"data": full.data})
+        if changed == full:
+            raise ConfigError(f"it changes nothing in {full.name}")
+        values = changed.model_dump() | {"name": row.name, "description": row.what}
+        return Config.model_validate(values)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {row.name}: {error}") from error
+    except ValidationError as error:
+        raise ConfigError(f"{file}: {row.name}: {error.errors()[0]['msg']}") from error

@@ -1,0 +1,416 @@
+"""`python -m training compare`: two models on scenes that neither has learnt from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from app.registry import RegistryError, Store
+from app.scene import Vocabulary
+from training.batches import SceneTensors, scene_tensors
+from training.config import DATA, ConfigError
+from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
+from training.evaluation.cases import some_scenes
+from training.evaluation.missing import ObjectScore, leave_one_out
+from training.evaluation.report import Progress, SourceReport, digest, run, silent
+from training.evaluation.setting import Setting
+from training.experiments.heldout import HeldOut, held_out
+from training.experiments.results import Difference, Results, only, summarise
+from training.experiments.sides import BASELINES, Rival, Say, Side, find
+from training.experiments.translation import BEYOND, Translation, same_classes
+from training.pipeline import read_sources, split_and_encode
+from training.runs import RunError
+from training.trainer import TrainingData
+
+COMPARED: dict[str, tuple[str, ...]] = {
+    "T2 missing": ("MRR", "top-1", "top-10"),
+    "T2-at missing at a place": ("MRR",),
+    "T3 outliers, uniform": ("hit@1", "AUROC"),
+    "T1a relations": ("R-precision, instance counts", "R-precision, distinct classes"),
+    "T1b completion": ("R-precision",),
+    "T3b placement": ("hit@1",),
+}
+"""By task the metrics that are compared, its primary one first; more is better in all of them."""
+
+RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
+"""The tasks that only scenes with relations ask about."""
+
+# Tasks that leave out scenes without relations.
+_RELATED = ("T2-at missing at a place", "T3b placement")
+# Intervals over fewer groups than this are rough.
+_ENOUGH_GROUPS = 15
+# Answers that are shown of each model.
+_FIRST = 3
+_COLOURS = {"better": "green", "worse": "red"}
+
+console = Console()
+
+
+@dataclass(frozen=True)
+class Example:
+    """One object taken out of one scene.
+
+    Attributes:
+        scene: its id; room_type: or "".
+        shown: labels that were left.
+        removed: the label that was taken out.
+        ranks: of the removed one, by either model; the first of them where it is one of a tie.
+        answers: the first few of either.
+    """
+
+    scene: str
+    room_type: str
+    shown: tuple[str, ...]
+    removed: str
+    ranks: tuple[int, int]
+    answers: tuple[tuple[str, ...], tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two models side by side.
+
+    Attributes:
+        results: the first one is `ours`.
+        b: the title of the second.
+        scenes, groups: how many were asked about.
+        certain: nothing suggests that either has learnt from any of them.
+        notes: remarks on the figures.
+        examples: questions whose answers differ most.
+        unmeasured: tasks about relations at which the second was measured when it was published,
+            where the scenes ask about none.
+    """
+
+    results: Results
+    b: str
+    scenes: int
+    groups: int
+    certain: bool
+    notes: tuple[str, ...]
+    examples: tuple[Example, ...]
+    unmeasured: tuple[str, ...] = ()
+
+    @property
+    def a(self) -> str:
+        """The title of the first."""
+        return self.results.ours
+
+    def worse_by(self, margin: float) -> list[Difference]:
+        """The primary metrics in which the first is worse by more than a margin, surely."""
+        return [
+            row for row in self.results.differences if is_primary(row) and row.figure.high < -margin
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able: `Results.to_dict`, and the other attributes."""
+        own = asdict(self)
+        own.pop("results")
+        return self.results.to_dict() | {"a": self.a} | own
+
+
+def is_primary(row: Difference) -> bool:
+    """The metric by which its task is judged."""
+    return row.metric == COMPARED[row.task][0]
+
+
+def compare_command(
+    new: Annotated[str, typer.Argument(help="a finished run's folder, or a model of the store")],
+    old: Annotated[
+        str | None,
+        typer.Argument(
+            help=f"another one, or {BASELINES}; by default what `default` serves, and {BASELINES} "
+            "where nothing is"
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option("--data", help="folder with the first one's scenes")
+    ] = None,
+    store: Annotated[Path, typer.Option("--store", help="the model store")] = Path("model_store"),
+    limit: Annotated[int, typer.Option(min=2, help="scenes that are asked about")] = 300,
+    examples: Annotated[int, typer.Option(min=0, help="changed answers that are shown")] = 3,
+    output: Annotated[Path | None, typer.Option("--json", help="write everything here")] = None,
+) -> None:
+    """Compare two models on scenes that neither has learnt from.
+
+    The scenes are the test part of the first one's configuration; those that the second has learnt
+    from are left out. Intervals are of 95 %, paired, over groups of scenes.
+    """
+    try:
+        with console.status("reading") as status:
+            say: Say = status.update
+            a = find(new, Store(store), data, say)
+            b = find(old or _served(store), Store(store), data, say)
+            comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
+    except (ConfigError, DatasetError, RegistryError, RunError) as error:
+        console.print(f"[red]error:[/red] {error}", soft_wrap=True)
+        raise typer.Exit(1) from None
+    if output is not None:
+        text = json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False)
+        output.write_text(text + "\n", encoding="utf-8")
+    show(comparison, console)
+
+
+def _served(store: Path) -> str:
+    """The alias `default`, where the store has one."""
+    return "default" if "default" in Store(store).aliases() else BASELINES
+
+
+def _root(given: Path | None, *sides: Side) -> Path:
+    known = (side.data for side in sides)
+    return given or next((path for path in known if path is not None), DATA)
+
+
+def show(comparison: Comparison, console: Console) -> None:
+    """Print the table, the notes and the examples."""
+    title = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
+    table = Table(title=title, title_justify="left")
+    for name in ("task", "metric", comparison.a, comparison.b, "difference", ""):
+        table.add_column(name, overflow="fold")
+    cells = comparison.results.cells
+    values = {(cell.row, cell.task, cell.metric): cell.figure.value for cell in cells}
+    for row in comparison.results.differences:
+        colour, figure = _COLOURS.get(row.verdict, "dim"), row.figure
+        task, metric = (row.task, row.metric) if is_primary(row) else ("", f"  {row.metric}")
+        table.add_row(
+            *(task, metric),
+            *(f"{values[x, row.task, row.metric]:.3f}" for x in (comparison.a, comparison.b)),
+            f"{figure.value:+.3f} [{figure.low:+.3f}, {figure.high:+.3f}]",
+            f"[{colour}]{row.verdict}[/{colour}]",
+        )
+    console.print(table)
+    notes = list(comparison.notes)
+    if comparison.unmeasured:
+        names = ", ".join(comparison.unmeasured)
+        notes.append(f"nothing here shows how {comparison.a} does at {names}")
+    for note in notes:
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
+    if not comparison.examples:
+        return
+    console.print("Answers that differ most, each with one thing taken out of a scene:")
+    for example in comparison.examples:
+        room = f" ({example.room_type})" if example.room_type else ""
+        lines = [f"  {example.scene}{room}: {', '.join(example.shown)}"]
+        lines.append(f"    taken out: {example.removed}")
+        for name, rank, answers in zip(
+            (comparison.a, comparison.b), example.ranks, example.answers, strict=True
+        ):
+            lines.append(f"    {name} has it in place {rank}: {', '.join(answers)}, …")
+        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def compare(
+    a: Side, b: Side, root: Path, *, limit: int | None, examples: int, say: Say
+) -> Comparison:
+    """Ask both the questions of `COMPARED`, in the classes of the first.
+
+    Args:
+        root: the folder with the scenes of the first one's configuration.
+        limit: at most so many scenes.
+
+    Raises:
+        ConfigError: the first does not say how it was trained; its scenes cannot be found; none is
+            held out for both, or too few are.
+        DatasetError: the scenes cannot be read.
+    """
+    if a.config is None or a.vocabulary is None:
+        raise ConfigError(
+            f"{a.title} does not say which scenes were held out from it: name a model or a "
+            "run that was trained here first"
+        )
+    say("reading scenes")
+    sources = read_sources(a.config.data, root)
+    held = held_out(a, b, sources, root)
+    data = split_and_encode(a.config.data, sources, a.vocabulary).training_data()
+    scenes = some_scenes(_tensors(held.scenes, a.vocabulary), limit)
+    rivals = (a.rival(a.vocabulary, data, say), b.rival(a.vocabulary, data, say))
+    try:
+        titles = a.title, b.title if b.title != a.title else f"{b.title} (second)"
+        results = side_by_side(titles, rivals, scenes, data.structure, progress=say)
+    except ValueError as error:
+        raise ConfigError(f"{a.title} and {b.title} cannot be compared: {error}") from error
+    if not results.differences:
+        raise ConfigError(f"none of the {len(scenes)} scenes that are held out can be asked about")
+    groups = len({scene.group for scene in scenes.scenes})
+    say("looking for examples")
+    return Comparison(
+        results=results,
+        b=titles[1],
+        scenes=len(scenes),
+        groups=groups,
+        certain=held.certain,
+        notes=(
+            *held.notes,
+            *_classes_note(a, b, held),
+            *_limit_note(held, limit),
+            *_groups_note(groups),
+        ),
+        examples=tuple(_examples(rivals, scenes, data, a.vocabulary, examples)),
+        unmeasured=unmeasured(results.differences, b),
+    )
+
+
+def side_by_side(
+    titles: tuple[str, str],
+    rivals: tuple[Rival, Rival],
+    scenes: SceneTensors,
+    structure: Tensor,
+    *,
+    progress: Progress = silent,
+) -> Results:
+    """Every compared metric that both have on the scenes; differences are paired over groups.
+
+    Args:
+        structure: (V,) bool.
+
+    Raises:
+        ValueError: fewer than two groups: there is no interval.
+    """
+    setting = Setting(scenes, structure, limit=None)
+    groups = {
+        related: [scene.group for scene in setting.some(related).scenes]
+        for related in (False, True)
+    }
+    if len(set(groups[False])) < 2:
+        raise ValueError("the scenes are of fewer than two groups: no interval can be told")
+    reports = {}
+    for title, rival in zip(titles, rivals, strict=True):
+        report = SourceReport("held out", digest(setting))
+        for task in COMPARED:
+            for _ in run(rival(task), setting, report, tasks=[task], progress=progress):
+                pass
+        reports[title, 0] = {"held out": only(report, COMPARED)}
+    progress("resampling groups")
+    return summarise(reports, titles[0], groups=lambda task: groups[task in _RELATED])
+
+
+def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
+    """The tasks about relations at which a model was measured, where no row is of any."""
+    if other.artifact is None or any(row.task in RELATIONAL for row in rows):
+        return ()
+    measured = {metric.task for metric in other.artifact.manifest.metrics}
+    return tuple(task for task in RELATIONAL if task in measured)
+
+
+def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneTensors:
+    encoded = encode(scenes, vocabulary)
+    return scene_tensors(encoded, annotated_classes(encoded, vocabulary), len(vocabulary))
+
+
+def _examples(
+    rivals: tuple[Rival, Rival],
+    scenes: SceneTensors,
+    data: TrainingData,
+    vocabulary: Vocabulary,
+    count: int,
+) -> list[Example]:
+    first, second = (rival("T2 missing").objects for rival in rivals)
+    if first is None or second is None:
+        return []
+    return changed_most(first, second, scenes, data.structure, vocabulary, count)
+
+
+def _classes_note(a: Side, b: Side, held: HeldOut) -> list[str]:
+    """What the second does not know of the first one's classes."""
+    if a.vocabulary is None or b.vocabulary is None or same_classes(a.vocabulary, b.vocabulary):
+        return []
+    own = Translation.between(a.vocabulary, b.vocabulary).own
+    unknown = {label for label, index in zip(a.vocabulary.labels, own, strict=True) if index < 0}
+    mentions = [
+        a.vocabulary.labels[index]
+        for scene in held.scenes
+        for thing in scene.objects
+        if (index := a.vocabulary.index(thing.label)) is not None
+    ]
+    lost = sum(label in unknown for label in mentions)
+    return [
+        f"asked in the {len(a.vocabulary)} classes of {a.title}; {b.title} does not know "
+        f"{len(unknown)} of them, {lost / max(len(mentions), 1):.0%} of the mentions here: it is "
+        "not shown these, and ranks them last, in no order"
+    ]
+
+
+def _groups_note(groups: int) -> list[str]:
+    if groups >= _ENOUGH_GROUPS:
+        return []
+    return [f"{groups} groups are few: intervals over them are rough, and too narrow"]
+
+
+def _limit_note(held: HeldOut, limit: int | None) -> list[str]:
+    if limit is None or len(held.scenes) <= limit:
+        return []
+    return [f"{limit} of {len(held.scenes)} held-out scenes, by --limit"]
+
+
+def changed_most(
+    a: ObjectScore,
+    b: ObjectScore,
+    scenes: SceneTensors,
+    structure: Tensor,
+    vocabulary: Vocabulary,
+    count: int,
+) -> list[Example]:
+    """The removed objects whose reciprocal rank differs most, one a group, the largest first."""
+    first, second = (leave_one_out(scenes, structure, score) for score in (a, b))
+    change = np.abs(first.reciprocal_rank() - second.reciprocal_rank())
+    chosen: dict[str, int] = {}
+    for place in np.argsort(-change, kind="stable").tolist():
+        if len(chosen) == count or not change[place]:
+            break
+        chosen.setdefault(scenes.scenes[int(first.scene[place])].group, place)
+    found = []
+    for place in chosen.values():
+        scene = int(first.scene[place])
+        target = int(first.target[place])
+        found.append(
+            Example(
+                scene=scenes.scenes[scene].scene_id,
+                room_type=_room(vocabulary, scenes.scenes[scene].room_type),
+                shown=_shown(scenes, scene, target, vocabulary),
+                removed=vocabulary.labels[target],
+                ranks=(int(first.above[place]) + 1, int(second.above[place]) + 1),
+                answers=(
+                    _answers(a, scenes, scene, target, structure, vocabulary),
+                    _answers(b, scenes, scene, target, structure, vocabulary),
+                ),
+            )
+        )
+    return found
+
+
+def _room(vocabulary: Vocabulary, index: int) -> str:
+    return vocabulary.room_types[index] if index >= 0 else ""
+
+
+def _shown(
+    scenes: SceneTensors, scene: int, target: int, vocabulary: Vocabulary
+) -> tuple[str, ...]:
+    present = scenes.v[scene].nonzero().squeeze(1).tolist()
+    return tuple(vocabulary.labels[index] for index in present if index != target)
+
+
+def _answers(
+    score: ObjectScore,
+    scenes: SceneTensors,
+    scene: int,
+    target: int,
+    structure: Tensor,
+    vocabulary: Vocabulary,
+) -> tuple[str, ...]:
+    """The likeliest missing objects, as they are asked for in the task."""
+    v = scenes.v[scene].clone()
+    v[target] = 0.0
+    with torch.no_grad():
+        values = score(v.unsqueeze(0))[0].masked_fill((v > 0) | structure, -torch.inf)
+    order = values.argsort(descending=True, stable=True)[:_FIRST].tolist()
+    # What a model has no class for is no answer of it.
+    return tuple(vocabulary.labels[index] for index in order if values[index] > -BEYOND)

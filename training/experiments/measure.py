@@ -1,0 +1,353 @@
+"""Rows measured on every source; a finished report on disk is never computed again.
+
+<folder>/<row>/seed-<n>/row.json          its identity, the scenes it learnt from, its weights
+                        trials.jsonl      every trial of its tuning
+                        run/              the training run of a machine, and its calibration
+                        <source>.json     its report on a source
+                        pooled.json       what does not follow from these: see `WHOLE_SET`
+
+Several processes fill these files side by side, each row in one of them with one thread.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import pickle  # nosec B403
+import re
+import shutil
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing.queues import SimpleQueue
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+
+from training.evaluation.report import SourceReport, digest, measure, pooled
+from training.evaluation.tasks import ONCE, WHOLE_SET, Setting
+from training.experiments.rows import Material, Rival, Row
+
+# Called with (row, source, what is being done).
+Progress = Callable[[str, str, str], None]
+# The last note on a row and a source: measured now, or read from a file.
+DONE, KNOWN = "done", "known"
+Reports = dict[tuple[str, int], dict[str, SourceReport]]
+
+POOLED = "pooled"
+"""All sources together."""
+
+
+class BenchmarkError(RuntimeError):
+    """Files in the folder of another experiment; says which."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What every row is asked.
+
+    Attributes:
+        folder: of the reports.
+        material: what rows learn from.
+        settings: by source, and `POOLED` for all of them.
+        tasks: names in `TASKS` or `SEED_TASKS`.
+    """
+
+    folder: Path
+    material: Material
+    settings: Mapping[str, Setting]
+    tasks: Sequence[str]
+
+    def place(self, row: Row) -> Path:
+        """The folder of one row and seed."""
+        return place_of(self.folder, row.name, row.seed)
+
+    def asked(self, source: str) -> list[str]:
+        """The tasks that are measured on a source."""
+        if source == POOLED:
+            return [task for task in self.tasks if task in WHOLE_SET]
+        return [task for task in self.tasks if task not in ONCE]
+
+    def known(self, row: Row) -> dict[str, SourceReport]:
+        """The finished reports of a row, by source.
+
+        Raises:
+            BenchmarkError: the folder holds reports of other scenes, or of a row that was
+                configured otherwise or learnt from other scenes.
+        """
+        claim(self.place(row), row, self.material.digest)
+        found = {}
+        for source, setting in self.settings.items():
+            path = self.place(row) / f"{source}.json"
+            if not self.asked(source):
+                found[source] = SourceReport(source, digest(setting))
+            elif path.exists():
+                report = read_report(path, setting)
+                if set(self.asked(source)) <= set(report.outcomes):
+                    found[source] = report
+        return found
+
+    def measure(self, row: Row, progress: Progress) -> None:
+        """Fill in a row's report on every source, training it only where one lacks a task.
+
+        KeyboardInterrupt passes through; finished tasks are on disk by then.
+
+        Raises:
+            BenchmarkError: see `known`.
+        """
+        known = self.known(row)
+        rival: Rival | None = None
+        for source, setting in self.settings.items():
+            if source in known:
+                progress(row.name, source, KNOWN)
+                continue
+            say = partial(progress, row.name, source)
+            place = self.place(row)
+            if rival is None:
+                say("training")
+                rival = row.make(self.material, place, say)
+            contender = rival(setting)
+            _note_parameters(place, contender.parameters)
+            path = place / f"{source}.json"
+            measure(path, contender, setting, source, tasks=self.asked(source), progress=say)
+            say(DONE)
+
+    def report(self, row: Row) -> dict[str, SourceReport]:
+        """A measured row's reports as its files have them, that of the pool with all tasks."""
+        found = self.known(row)
+        sources = [found[source] for source in self.settings if source != POOLED]
+        if POOLED in self.settings:
+            whole = found[POOLED]
+            every = pooled(sources, POOLED)
+            every.outcomes |= whole.outcomes
+            found[POOLED] = every
+        return {source: found[source] for source in self.settings}
+
+
+def measure_rows(
+    plan: Plan,
+    rows: Sequence[Row],
+    progress: Progress,
+    *,
+    workers: int = 1,
+    fresh: bool = False,
+    failures: tuple[type[Exception], ...] = (),
+) -> tuple[Reports, dict[str, str]]:
+    """Every row's report on every source by (name, seed), and by name why others have none.
+
+    KeyboardInterrupt stops the workers and passes through; finished tasks are on disk by then.
+
+    Args:
+        fresh: earlier reports of these rows are removed.
+        failures: errors that end the row in which they arise and leave the others alone.
+
+    Raises:
+        BenchmarkError: see `Plan.known`.
+        BrokenProcessPool: a worker died.
+    """
+    if fresh:
+        for row in rows:
+            shutil.rmtree(plan.place(row), ignore_errors=True)
+    failed: dict[tuple[str, int], Exception] = {}
+    missing = [row for row in rows if len(plan.known(row)) < len(plan.settings)]
+    for row in rows:
+        if row not in missing:
+            plan.measure(row, progress)
+    if workers > 1 and missing:
+        count = min(workers, len(missing))
+        failed = _in_workers(plan, missing, progress, count, failures)
+    else:
+        for row in missing:
+            if error := _failure(plan, row, progress, failures):
+                failed[row.name, row.seed] = error
+    reasons = {name: f"seed {seed}: {error}" for (name, seed), error in failed.items()}
+    kept = [row for row in rows if row.name not in reasons]
+    return {(row.name, row.seed): plan.report(row) for row in kept}, reasons
+
+
+def _failure(
+    plan: Plan, row: Row, progress: Progress, failures: tuple[type[Exception], ...]
+) -> Exception | None:
+    try:
+        plan.measure(row, progress)
+    except failures as error:
+        return error
+    return None
+
+
+@contextmanager
+def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
+    """A progress bar over (row, source) pairs."""
+    columns = (
+        "[progress.description]{task.description}",
+        BarColumn(),
+        "{task.completed}/{task.total}",
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Bar(*columns, console=console) as bar:
+        task = bar.add_task(title, total=total, note="")
+
+        def show(row: str, source: str, note: str) -> None:
+            bar.update(task, note=f"{row}, {source}: {note}")
+            if note in (DONE, KNOWN):
+                bar.advance(task)
+
+        yield show
+
+
+def place_of(folder: Path, name: str, seed: int) -> Path:
+    """Where a row of one seed lies."""
+    return folder / slug(name) / f"seed-{seed}"
+
+
+def slug(name: str) -> str:
+    """A folder's name: lower case, words joined by hyphens."""
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+
+
+def parameters(folder: Path, rows: Sequence[Row]) -> dict[str, int]:
+    """Trained weights of the rows of which a number says something, by name."""
+    found = {}
+    for row in rows:
+        path = place_of(folder, row.name, row.seed) / "row.json"
+        count = json.loads(path.read_text(encoding="utf-8")).get("parameters")
+        if count is not None:
+            found[row.name] = int(count)
+    return found
+
+
+def claim(place: Path, row: Row, material: str) -> None:
+    """Write down whose folder this is.
+
+    Args:
+        material: digest of what the row learns from.
+
+    Raises:
+        BenchmarkError: it is another one's.
+    """
+    path = place / "row.json"
+    if path.exists():
+        known = json.loads(path.read_text(encoding="utf-8"))
+        if known["identity"] != row.identity:
+            raise BenchmarkError(
+                f"{place} holds another configuration of {row.name}; give --fresh or another folder"
+            )
+        if known.get("material") != material:
+            raise BenchmarkError(
+                f"{place} learnt from other scenes than these, or does not say from which: another "
+                "file, source, limit, split or vocabulary; give --fresh or another folder"
+            )
+        return
+    place.mkdir(parents=True, exist_ok=True)
+    values = {"name": row.name, "seed": row.seed, "identity": row.identity}
+    _write(path, values | {"material": material})
+
+
+def read_report(path: Path, setting: Setting) -> SourceReport:
+    """The report in a file.
+
+    Raises:
+        BenchmarkError: it is of other scenes or questions.
+    """
+    report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    if report.scenes != digest(setting):
+        raise BenchmarkError(
+            f"{path} is of other scenes or questions; give --fresh or another folder"
+        )
+    return report
+
+
+def _note_parameters(place: Path, count: int | None) -> None:
+    path = place / "row.json"
+    values = json.loads(path.read_text(encoding="utf-8"))
+    if values.get("parameters") != count:
+        _write(path, values | {"parameters": count})
+
+
+def _write(path: Path, values: Mapping[str, object]) -> None:
+    draft = path.with_name(path.name + ".part")
+    draft.write_text(json.dumps(values), encoding="utf-8")
+    draft.replace(path)
+
+
+# ------------------------------------------------------------------------------------- processes
+
+_Message = tuple[str, str, str]
+# Seconds between two looks for messages.
+_TICK = 0.2
+# Read by the linear algebra libraries when they are loaded, that is at the start of a process.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+_plan: Plan
+_messages: SimpleQueue[_Message]
+
+
+def _in_workers(
+    plan: Plan,
+    rows: Sequence[Row],
+    progress: Progress,
+    workers: int,
+    failures: tuple[type[Exception], ...],
+) -> dict[tuple[str, int], Exception]:
+    """Measure rows in processes; returns the `failures` by (name, seed)."""
+    # Plain bytes: torch would hand tensors over through shared memory, which containers keep small.
+    material = pickle.dumps(plan)
+    context = multiprocessing.get_context("spawn")
+    # A queue without a sending thread: the last message of a row is there when the row is done.
+    messages: SimpleQueue[_Message] = context.SimpleQueue()
+    with (
+        _one_thread(),
+        ProcessPoolExecutor(
+            workers, context, initializer=_begin, initargs=(material, messages)
+        ) as pool,
+    ):
+        futures = {pool.submit(_work, row, failures): (row.name, row.seed) for row in rows}
+        try:
+            while True:
+                done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
+                while not messages.empty():
+                    progress(*messages.get())
+                failed = {futures[future]: error for future in done if (error := future.result())}
+                if not waiting:
+                    return failed
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _begin(material: bytes, messages: SimpleQueue[_Message]) -> None:
+    global _plan, _messages  # set once in each worker
+    # Ctrl-C reaches every process of the terminal; the first one decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    # Written by the process that started this one, and passed on in memory.
+    _plan = pickle.loads(material)  # noqa: S301  # nosec B301
+    _messages = messages
+
+
+def _work(row: Row, failures: tuple[type[Exception], ...]) -> Exception | None:
+    return _failure(_plan, row, lambda *message: _messages.put(message), failures)

@@ -1,0 +1,147 @@
+"""Plots beside the tables.
+
+learning-curves.png   every machine and seed, from its run's curve
+reliability-*.png     of each machine: what its probabilities promise and what came true
+recall.png            relations among the first k predictions, removed objects in the first k places
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from training.evaluation.answers import QUESTIONS
+from training.evaluation.item_statistics import reliability
+from training.evaluation.metrics import Scored
+from training.evaluation.report import SourceReport
+from training.evaluation.setting import Outcome
+from training.experiments.measure import POOLED, Plan, slug
+from training.experiments.results import Results
+from training.experiments.rows import Row
+
+Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
+
+_CURVES = {
+    "mrr_validation": "MRR of removed objects",
+    "r_precision_validation": "R-precision of relations",
+    "object_error_validation": "reconstruction error, objects",
+    "relation_error_validation": "reconstruction error, relations",
+}
+_RECALL = {
+    "T1a relations": ("R@", "annotated relations among the first k, a scene"),
+    "T2 missing": ("top-", "removed objects in the first k places"),
+}
+
+
+def write_plots(
+    plan: Plan, machines: Sequence[Row], reports: Reports, results: Results
+) -> list[Path]:
+    """Every plot that there is something to draw for; what was written.
+
+    Args:
+        machines: the rows that have a run and a calibration, the first one ours.
+    """
+    matplotlib.use("Agg")
+    runs: dict[str, list[Path]] = {}
+    for entry in machines:
+        runs.setdefault(entry.name, []).append(plan.place(entry) / "run" / "curve.csv")
+    drawn: dict[str, Figure] = {
+        "learning-curves": learning_curves(runs),
+        "recall": recall_curves(results, POOLED),
+    }
+    for entry in machines:
+        outcome = reports[entry.name, entry.seed][POOLED].outcomes.get("Calibration")
+        if outcome is not None and entry.seed == machines[0].seed:
+            title = f"{entry.name}, {POOLED}"
+            drawn[f"reliability-{slug(entry.name)}"] = reliability_diagrams(outcome, title)
+    written = []
+    for name, figure in drawn.items():
+        path = plan.folder / f"{name}.png"
+        figure.savefig(path, dpi=110)
+        written.append(path)
+    return written
+
+
+def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
+    """Validation figures by epoch; one colour a machine, one line a seed."""
+    figure = Figure(figsize=(11, 6.5), layout="constrained")
+    axes = figure.subplots(2, 2).flat
+    for axis, (column, title) in zip(axes, _CURVES.items(), strict=True):
+        for colour, (name, paths) in enumerate(runs.items()):
+            for k, path in enumerate(paths):
+                epochs, values = read_curve(path, column)
+                label = name if k == 0 else None
+                axis.plot(epochs, values, color=f"C{colour}", alpha=0.8, label=label)
+        axis.set(xlabel="epoch", title=title)
+        axis.legend()
+    return figure
+
+
+def read_curve(path: Path, column: str) -> tuple[list[int], list[float]]:
+    """Epochs, counted from 1, and one column of a run's curve."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [int(row["epoch"]) + 1 for row in rows], [float(row[column]) for row in rows]
+
+
+def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
+    """One diagram a question, calibrated and not; bins of equal mass, logarithmic axes.
+
+    Most of the probabilities are small: on linear axes all but a bin or two lie in one corner.
+    """
+    asked = [name for name in QUESTIONS if f"ECE, {name}" in outcome.metrics]
+    figure = Figure(figsize=(3.2 * max(len(asked), 1), 3.6), layout="constrained")
+    figure.suptitle(title)
+    for axis, name in zip(_axes(figure, 1, len(asked)), asked, strict=True):
+        axis.plot([1e-5, 1], [1e-5, 1], color="0.7", linewidth=1)
+        for suffix, marker in ((", uncalibrated", "x"), ("", "o")):
+            metric = outcome.metrics[f"ECE, {name}{suffix}"]
+            if not isinstance(metric, Scored):
+                raise TypeError(f"ECE of {name} does not hold its answers")
+            bins = reliability(metric.score, metric.truth)
+            label = f"{suffix[2:] or 'as published'}, ECE {metric.value:.3f}"
+            axis.plot(bins.probability, bins.frequency, marker=marker, linewidth=1, label=label)
+        axis.set_xscale("symlog", linthresh=1e-3)
+        axis.set_yscale("symlog", linthresh=1e-3)
+        axis.set(xlim=(0, 1.1), ylim=(0, 1.1), xlabel="probability", title=name)
+        axis.legend(fontsize=7)
+    return figure
+
+
+def recall_curves(results: Results, source: str) -> Figure:
+    """Recall over the number of predictions, every row that was asked."""
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    for axis, (task, (prefix, title)) in zip(
+        _axes(figure, 1, len(_RECALL)), _RECALL.items(), strict=True
+    ):
+        for row, points in recall_points(results, task, prefix, source).items():
+            k, values = zip(*points, strict=True)
+            ours = row == results.ours
+            axis.plot(
+                k, values, label=row, linewidth=2.5 if ours else 1, marker="." if ours else ""
+            )
+        axis.set(xscale="log", xlabel="k", title=f"{title}, {source}", ylim=(0, 1))
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(fontsize=7)
+    return figure
+
+
+def recall_points(
+    results: Results, task: str, prefix: str, source: str
+) -> dict[str, list[tuple[int, float]]]:
+    """(k, value) by row, of the metrics that are called the prefix and k."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    for cell in results.cells:
+        k = cell.metric.removeprefix(prefix)
+        if (cell.task, cell.source) == (task, source) and k != cell.metric and k.isdigit():
+            found.setdefault(cell.row, []).append((int(k), cell.figure.value))
+    return {row: sorted(points) for row, points in found.items()}
+
+
+def _axes(figure: Figure, rows: int, columns: int) -> Iterator[Any]:
+    return iter(figure.subplots(rows, columns, squeeze=False).flat) if columns else iter(())

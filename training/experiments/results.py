@@ -1,0 +1,420 @@
+"""Results of rows × tasks: means over training seeds, paired differences, JSON and Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from training.evaluation.answers import QUESTIONS
+from training.evaluation.asking import SENSITIVITIES
+from training.evaluation.everyday import LINES
+from training.evaluation.evidence import KINDS
+from training.evaluation.intervals import Figure, Floats, Metric, paired_difference
+from training.evaluation.partial import SHARES
+from training.evaluation.report import SourceReport
+
+Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
+
+PRIMARY: dict[str, tuple[str, ...]] = {
+    "T1a relations": ("R-precision, distinct classes", "R-precision, instance counts"),
+    "T1 pairs": ("accuracy", "log-loss", "accuracy, unseen pairs", "accuracy, rare classes"),
+    "T1 with evidence": tuple(f"change of R-precision, {kind}" for kind in KINDS[:2]),
+    "T1b completion": ("R-precision",),
+    "T2 missing": ("MRR", "top-1", "top-10"),
+    "T2 missing, room type given": ("MRR", "MRR, room type withheld"),
+    "T2 partial": (
+        *(f"MRR, {share}" for share in SHARES),
+        "precision@5, 50 %",
+        "change of MRR, 50 %",
+    ),
+    "T2 with evidence": tuple(f"change of MRR, {kind}" for kind in KINDS),
+    "T2-at missing at a place": ("MRR", "MRR, on-top"),
+    "T3 outliers, uniform": ("hit@1", "AUROC", "alarms in untouched scenes", "intruders caught"),
+    "T3 outliers, by popularity": ("hit@1",),
+    "T3 outliers, same room type": ("hit@1",),
+    "T3 signature": (
+        "hit@1",
+        "hit@1, log-odds alone",
+        *(f"caught, {name}" for name in SENSITIVITIES),
+    ),
+    "T3 sensitivity": tuple(
+        f"{figure}, {name}"
+        for name in SENSITIVITIES
+        for figure in ("alarms", "caught, uniform", "caught, by popularity")
+    ),
+    "T3 with evidence": tuple(f"change of hit@1, {kind}" for kind in KINDS),
+    "T3b placement": ("hit@1",),
+    "T4 generate": (
+        "MMD², free",
+        "MMD², given room types",
+        "pair correlation, free",
+        "marginal error, free",
+        "copies of training scenes, free",
+        "mirrored relations, free",
+        "on-top cycles, free",
+    ),
+    "Density": ("gain over independent classes, upper log Z",),
+    "Calibration": tuple(
+        f"{figure}, {question}" for figure in ("ECE", "Brier skill") for question in QUESTIONS
+    ),
+    "Everyday": LINES,
+}
+"""What the Markdown tables show; the JSON holds every metric."""
+
+SEED_PRIMARY: dict[str, tuple[str, ...]] = {
+    "Seed T1": (
+        "labelled relations switched on",
+        "relations switched on per scene",
+        "labelled relations per scene",
+    ),
+    "Seed T2": (
+        "removed objects switched on, relations left on",
+        "removed objects switched on, relations deleted",
+    ),
+    "Seed T3": ("error measure", "error measure, doing nothing"),
+}
+"""The same of the seed protocol."""
+
+# Annotators list a part of the relations that hold.
+UNLISTED = "An unlisted relation counts as wrong"
+
+_RELATION_TASKS = ("T1a", "T1b", "T1 with")
+
+_LOWER_IS_BETTER = (
+    "MMD²",
+    "marginal error",
+    "copies",
+    "mirrored",
+    "on-top cycles",
+    "alarms",
+    "ECE",
+    "error",
+    "log-loss",
+    "outliers: plain scenes with an alarm",
+    "generate: the scene has what never belongs",
+    "generate: scenes of fewer",
+)
+
+
+class MeanOverSeeds(Metric):
+    """The mean of one metric over training seeds, on the same resampled scenes for all."""
+
+    def __init__(self, members: Sequence[Metric]) -> None:
+        if not members:
+            raise ValueError("a mean over seeds needs at least one metric")
+        if len({member.scenes for member in members}) > 1:
+            raise ValueError("the seeds were measured on different numbers of scenes")
+        self.members = tuple(members)
+
+    @property
+    def scenes(self) -> int:
+        """Scenes of each member."""
+        return self.members[0].scenes
+
+    @property
+    def n(self) -> int:
+        """Scored items of each member."""
+        return self.members[0].n
+
+    @property
+    def value(self) -> float:
+        """The mean."""
+        return float(np.mean([member.value for member in self.members]))
+
+    def at(self, weight: Floats) -> float:
+        """The mean where scene k counts weight[k] times."""
+        return float(np.mean([member.at(weight) for member in self.members]))
+
+    def resampled(self, resamples: int, seed: int) -> Floats:
+        """The mean in each resample, (resamples,)."""
+        draws = [member.draws(resamples, seed) for member in self.members]
+        shortest = min(len(draw) for draw in draws)
+        mean: Floats = np.mean([draw[:shortest] for draw in draws], axis=0)
+        return mean
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure.
+
+    Attributes:
+        row, task, source, metric: its place in the tables.
+        figure: mean over seeds, with the interval over scenes.
+        seeds: the value of each seed.
+    """
+
+    row: str
+    task: str
+    source: str
+    metric: str
+    figure: Figure
+    seeds: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Ours minus another row in one metric, with the paired interval."""
+
+    row: str
+    task: str
+    source: str
+    metric: str
+    figure: Figure
+
+    @property
+    def verdict(self) -> str:
+        """`better`, `worse` or `undecided`: is ours better, by the whole interval?"""
+        low, high = self.figure.low, self.figure.high
+        if self.metric.startswith(_LOWER_IS_BETTER):
+            low, high = -high, -low
+        return "better" if low > 0 else "worse" if high < 0 else "undecided"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The size of one task for one row and seed.
+
+    Attributes:
+        row, seed, task, source: its place in the tables.
+        scenes, skipped: how many were asked about, and how many of them could not be scored.
+        notes: such as a bandwidth, or log Z with its standard errors.
+    """
+
+    row: str
+    seed: int
+    task: str
+    source: str
+    scenes: int
+    skipped: int
+    notes: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results of an experiment.
+
+    Attributes:
+        ours: the row that the others are compared with.
+        cells, differences: in the order of rows, sources and tasks.
+        parameters: trained weights by row, for rows with weights.
+        asked: the size of each task.
+    """
+
+    ours: str
+    cells: tuple[Cell, ...]
+    differences: tuple[Difference, ...]
+    parameters: Mapping[str, int] = field(default_factory=dict)
+    asked: tuple[Asked, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "ours": self.ours,
+            "parameters": dict(self.parameters),
+            "cells": [asdict(cell) for cell in self.cells],
+            "differences": [asdict(one) | {"verdict": one.verdict} for one in self.differences],
+            "asked": [asdict(asked) for asked in self.asked],
+        }
+
+    def markdown(
+        self, primary: Mapping[str, tuple[str, ...]] = PRIMARY, *, changes: bool = False
+    ) -> str:
+        """One table for each primary metric, rows by sources, and remarks on each task.
+
+        A star marks a row that ours is better than, by the whole paired interval.
+
+        Args:
+            changes: brackets hold the interval of the row minus ours, in place of the row's own.
+        """
+        parts: list[str] = []
+        for task, metrics in primary.items():
+            tables = [table for name in metrics if (table := self._table(task, name, changes))]
+            if tables:
+                asked = [asked for asked in self.asked if asked.task == task]
+                parts += [*tables, *remarks(asked)]
+        return "\n\n".join(parts) + "\n"
+
+    def _table(self, task: str, metric: str, changes: bool) -> str:
+        cells = [cell for cell in self.cells if (cell.task, cell.metric) == (task, metric)]
+        if not cells:
+            return ""
+        gaps = {
+            (gap.row, gap.source): gap
+            for gap in self.differences
+            if (gap.task, gap.metric) == (task, metric)
+        }
+        shown = {
+            (cell.row, cell.source): _text(cell, gaps.get((cell.row, cell.source)), changes)
+            for cell in cells
+        }
+        sources = list(dict.fromkeys(cell.source for cell in cells))
+        lines = []
+        for row in dict.fromkeys(cell.row for cell in cells):
+            name = f"**{row}**" if row == self.ours else row
+            weights = f"{self.parameters[row]:,}" if row in self.parameters else ""
+            lines.append([name, weights, *(shown.get((row, source), "") for source in sources)])
+        parts = [f"### {task}: {metric}"]
+        if task.startswith(_RELATION_TASKS):
+            parts.append(f"{UNLISTED}.")
+        if changes:
+            parts.append(f"In brackets: the row minus {self.ours}, 95 % interval, same scenes.")
+        return "\n\n".join([*parts, grid(["", "weights", *sources], lines)])
+
+
+def _text(cell: Cell, gap: Difference | None, changes: bool) -> str:
+    if changes and gap is not None:
+        low, high = (0.0 - round(bound, 3) for bound in (gap.figure.high, gap.figure.low))
+        return f"{cell.figure.value:.3f} ({low:+.3f}, {high:+.3f})"
+    if changes:
+        return f"{cell.figure.value:.3f}"
+    return f"{cell.figure}{' *' if gap is not None and gap.verdict == 'better' else ''}"
+
+
+def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
+    """results.json and results.md of a folder, each replaced as a whole."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in (("md", text), ("json", json.dumps(values, indent=1) + "\n")):
+        draft = folder / f"results.{name}.part"
+        draft.write_text(content, encoding="utf-8")
+        draft.replace(folder / f"results.{name}")
+
+
+def summarise(
+    reports: Reports,
+    ours: str,
+    parameters: Mapping[str, int] | None = None,
+    *,
+    groups: Callable[[str], Sequence[str]] | None = None,
+) -> Results:
+    """The figures of every row, and its paired differences to ours.
+
+    Args:
+        groups: by task the group of each scene; differences then resample groups, not scenes.
+
+    Raises:
+        ValueError: no report of `ours`.
+    """
+    means = {
+        (row, source, task, name): MeanOverSeeds(metrics)
+        for row in dict.fromkeys(name for name, _ in reports)
+        for source, task, name, metrics in _by_metric(reports, row)
+    }
+    if not any(key[0] == ours for key in means):
+        raise ValueError(f"there is no report of {ours}")
+    cells = tuple(
+        Cell(row, task, source, name, mean.figure(), tuple(m.value for m in mean.members))
+        for (row, source, task, name), mean in means.items()
+    )
+    differences = tuple(
+        Difference(
+            *(row, task, source, name),
+            paired_difference(mine, mean, groups=None if groups is None else groups(task)),
+        )
+        for (row, source, task, name), mean in means.items()
+        if row != ours and (mine := means.get((ours, source, task, name))) is not None
+    )
+    return Results(ours, cells, differences, parameters or {}, tuple(_asked(reports)))
+
+
+def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
+    """The report with some metrics by task alone: resampling all of them takes minutes."""
+    outcomes = {
+        task: outcome
+        and replace(
+            outcome,
+            metrics={name: outcome.metrics[name] for name in names if name in outcome.metrics},
+        )
+        for task, names in wanted.items()
+        if task in report.outcomes
+        for outcome in [report.outcomes[task]]
+    }
+    return replace(report, outcomes=outcomes)
+
+
+def _asked(reports: Reports) -> Iterator[Asked]:
+    for (row, seed), by_source in reports.items():
+        for source, report in by_source.items():
+            for task, outcome in report.outcomes.items():
+                if outcome is not None:
+                    counts = outcome.scenes, outcome.skipped
+                    yield Asked(row, seed, task, source, *counts, outcome.notes)
+
+
+def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
+    """(source, task, metric name, one metric a seed) of a row.
+
+    A metric that is pooled from fewer sources for one seed than for another is left out: a source
+    has no skill where all of its asked relations hold.
+    """
+    found: dict[tuple[str, str, str], list[Metric]] = {}
+    for (name, _), by_source in reports.items():
+        if name != row:
+            continue
+        for source, report in by_source.items():
+            for task, outcome in report.outcomes.items():
+                for metric, value in (outcome.metrics if outcome else {}).items():
+                    found.setdefault((source, task, metric), []).append(value)
+    for (source, task, metric), values in found.items():
+        if len({value.scenes for value in values}) == 1:
+            yield source, task, metric, values
+
+
+def remarks(asked: Sequence[Asked]) -> list[str]:
+    """Skipped scenes and notes, for below the figures of one task."""
+    skipped = []
+    for source in dict.fromkeys(one.source for one in asked):
+        here = [one for one in asked if one.source == source]
+        count, scenes = _range(one.skipped for one in here), _range(one.scenes for one in here)
+        if count != "0":
+            skipped.append(f"{source} {count} of {scenes}")
+    parts = [f"Scenes that could not be scored: {', '.join(skipped)}."] if skipped else []
+    noted = [one for one in asked if one.notes]
+    return [*parts, _notes(noted)] if noted else parts
+
+
+def _range(counts: Iterable[int]) -> str:
+    """Of all rows; rows that answer about other scenes show as two numbers."""
+    low, *others = sorted(set(counts))
+    return f"{low:,}–{others[-1]:,}" if others else f"{low:,}"
+
+
+def _notes(asked: Sequence[Asked]) -> str:
+    """By source where the rows agree, by row where the sources agree, else by both."""
+    found: dict[str, Mapping[str, float]] = {}
+    for key in (_of_source, _of_row, _of_both):
+        found = {key(one): one.notes for one in asked}
+        if all(found[key(one)] == one.notes for one in asked):
+            break
+    names = list(dict.fromkeys(name for values in found.values() for name in values))
+    rows = (
+        [key, *(_number(values[name]) if name in values else "" for name in names)]
+        for key, values in found.items()
+    )
+    return grid(["", *names], rows)
+
+
+def _of_source(one: Asked) -> str:
+    return one.source
+
+
+def _of_row(one: Asked) -> str:
+    return f"{one.row}, seed {one.seed}"
+
+
+def _of_both(one: Asked) -> str:
+    return f"{_of_row(one)}, {one.source}"
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if float(value).is_integer() else f"{value:,.3f}"

@@ -1,0 +1,404 @@
+"""`python -m training tune`: a search on validation scenes that optuna stores, samples and prunes.
+
+<folder>/<configuration>/study.log   every trial, as optuna's journal
+                         <digest>/   of a trial's configuration: its curve, reports and checkpoint
+                         best.toml   the best configuration
+
+A space is a TOML file of settings with their choices or intervals:
+
+    "machine.H1" = [100, 200, 400]
+    "training.weight_decay" = { low = 0.01, high = 0.1, log = true }
+
+Source: Akiba et al., "Optuna: a next-generation hyperparameter optimization framework" (2019).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+
+import typer
+from pydantic import BaseModel, ConfigDict, ValidationError
+from rich.console import Console
+from rich.table import Table
+
+from training.config import (
+    Config,
+    ConfigError,
+    config_toml,
+    data_folder,
+    load_config,
+    with_settings,
+)
+from training.datasets import DatasetError
+from training.evaluation.contenders import Contender
+from training.evaluation.intervals import Metric, paired_difference
+from training.evaluation.missing import machine_score
+from training.evaluation.relations import machine_score as relation_score
+from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
+from training.pipeline import prepare
+from training.trainer import Trainer, TrainingData
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+    from optuna.distributions import BaseDistribution
+    from optuna.trial import FrozenTrial
+
+By: TypeAlias = Literal["mrr", "r-precision", "both"]
+
+FIGURES = {
+    "MRR": ("T2 missing", "MRR"),
+    "R-precision": ("T1a relations", "R-precision, instance counts"),
+}
+"""What trials are judged by: name to task and metric of the evaluation's tables."""
+
+_BY: dict[By, tuple[str, ...]] = {
+    "mrr": ("MRR",),
+    "r-precision": ("R-precision",),
+    "both": tuple(FIGURES),
+}
+# Trials must differ by the space alone: all learn from the same scenes with the same seed.
+_FIXED = ("data.", "training.seed", "training.threads")
+# Median pruning needs so many finished trials, and so great a share of a run.
+_RIVALS = 4
+_WARM_UP = 1 / 3
+
+console = Console()
+
+
+class _Interval(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    low: int | float
+    high: int | float
+    log: bool = False
+
+
+def tune(
+    configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
+    space: Annotated[
+        Path | None, typer.Option(help="what may vary; by default the shipped one of its name")
+    ] = None,
+    trials: Annotated[int, typer.Option(min=1, help="trials, earlier ones among them")] = 20,
+    by: Annotated[By, typer.Option(help="the figure to maximise")] = "both",
+    seed: Annotated[int, typer.Option(help="of the sampler")] = 0,
+    epochs: Annotated[int | None, typer.Option(min=1, help="for shorter cycles")] = None,
+    prune: Annotated[bool, typer.Option(help="give up on trials below the median")] = True,
+    data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="for trials and results")] = Path(
+        "runs/tuning"
+    ),
+    fresh: Annotated[bool, typer.Option("--fresh", help="forget earlier trials")] = False,
+) -> None:
+    """Search for better settings by validation scenes alone.
+
+    The configuration as it is comes first, then optuna's draws. The best one is written to
+    <folder>/<configuration>/best.toml. Ctrl-C keeps finished trials; the same command goes on from
+    there.
+    """
+    try:
+        original = load_config(configuration)
+        distributions = load_space(_space(original, space), original)
+        place = folder / original.name
+        if fresh:
+            shutil.rmtree(place, ignore_errors=True)
+        config = with_settings(original, {"training.epochs": epochs} if epochs else {})
+        with console.status("reading and encoding scenes"):
+            scenes = prepare(config, data_folder(configuration, config, data))
+        search = Search(place, config, scenes.training_data(), distributions, by)
+        study = search.open(scenes.digest, seed, prune=prune)
+        search.run(study, trials + 1)
+    except (ConfigError, DatasetError) as error:
+        console.print(f"[red]error:[/red] {error}")
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        console.print("stopped; the same command goes on from there")
+        raise typer.Exit(130) from None
+    console.print(_table(study, original.name))
+    if not _finished(study):
+        console.print("[red]error:[/red] no trial finished")
+        raise typer.Exit(1)
+    _conclude(search, study, original)
+
+
+def shipped_spaces() -> dict[str, Path]:
+    """The spaces that come with the package, by the name of their configuration."""
+    folder = Path(__file__).parents[1] / "configs/spaces"
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def _space(config: Config, path: Path | None) -> Path:
+    shipped = shipped_spaces()
+    if path is None and config.name not in shipped:
+        raise ConfigError(
+            f"no search space comes with {config.name}, only with {', '.join(shipped)}: name a "
+            "TOML file with --space"
+        )
+    return path or shipped[config.name]
+
+
+def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
+    """Read a space; each of its values must fit the configuration.
+
+    Raises:
+        ConfigError: no such file, not TOML, an entry that is neither choices nor an interval, or a
+            setting that does not exist, does not fit or must not vary.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"no search space {path}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path.name} is not TOML: {error}") from error
+    if not values:
+        raise ConfigError(f"{path.name} names no setting")
+    found = {}
+    for name, entry in values.items():
+        if name.startswith(_FIXED):
+            raise ConfigError(f"{name!r} is no setting to search: all trials share it")
+        try:
+            found[name] = _distribution(entry)
+        except (ValueError, ValidationError) as error:
+            raise ConfigError(
+                f"{path.name}: {name}: {_first_line(error)}; write a list of choices, or "
+                "{ low = ..., high = ... }"
+            ) from error
+        for value in entry if isinstance(entry, list) else (entry["low"], entry["high"]):
+            with_settings(config, {name: value})
+    return found
+
+
+def _distribution(entry: Any) -> BaseDistribution:
+    from optuna.distributions import (
+        CategoricalDistribution,
+        FloatDistribution,
+        IntDistribution,
+    )
+
+    if isinstance(entry, list):
+        return CategoricalDistribution(entry)
+    bounds = _Interval.model_validate(entry)
+    if not bounds.low < bounds.high:
+        raise ValueError(f"low must be below high, not {bounds.low} and {bounds.high}")
+    if isinstance(bounds.low, int) and isinstance(bounds.high, int):
+        return IntDistribution(bounds.low, bounds.high, log=bounds.log)
+    return FloatDistribution(bounds.low, bounds.high, log=bounds.log)
+
+
+def _first_line(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+    return str(error)
+
+
+class Search:
+    """Trials of a study: train, report every epoch, judge on all validation scenes.
+
+    Args:
+        folder: of the study.
+        config: what all trials share.
+        space: what they differ in.
+        by: the figure to maximise.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        data: TrainingData,
+        space: Mapping[str, BaseDistribution],
+        by: By,
+    ) -> None:
+        self.folder, self.config, self.data, self.space, self.by = folder, config, data, space, by
+
+    def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
+        """The study on disk, made where there is none.
+
+        Args:
+            scenes: digest of the scenes.
+
+        Raises:
+            ConfigError: the folder holds a search over another configuration or other scenes.
+        """
+        import optuna
+        from optuna.storages.journal import JournalFileBackend
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        backend = JournalFileBackend(str(self.folder / "study.log"))
+        warm_up = math.ceil(self.config.training.epochs * _WARM_UP) - 1
+        study = optuna.create_study(
+            storage=optuna.storages.JournalStorage(backend),
+            study_name=self.config.name,
+            direction="maximize",
+            load_if_exists=True,
+            pruner=optuna.pruners.MedianPruner(_RIVALS, warm_up)
+            if prune
+            else optuna.pruners.NopPruner(),
+        )
+        # A resumed sampler of the same seed would draw the same first points again.
+        study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.trials))
+        identity = {"config": self.config.digest, "scenes": scenes, "by": self.by}
+        if study.user_attrs.setdefault("identity", identity) != identity:
+            raise ConfigError(
+                f"{self.folder} holds a search over another configuration or other scenes, or by "
+                "another figure; give --fresh or another folder"
+            )
+        study.set_user_attr("identity", identity)
+        return study
+
+    def run(self, study: Study, trials: int) -> None:
+        """Run until so many trials are over, the configuration as it is first."""
+        import optuna
+        from optuna.trial import TrialState
+
+        if not study.trials:
+            study.enqueue_trial({}, user_attrs={"as it is": True})
+        for halted in study.get_trials(states=(TrialState.RUNNING,)):
+            # Stopped in the middle: its checkpoint lies in its folder.
+            original = halted.user_attrs.get("as it is", False)
+            study.enqueue_trial(halted.params, user_attrs={"as it is": original})
+            study.tell(halted.number, state=TrialState.FAIL)
+        while sum("settings" in known.user_attrs for known in study.trials) < trials:
+            trial = study.ask()
+            original = trial.user_attrs.get("as it is", False)
+            settings = {} if original else _suggested(trial, self.space)
+            state, reason, value = TrialState.COMPLETE, "", None
+            try:
+                value = self.value_of(trial, settings)
+            except FloatingPointError as error:
+                state, reason = TrialState.FAIL, str(error)
+            except optuna.TrialPruned:
+                state, reason = TrialState.PRUNED, "below the median of earlier trials"
+            trial.set_user_attr("settings", settings)
+            trial.set_user_attr("reason", reason)
+            study.tell(trial, value, state)
+            console.print(f"{shown(settings)}: {reason or value}", markup=False)
+
+    def value_of(self, trial: Trial, settings: Mapping[str, Any]) -> float:
+        """Train and judge one trial.
+
+        Raises:
+            FloatingPointError: it diverged.
+            optuna.TrialPruned: its best epoch is below the median of earlier trials.
+        """
+        import optuna
+
+        config = with_settings(self.config, settings)
+        place = self.folder / config.digest[:12]
+        trial.set_user_attr("digest", config.digest)
+        trainer = Trainer(config, self.data, place)
+        trainer.resume()
+        reported = 0
+
+        def report(*_: object) -> None:
+            nonlocal reported
+            for epoch in trainer.epochs[reported:]:
+                both = {"MRR": epoch.mrr_validation, "R-precision": epoch.r_precision_validation}
+                value = sum(both[name] for name in _BY[self.by] if not math.isnan(both[name]))
+                trial.report(value, reported)
+                reported += 1
+                if trial.should_prune():
+                    raise optuna.TrialPruned
+
+        try:
+            trainer.run(ended=report)
+        except (FloatingPointError, optuna.TrialPruned):
+            (place / "checkpoint.pt").unlink(missing_ok=True)
+            raise
+        metrics = self._judge(trainer, place)
+        (place / "checkpoint.pt").unlink(missing_ok=True)
+        trial.set_user_attr("figures", {name: str(m.figure()) for name, m in metrics.items()})
+        return sum(metrics[name].value for name in _BY[self.by] if name in metrics)
+
+    def _judge(self, trainer: Trainer, place: Path) -> dict[str, Metric]:
+        machine = trainer.machine
+        contender = Contender(objects=machine_score(machine), relations=relation_score(machine))
+        tasks = [task for task, _ in FIGURES.values()]
+        for source, setting in settings_by_source(
+            self.data.validation, self.data.structure, self.data.train, seen=None
+        ):
+            measure(place / f"{source}.json", contender, setting, source, tasks=tasks)
+        return self.metrics(trainer.config.digest)
+
+    def metrics(self, digest: str) -> dict[str, Metric]:
+        """`FIGURES` of a finished trial over all validation scenes."""
+        texts = (
+            (self.folder / digest[:12] / f"{source}.json").read_text(encoding="utf-8")
+            for source in sorted({scene.source for scene in self.data.validation.scenes})
+        )
+        report = pooled([SourceReport.from_dict(json.loads(text)) for text in texts])
+        return {
+            name: outcome.metrics[metric]
+            for name, (task, metric) in FIGURES.items()
+            if (outcome := report.outcomes.get(task))
+        }
+
+
+def shown(settings: Mapping[str, Any]) -> str:
+    """Settings in one line."""
+    return ", ".join(f"{name.partition('.')[2]} {v}" for name, v in settings.items()) or "as it is"
+
+
+def _finished(study: Study) -> list[FrozenTrial]:
+    from optuna.trial import TrialState
+
+    return study.get_trials(states=(TrialState.COMPLETE,))
+
+
+def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str, Any]:
+    from optuna.distributions import FloatDistribution, IntDistribution
+
+    found: dict[str, Any] = {}
+    for name, entry in space.items():
+        if isinstance(entry, IntDistribution):
+            found[name] = trial.suggest_int(name, entry.low, entry.high, log=entry.log)
+        elif isinstance(entry, FloatDistribution):
+            found[name] = trial.suggest_float(name, entry.low, entry.high, log=entry.log)
+        else:
+            found[name] = trial.suggest_categorical(name, entry.choices)  # type: ignore[attr-defined]
+    return found
+
+
+def _table(study: Study, title: str) -> Table:
+    """Trials from best to worst, those without figures last."""
+    table = Table(*FIGURES, "state", "settings", title=title)
+    trials = [trial for trial in study.trials if "settings" in trial.user_attrs]
+    for trial in sorted(trials, key=lambda t: math.inf if t.value is None else -t.value):
+        figures = trial.user_attrs.get("figures", {})
+        reason = trial.user_attrs.get("reason", "")
+        state = f"{trial.state.name.lower()}: {reason}" if reason else trial.state.name.lower()
+        settings = shown(trial.user_attrs["settings"])
+        table.add_row(*(figures.get(name, "") for name in FIGURES), state, settings)
+    return table
+
+
+def _conclude(search: Search, study: Study, original: Config) -> None:
+    """Write the best configuration, with the original's own number of epochs."""
+    best = study.best_trial
+    base = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
+    settings, digest = best.user_attrs["settings"], best.user_attrs["digest"]
+    tuned = with_settings(original, settings).model_copy(update={"name": f"{original.name}-tuned"})
+    figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
+    comment = [
+        f"{original.name}, {shown(settings)}.",
+        f"On validation scenes, {search.config.training.epochs} epochs: {figures}.",
+    ]
+    if settings and base is not None:
+        ours, theirs = search.metrics(digest), search.metrics(base.user_attrs["digest"])
+        gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
+        comment.append(f"Minus {original.name} as it is, paired by scenes: {', '.join(gaps)}.")
+        comment.append(
+            f"The best of {len(study.trials)} flatters itself: train both with more seeds."
+        )
+    path = search.folder / "best.toml"
+    text = "".join(f"# {line}\n" for line in comment) + "\n" + config_toml(tuned)
+    path.write_text(text, encoding="utf-8")
+    console.print("\n".join(comment), markup=False)
+    console.print(f"best configuration: {path}")
