@@ -12,8 +12,8 @@ import pytest
 
 from app.serving import answer_size
 from scene_client.schemas import MAX_BATCH
-from tests.http.conftest import launch, serve
 from tests.http.stores import VOCABULARY
+from tests.services import launch, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -112,8 +112,7 @@ async def test_no_answer_is_larger_than_estimated(
 
 def test_memory_stays_bounded(shared_store: Path, tmp_path: Path) -> None:
     """It grew by 700 MB."""
-    service = launch(shared_store, tmp_path / "log")
-    try:
+    with launch(shared_store, tmp_path / "log") as service:
         service.client.post("/relations", json=scene(23, **LARGEST))
         before = peak(service.process.pid)
         body = json.dumps(BATCH).encode()
@@ -121,10 +120,6 @@ def test_memory_stays_bounded(shared_store: Path, tmp_path: Path) -> None:
         answer = service.client.post("/relations/batch", content=body, headers=headers)
         assert answer.status_code == 200
         assert peak(service.process.pid) - before < 150 * 2**20
-    finally:
-        service.client.close()
-        service.process.kill()
-        service.process.wait()
 
 
 def peak(pid: int) -> int:

@@ -18,8 +18,8 @@ from pydantic import ValidationError
 
 from app import reasoning
 from app.settings import Settings
-from tests.http.conftest import launch, serve
 from tests.http.stores import VOCABULARY
+from tests.services import launch, serve
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 DEEP = {"objects": LABELS[:4], "model": "deep"}
@@ -120,8 +120,7 @@ def test_the_longest_deadline_is_no_shorter_than_the_default(shared_store: Path)
 
 
 def test_work_of_a_departed_client_ends(shared_store: Path, tmp_path: Path) -> None:
-    service = launch(shared_store, tmp_path / "log")
-    try:
+    with launch(shared_store, tmp_path / "log") as service:
         body = {**DEEP, "count": 64, "steps": 2000}
         costs = []
         for patience in (60, 0.1):
@@ -135,10 +134,6 @@ def test_work_of_a_departed_client_ends(shared_store: Path, tmp_path: Path) -> N
         # question between two scenes.
         assert begun < 0.6 * whole
         assert service.client.post("/outliers", json=HOME).is_success
-    finally:
-        service.client.close()
-        service.process.kill()
-        service.process.wait()
 
 
 def used(pid: int) -> float:

@@ -15,7 +15,6 @@ from app.registry import ArtifactError, Store, StoreError, load_model_set
 from app.registry.artifact import load_artifact
 from app.registry.tensors import MAX_HEADER_BYTES, unpack
 from app.registry.verified import MAX_MANIFEST_BYTES
-from tests.http.conftest import ADMIN_KEY, serve
 from tests.registry.small_artifacts import (
     description,
     replace_file,
@@ -23,6 +22,7 @@ from tests.registry.small_artifacts import (
     rewrite_manifest,
     state,
 )
+from tests.services import ADMIN_KEY, serve
 
 TERABYTE = 2**40
 ADMIN = {"X-Admin-Key": ADMIN_KEY}

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, ViewportSize, sync_playwright
 
 from tests.browser.driving import Board, link_to
-from tests.http.conftest import LiveService, launch
+from tests.services import LiveService
 
 DESK = {
     "objects": [
@@ -50,24 +50,14 @@ def chromium(require_system_tool: Callable[[str], Path]) -> Iterator[Browser]:
         browser.close()
 
 
-@pytest.fixture(scope="package")
-def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    """The service with the shipped models."""
-    running = launch(repository / "model_store", tmp_path_factory.mktemp("browser") / "log")
-    yield running
-    running.client.close()
-    running.process.terminate()
-    running.process.wait(timeout=30)
-
-
 @pytest.fixture
-def api(service: LiveService) -> httpx.Client:
+def api(shipped: LiveService) -> httpx.Client:
     """The same service, asked without a browser."""
-    return service.client
+    return shipped.client
 
 
 @pytest.fixture
-def open_board(chromium: Browser, service: LiveService) -> Iterator[Callable[..., Board]]:
+def open_board(chromium: Browser, shipped: LiveService) -> Iterator[Callable[..., Board]]:
     """Return a function that opens the page; what must never happen there fails the test."""
     opened: list[tuple[Page, list[str]]] = []
 
@@ -84,7 +74,7 @@ def open_board(chromium: Browser, service: LiveService) -> Iterator[Callable[...
         context = chromium.new_context(viewport=size, **options)
         context.set_default_timeout(15_000)
         context.add_init_script(_WITNESS)
-        root = home or str(service.client.base_url)
+        root = home or str(shipped.client.base_url)
         wrong: list[str] = []
 
         def only_home(route: Route) -> None:

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Route, expect
 
 from tests.browser.driving import Board
-from tests.http.conftest import launch
+from tests.services import launch
 
 pytestmark = pytest.mark.system
 
@@ -118,9 +118,8 @@ def test_the_page_outlives_the_service(
     open_board: OpenBoard, repository: Path, tmp_path: Path
 ) -> None:
     store = repository / "model_store"
-    mortal = launch(store, tmp_path / "log")
-    home = f"http://127.0.0.1:{mortal.port}"
-    try:
+    with launch(store, tmp_path / "log") as mortal:
+        home = f"http://127.0.0.1:{mortal.port}"
         board = open_board(home=home, allow=("ERR_", "503"))
         mortal.process.kill()
         mortal.process.wait()
@@ -133,18 +132,13 @@ def test_the_page_outlives_the_service(
         board.settle()
         assert len(board.body("missing")["objects"]) == 3
         assert board.rows("missing")
-    finally:
-        mortal.client.close()
-        mortal.process.kill()
-        mortal.process.wait()
 
 
 def test_a_service_with_a_key_is_asked_with_it(
     open_board: OpenBoard, repository: Path, tmp_path: Path
 ) -> None:
     key = "a-key-of-sixteen-letters"
-    guarded = launch(repository / "model_store", tmp_path / "log", SCENE_API_KEY=key)
-    try:
+    with launch(repository / "model_store", tmp_path / "log", SCENE_API_KEY=key) as guarded:
         board = open_board(home=f"http://127.0.0.1:{guarded.port}", allow=("401",))
         board.page.get_by_label("API key").first.fill(key)
         board.page.get_by_label("API key").first.press("Enter")
@@ -153,10 +147,6 @@ def test_a_service_with_a_key_is_asked_with_it(
         assert board.rows("missing")
         assert '-H "X-API-Key: $SCENE_API_KEY"' in board.curl("missing")
         assert key not in board.page.content()
-    finally:
-        guarded.client.close()
-        guarded.process.kill()
-        guarded.process.wait()
 
 
 def test_what_is_answered_behind_another_tab_is_no_longer_awaited(open_board: OpenBoard) -> None:

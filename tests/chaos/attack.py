@@ -14,7 +14,7 @@ from typing import Any
 from app.api.catalogue import PROBLEM_TYPES
 from scene_client.schemas import Problem
 from tests.chaos.corpus import JSON, MARKER, NUMBER, Hostile
-from tests.http.conftest import ADMIN_KEY
+from tests.services import ADMIN_KEY
 
 _LEAKS = (
     MARKER,

@@ -8,10 +8,9 @@ import pytest
 import requests
 import schemathesis
 
-from tests.chaos.service import control, running
-from tests.http.conftest import LiveService
 from tests.http.contract import call, documented
 from tests.http.stores import make_store
+from tests.services import LiveService, launch
 
 api = documented(examples=60)
 
@@ -20,9 +19,9 @@ api = documented(examples=60)
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     """A service of its own: the administration's routes change its store."""
     folder = tmp_path_factory.mktemp("contract")
-    with running(make_store(folder / "store"), folder / "log") as service:
+    with launch(make_store(folder / "store"), folder / "log") as service:
         yield service
-        control(service)
+        service.control()
         assert "Traceback" not in service.log.read_text()
 
 

@@ -13,9 +13,8 @@ import pytest
 from benchmarks.load.connections import prepared
 from benchmarks.load.windows import at_concurrency, at_rate
 from tests.chaos.load import ConstantLoad, Pulse
-from tests.chaos.service import control, memory, running
-from tests.http.conftest import LiveService
 from tests.http.stores import make_store
+from tests.services import LiveService, launch
 
 SECONDS = float(os.environ.get("CHAOS_OVERLOAD_SECONDS", "30"))
 DEADLINE = 1.0
@@ -35,7 +34,9 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     folder = tmp_path_factory.mktemp("overload")
     store = make_store(folder / "store")
     # A line a request on a disk that others use is no part of what is tested.
-    with running(store, folder / "log", access_log="false", max_connections="4096") as service:
+    with launch(
+        store, folder / "log", SCENE_ACCESS_LOG="false", SCENE_MAX_CONNECTIONS="4096"
+    ) as service:
         yield service
 
 
@@ -45,11 +46,11 @@ def sustainable(port: int) -> float:
 
 
 def test_overload_is_refused_and_leaves_nothing_behind(service: LiveService) -> None:
-    before = control(service)
+    before = service.control()
     rate = sustainable(service.port)
     # A first overload allocates what every later one uses again.
     asyncio.run(at_rate(service.port, REQUESTS, 10 * rate, 2, connections=512))
-    resident = memory(service)
+    resident = service.memory
 
     pulse = Pulse(service.port, "/health/live")
     with pulse.beating():
@@ -59,11 +60,11 @@ def test_overload_is_refused_and_leaves_nothing_behind(service: LiveService) -> 
     assert set(window.statuses) <= {200, 429, 504}
     assert window.statuses[429] > 0
     assert set(pulse.statuses) == {200}
-    assert control(service) == before
+    assert service.control() == before
     # What follows is time: it is meant for a machine with a core for each of the two sides.
     assert np.quantile(pulse.seconds, 0.99) < 0.05
     assert recovered > 0.8 * rate
-    assert memory(service) - resident < 16 * 2**20
+    assert service.memory - resident < 16 * 2**20
     assert "Traceback" not in service.log.read_text()
 
 

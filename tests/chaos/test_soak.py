@@ -18,10 +18,9 @@ from benchmarks.load.connections import prepared
 from tests.chaos import corpus
 from tests.chaos.attack import attack
 from tests.chaos.load import ConstantLoad
-from tests.chaos.service import control, descriptors, memory, running
 from tests.chaos.trends import trend
-from tests.http.conftest import ADMIN_KEY, LiveService
 from tests.http.stores import make_store
+from tests.services import ADMIN_KEY, LiveService, launch
 
 MINUTES = float(os.environ.get("CHAOS_SOAK_MINUTES", "0"))
 CYCLE = 5.0
@@ -31,7 +30,9 @@ pytestmark = pytest.mark.skipif(MINUTES <= 0, reason="CHAOS_SOAK_MINUTES says ho
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[LiveService]:
-    with running(make_store(tmp_path / "store"), tmp_path / "log", access_log="false") as service:
+    with launch(
+        make_store(tmp_path / "store"), tmp_path / "log", SCENE_ACCESS_LOG="false"
+    ) as service:
         yield service
 
 
@@ -52,7 +53,7 @@ def cycle(service: LiveService, hostile: list[corpus.Hostile]) -> list[str]:
 
 
 def test_nothing_grows(service: LiveService) -> None:
-    before = control(service)
+    before = service.control()
     requests = [
         prepared(route, {"objects": ["bed", "lamp", "desk", "chair"], "seed": 1} | extra)
         for route, extra in {
@@ -73,7 +74,7 @@ def test_nothing_grows(service: LiveService) -> None:
     # a cycle sends a hundredth, so that new ones would come for eight minutes.
     for _ in range(2):
         attack(service.port, every)
-    files = descriptors(service)
+    files = service.descriptors
     end = time.monotonic() + 60 * MINUTES
     with ConstantLoad(service.port, requests, judge, connections=2) as load:
         for number in count():
@@ -81,12 +82,12 @@ def test_nothing_grows(service: LiveService) -> None:
                 break
             began = time.monotonic()
             faults += cycle(service, every[number % 97 :: 97])
-            readings.append(memory(service))
+            readings.append(service.memory)
             time.sleep(max(0.0, CYCLE - (time.monotonic() - began)))
     assert faults + load.tally.faults == []
     assert sum(load.tally.statuses.values()) == load.tally.sent
-    assert control(service) == before
-    assert descriptors(service) <= files + 8
+    assert service.control() == before
+    assert service.descriptors <= files + 8
     settled = readings[len(readings) // 4 :]
     grown = trend(settled)
     print("resident, MiB:", *(reading >> 20 for reading in readings))  # all of it, where it fails

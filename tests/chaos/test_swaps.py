@@ -22,10 +22,9 @@ from app.serving.rounding import significant
 from benchmarks.load.connections import prepared
 from scene_client.schemas import MissingRequest
 from tests.chaos.load import ConstantLoad
-from tests.chaos.service import control, memory, running
 from tests.chaos.trends import trend
-from tests.http.conftest import ADMIN_KEY, LiveService
 from tests.http.stores import make_store, publish
+from tests.services import ADMIN_KEY, LiveService, launch
 
 SWAPS = int(os.environ.get("CHAOS_SWAPS", "500"))
 VERSIONS = ("1.0.0", "1.1.0", "1.2.0")
@@ -137,7 +136,7 @@ def swap(service: LiveService, store: Path, number: int) -> list[str]:
 
 @pytest.fixture
 def service(store: Path, tmp_path: Path) -> Iterator[LiveService]:
-    with running(store, tmp_path / "log", access_log="false") as service:
+    with launch(store, tmp_path / "log", SCENE_ACCESS_LOG="false") as service:
         yield service
 
 
@@ -158,7 +157,7 @@ def test_no_answer_is_lost_or_mixed_and_no_memory_kept(service: LiveService, sto
             return f"{answer['model']} says {given}, not {known[digest][number]}"
         return None
 
-    before = control(service)
+    before = service.control()
     requests = [prepared("/missing", body) for body in SCENES]
     faults: list[str] = []
     readings: list[int] = []
@@ -166,14 +165,14 @@ def test_no_answer_is_lost_or_mixed_and_no_memory_kept(service: LiveService, sto
         for number in range(SWAPS):
             faults += swap(service, store, number)
             if number >= SWAPS // 5:
-                readings.append(memory(service))
+                readings.append(service.memory)
     assert faults == []
     assert load.tally.faults == []
     assert sum(load.tally.statuses.values()) == load.tally.sent
     assert seen == set(known)
     alias = {"model": "home@1.0.0"}
     assert service.client.put("/models/aliases/default", json=alias, headers=ADMIN).is_success
-    assert control(service) == before
+    assert service.control() == before
     grown = trend(readings)
     # A model of this store has 10 kB of weights; a version that is never let go would show as the
     # hundred kB that its artifact, its compiled views and its card take together, each time.

@@ -13,30 +13,13 @@ import pytest
 from tests.client import callers
 from tests.client.callers import Caller
 from tests.client.peers import Peer
-from tests.http.conftest import LiveService, launch
-from tests.http.stores import make_store
+from tests.services import LiveService
 
 
 @pytest.fixture(scope="session")
-def client_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store that no test changes."""
-    return make_store(tmp_path_factory.mktemp("store"))
-
-
-@pytest.fixture(scope="session")
-def service(client_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    """The service as a process of its own."""
-    service = launch(client_store, tmp_path_factory.mktemp("live") / "log")
-    yield service
-    service.client.close()
-    service.process.terminate()
-    service.process.wait(timeout=30)
-
-
-@pytest.fixture(scope="session")
-def url(service: LiveService) -> str:
+def url(live: LiveService) -> str:
     """Where the service is."""
-    return f"http://127.0.0.1:{service.port}"
+    return live.url
 
 
 @pytest.fixture(scope="session")
@@ -91,7 +74,7 @@ def caller(request: pytest.FixtureRequest, url: str) -> Iterator[Caller]:
         case "async":
             opened = callers.async_caller(url)
         case "offline":
-            opened = callers.offline_caller(request.getfixturevalue("client_store"))
+            opened = callers.offline_caller(request.getfixturevalue("shared_store"))
         case "cpp":
             opened = callers.cpp_caller(request.getfixturevalue("bridge"), url)
         case other:

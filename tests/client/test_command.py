@@ -132,9 +132,9 @@ def test_everything_has_a_table(scene: Any, arguments: tuple[str, ...]) -> None:
         assert word in done.stdout
 
 
-def test_answers_without_a_service_are_the_same(scene: Any, client_store: Path) -> None:
+def test_answers_without_a_service_are_the_same(scene: Any, shared_store: Path) -> None:
     over_http = json.loads(scene("missing", "bed", "--json").stdout)
-    done = scene("missing", "bed", "--json", "--offline", str(client_store))
+    done = scene("missing", "bed", "--json", "--offline", str(shared_store))
     offline = json.loads(done.stdout)
     assert {**offline, "request_id": ""} == {**over_http, "request_id": ""}
 

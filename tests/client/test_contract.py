@@ -23,8 +23,8 @@ from scene_client.schemas import Answer
 from tests.client.callers import Caller
 from tests.client.conftest import EVERY
 from tests.conftest import REPOSITORY
-from tests.http.conftest import ADMIN_KEY, LiveService, launch
 from tests.http.stores import make_store
+from tests.services import ADMIN_KEY, LiveService, launch
 
 every_client = pytest.mark.parametrize("caller", EVERY, indirect=True)
 
@@ -59,10 +59,10 @@ def _same(answer: dict[str, Any], other: dict[str, Any]) -> bool:
 @every_client
 @pytest.mark.parametrize("number", range(len(QUESTIONS)))
 def test_every_question_is_answered_as_the_service_answers_it(
-    caller: Caller, service: LiveService, number: int
+    caller: Caller, live: LiveService, number: int
 ) -> None:
     question, request = QUESTIONS[number]
-    response = service.client.post(f"/{question}", json=request)
+    response = live.client.post(f"/{question}", json=request)
     assert response.status_code == 200
     answer = caller(question, request)
     assert answer["request_id"]
@@ -72,10 +72,10 @@ def test_every_question_is_answered_as_the_service_answers_it(
 
 @pytest.mark.parametrize("number", range(len(QUESTIONS)))
 def test_typed_answers_keep_every_byte(
-    service: LiveService, url: str, client_store: Path, number: int
+    live: LiveService, url: str, shared_store: Path, number: int
 ) -> None:
     question, request = QUESTIONS[number]
-    sent = service.client.post(f"/{question}", json=request, headers={"X-Request-Id": "r"})
+    sent = live.client.post(f"/{question}", json=request, headers={"X-Request-Id": "r"})
     with Client(url) as client:
         answer: Answer = getattr(client, question)(request)
         renamed = answer.model_copy(update={"request_id": "r"})
@@ -84,20 +84,20 @@ def test_typed_answers_keep_every_byte(
 
 @every_client
 def test_a_batch_is_answered_in_order_each_entry_by_itself(
-    caller: Caller, service: LiveService
+    caller: Caller, live: LiveService
 ) -> None:
     scenes = [{"objects": ["bed"]}, {"objects": ["nonsuch"]}, {"objects": ["desk", "lamp"]}]
     for question in ("relations", "missing", "outliers"):
         found = caller(f"{question}_batch", scenes)["results"]
         assert [entry["status"] for entry in found] == [200, 422, 200]
         assert found[1]["problem"]["type"] == "/problems/unknown-labels"
-        response = service.client.post(f"/{question}", json=scenes[2]).json()
+        response = live.client.post(f"/{question}", json=scenes[2]).json()
         assert _same(found[2]["result"], response)
 
 
 @every_client
-def test_models_are_listed(caller: Caller, service: LiveService) -> None:
-    assert caller("models") == service.client.get("/models").json()
+def test_models_are_listed(caller: Caller, live: LiveService) -> None:
+    assert caller("models") == live.client.get("/models").json()
 
 
 @every_client
@@ -147,9 +147,9 @@ def test_who_cannot_wait_is_told_so_and_may_ask_again(caller: Caller) -> None:
 
 
 def test_clients_without_a_service_answer_the_whole_catalogue_alike(
-    url: str, client_store: Path
+    url: str, shared_store: Path
 ) -> None:
-    with Client(url) as online, OfflineClient(client_store) as offline:
+    with Client(url) as online, OfflineClient(shared_store) as offline:
         for ask in (
             lambda client: client.model("home"),
             lambda client: client.model("home", "1.0.0"),
@@ -173,10 +173,10 @@ except DeadlineError:
 
 
 def test_an_offline_client_that_nobody_closes_keeps_no_program_from_ending(
-    client_store: Path,
+    shared_store: Path,
 ) -> None:
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", UNCLOSED, client_store],
+        [sys.executable, "-W", "error", "-c", UNCLOSED, shared_store],
         cwd=REPOSITORY,
         # What the environment says of a service does not concern it.
         env={**os.environ, "SCENE_API_KEY": "short", "SCENE_STORE": "/nowhere"},
@@ -204,18 +204,13 @@ def test_a_store_without_a_usable_default_is_not_ready(tmp_path: Path) -> None:
 
 def test_what_is_served_is_changed_alike_with_a_service_and_without(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
-    service = launch(store, tmp_path / "log")
-    try:
+    with launch(store, tmp_path / "log") as service:
         with Client(f"http://127.0.0.1:{service.port}", admin_key=ADMIN_KEY) as scene:
             change(scene)
         with Client(f"http://127.0.0.1:{service.port}") as scene:
             with pytest.raises(ProblemError) as raised:
                 scene.refresh()
             assert raised.value.type == "/problems/unauthorized"
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=30)
     with OfflineClient(store) as scene:
         change(scene)
 

@@ -18,12 +18,12 @@ from py_trees.common import Status
 from scene_client import Client, UnreachableError
 from scene_client.vision_msgs import SceneFields, from_message
 from tests.deploy.ros import load_package
-from tests.http.conftest import LiveService
+from tests.services import LiveService
 
 
 @pytest.fixture(scope="module")
-def client(service: LiveService) -> Iterator[Client]:
-    with Client(f"http://127.0.0.1:{service.port}", timeout=20.0) as client:
+def client(live: LiveService) -> Iterator[Client]:
+    with Client(f"http://127.0.0.1:{live.port}", timeout=20.0) as client:
         yield client
 
 

@@ -15,7 +15,7 @@ import pytest
 from scene_client import Client
 from scene_client.vision_msgs import SceneFields, from_message
 from tests.client import callers
-from tests.http.conftest import LiveService
+from tests.services import LiveService
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -52,8 +52,8 @@ def tick(program: Path, url: str, kind: str, *ports: Any, timeout: float = 20.0)
 
 
 @pytest.fixture
-def url(service: LiveService) -> str:
-    return f"http://127.0.0.1:{service.port}"
+def url(live: LiveService) -> str:
+    return f"http://127.0.0.1:{live.port}"
 
 
 @pytest.fixture

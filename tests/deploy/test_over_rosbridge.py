@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from tests.http.conftest import LiveService
+from tests.services import LiveService
 
 
 @contextmanager
@@ -63,10 +63,10 @@ def run(repository: Path, *arguments: str) -> tuple[list[Any], list[str]]:
 
 @pytest.mark.parametrize(("question", "part"), [("missing", "missing"), ("outliers", "outliers")])
 def test_a_published_message_is_answered(
-    repository: Path, service: LiveService, question: str, part: str
+    repository: Path, live: LiveService, question: str, part: str
 ) -> None:
     recorded = json.loads((repository / "clients/ros2/detections.json").read_text())
-    at = f"http://127.0.0.1:{service.port}"
+    at = f"http://127.0.0.1:{live.port}"
     with bridge({"op": "status", "level": "info"}, recorded) as (url, heard):
         (answer,), errors = run(
             repository, url, "/detections_3d", "--service", at, "--question", question

@@ -21,7 +21,7 @@ from scene_client import Client, UnreachableError
 from scene_client.vision_msgs import SceneFields
 from tests.client.ros_messages import blank
 from tests.deploy.ros import PACKAGE, STORE, Ros, from_json, load_package
-from tests.http.conftest import LiveService
+from tests.services import LiveService
 
 
 @pytest.fixture
@@ -76,17 +76,13 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Running]]:
         assert running.ros.destroyed
 
 
-def url(service: LiveService) -> str:
-    return f"http://127.0.0.1:{service.port}"
-
-
 # ----------------------------------------------------------------------------------- the node
 
 
 def test_detections_become_answers_markers_and_a_diagnosis(
-    run: Callable[..., Running], service: LiveService, recorded: Any
+    run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
-    running = run(url=url(service), timeout=20.0)
+    running = run(url=live.url, timeout=20.0)
     running.hear("detections", recorded)
     running.tick_until(lambda: running.said("~/answers"))
     (published,) = running.said("~/answers")
@@ -148,14 +144,14 @@ def test_no_callback_waits_and_only_the_newest_detections_are_asked_about(
 
 
 def test_a_service_that_is_not_there_is_diagnosed_and_its_return_noticed(
-    run: Callable[..., Running], service: LiveService, recorded: Any
+    run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
     running = run(url="http://127.0.0.1:9", timeout=0.5)
     running.hear("detections", recorded)
     running.tick_until(lambda: running.said("/diagnostics"))
     assert running.status().level == 2
     assert running.status().message.startswith(("UnreachableError", "DeadlineError"))
-    with Client(url(service), timeout=20.0) as client:
+    with Client(live.url, timeout=20.0) as client:
         running.node.advisor.client = client
         running.hear("detections", recorded)
         running.tick_until(lambda: running.said("~/answers"))
@@ -171,14 +167,14 @@ def test_a_view_of_nothing_asks_nothing(run: Callable[..., Running]) -> None:
 
 
 def test_numbers_wait_for_their_labels(
-    run: Callable[..., Running], service: LiveService, recorded: Any
+    run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
     numbers = {"desk": "0", "chair": "1"}
     for detection in recorded.detections:
         for result in detection.results:
             name = result.hypothesis.class_id
             result.hypothesis.class_id = numbers.get(name, "9")
-    running = run(url=url(service), timeout=20.0)
+    running = run(url=live.url, timeout=20.0)
     running.hear("detections", recorded)
     running.tick_until(lambda: running.said("/diagnostics"))
     assert running.status().message.startswith("MessageError: the class ids are numbers")
@@ -201,13 +197,13 @@ def test_labels_may_be_listed_in_the_parameters(run: Callable[..., Running]) -> 
 
 
 def test_a_pose_in_the_frame_of_the_detections_is_their_viewpoint(
-    run: Callable[..., Running], service: LiveService, recorded: Any
+    run: Callable[..., Running], live: LiveService, recorded: Any
 ) -> None:
     def horizontal(answer: Any) -> set[str]:
         found = json.loads(answer.data)["missing"]["observed_relations"]
         return {entry["relation"] for entry in found} & {"left", "front"}
 
-    running = run(url=url(service), timeout=20.0)
+    running = run(url=live.url, timeout=20.0)
     for message in (recorded, *recorded.detections):
         message.header.frame_id = "map"
     running.hear("detections", recorded)
@@ -244,9 +240,9 @@ def test_a_camera_that_stands_still_has_its_viewpoint_in_the_parameters(
 
 
 def test_images_are_heard_where_the_parameters_say_so(
-    run: Callable[..., Running], service: LiveService
+    run: Callable[..., Running], live: LiveService
 ) -> None:
-    running = run(url=url(service), timeout=20.0, kind="2d", questions=["outliers"])
+    running = run(url=live.url, timeout=20.0, kind="2d", questions=["outliers"])
     names, places = ("bed", "lamp"), (100.0, 160.0)
     detections = []
     for name, place in zip(names, places, strict=True):

@@ -13,7 +13,7 @@ from app.main import create_app
 from app.settings import Settings
 from scene_client import schemas
 from tests.conftest import REPOSITORY
-from tests.http.conftest import ADMIN_KEY, LiveService
+from tests.services import ADMIN_KEY, LiveService
 
 _FORMS: dict[str, type[BaseModel]] = {
     "/relations": schemas.RelationsRequest,

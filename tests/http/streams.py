@@ -11,8 +11,8 @@ from typing import Any
 import httpx
 from websockets.sync.client import ClientConnection, connect
 
-from tests.http.conftest import LiveService
 from tests.http.stores import VOCABULARY
+from tests.services import LiveService
 
 LABELS = [entry.label for entry in VOCABULARY.objects]
 ASK: dict[str, Any] = {

@@ -64,13 +64,6 @@ async def test_a_batch_holds_1_to_256_scenes(client: httpx.AsyncClient, scenes: 
     assert response.json()["errors"][0]["pointer"] == "#/scenes"
 
 
-async def test_256_scenes_are_answered(client: httpx.AsyncClient) -> None:
-    scenes = [{"objects": ["bed", "lamp", "chair"], "seed": i} for i in range(256)]
-    response = await client.post("/missing/batch", json={"scenes": scenes})
-    assert {entry["status"] for entry in response.json()["results"]} == {200}
-    assert len(response.json()["results"]) == 256
-
-
 async def test_there_is_no_batch_of_drawings(client: httpx.AsyncClient) -> None:
     assert (await client.post("/generate/batch", json={"scenes": []})).status_code == 404
 

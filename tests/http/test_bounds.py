@@ -15,8 +15,8 @@ import pytest
 
 from app import reasoning
 from app.serving.admission import WorkQueue
-from tests.http.conftest import launch, serve
 from tests.http.test_problems import problem
+from tests.services import launch, serve
 
 SCENE = {"objects": ["bed", "chair", "lamp"]}
 QUESTIONS = ("relations", "missing", "outliers", "generate")
@@ -182,18 +182,17 @@ async def test_a_batch_stops_where_its_deadline_passes(
 def test_ending_finishes_what_was_begun_and_takes_nothing_new(
     shared_store: Path, tmp_path: Path
 ) -> None:
-    service = launch(shared_store, tmp_path / "log", SCENE_DRAIN_SECONDS="1.5")
-    answers: list[httpx.Response] = []
+    with launch(shared_store, tmp_path / "log", SCENE_DRAIN_SECONDS="1.5") as service:
+        answers: list[httpx.Response] = []
 
-    def draw() -> None:
-        with httpx.Client(base_url=service.client.base_url, timeout=60) as client:
-            # By tensors, which take longer than compiled chains.
-            body = {**SCENE, "model": "plain", "count": 64, "steps": 400}
-            headers = {"X-Request-Timeout-Ms": "60000"}
-            answers.append(client.post("/generate", json=body, headers=headers))
+        def draw() -> None:
+            with httpx.Client(base_url=service.client.base_url, timeout=60) as client:
+                # By tensors, which take longer than compiled chains.
+                body = {**SCENE, "model": "plain", "count": 64, "steps": 400}
+                headers = {"X-Request-Timeout-Ms": "60000"}
+                answers.append(client.post("/generate", json=body, headers=headers))
 
-    drawing = threading.Thread(target=draw)
-    try:
+        drawing = threading.Thread(target=draw)
         drawing.start()
         time.sleep(0.2)
         assert not answers
@@ -211,7 +210,3 @@ def test_ending_finishes_what_was_begun_and_takes_nothing_new(
         assert service.process.returncode == -signal.SIGTERM
         with pytest.raises(httpx.ConnectError):
             service.client.get("/health/live")
-    finally:
-        service.client.close()
-        service.process.kill()
-        service.process.wait()

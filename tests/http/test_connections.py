@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.chaos.service import control, descriptors, memory, running
 from tests.chaos.wire import BODY, Answer, Wire, exchange
-from tests.http.conftest import LiveService
 from tests.http.stores import make_store
 from tests.http.test_problems import problem
+from tests.services import LiveService, launch
 
 pytestmark = pytest.mark.system
 
@@ -30,7 +29,7 @@ LIVE = b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     """A service of little patience."""
     folder = tmp_path_factory.mktemp("connections")
-    with running(make_store(folder / "store"), folder / "log", client_timeout="1") as service:
+    with launch(make_store(folder / "store"), folder / "log", SCENE_CLIENT_TIMEOUT="1") as service:
         yield service
 
 
@@ -56,8 +55,8 @@ def is_problem(answer: Answer, status: int, slug: str) -> None:
 
 def test_a_byte_now_and_then_keeps_no_connection(service: LiveService) -> None:
     """Sixty bodies at once; others are answered meanwhile, and all sixty are ended."""
-    before = control(service)
-    files = descriptors(service)
+    before = service.control()
+    files = service.descriptors
     slow = [connect(service) for _ in range(60)]
     for connection in slow:
         connection.sendall(HEAD % 1000)
@@ -77,15 +76,15 @@ def test_a_byte_now_and_then_keeps_no_connection(service: LiveService) -> None:
                 pass
             connection.close()
             slow.remove(connection)
-        assert control(service) == before
+        assert service.control() == before
         time.sleep(0.1)
     assert slow == []
-    assert descriptors(service) <= files + 2
+    assert service.descriptors <= files + 2
 
 
 def test_who_leaves_in_the_middle_is_forgotten(service: LiveService) -> None:
-    before = control(service)
-    files = descriptors(service)
+    before = service.control()
+    files = service.descriptors
     request = HEAD % len(BODY) + BODY
     for end in range(0, len(request) + 1, 7):
         with connect(service) as connection:
@@ -96,15 +95,15 @@ def test_who_leaves_in_the_middle_is_forgotten(service: LiveService) -> None:
         with connect(service) as connection:
             connection.sendall(batch)
             connection.recv(1)  # in the middle of the answer
-    assert control(service) == before
+    assert service.control() == before
     assert "Traceback" not in service.log.read_text()
     wait_for_descriptors(service, files)
 
 
 def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
     """The system ends the connection, some retransmissions after SCENE_CLIENT_TIMEOUT."""
-    before = control(service)
-    files = descriptors(service)
+    before = service.control()
+    files = service.descriptors
     body = json.dumps({"scenes": [json.loads(BODY)] * 256}).encode()
     batch = HEAD.replace(b"outliers", b"missing/batch") % len(body) + body
     unread = []
@@ -116,7 +115,7 @@ def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
         with suppress(OSError):
             connection.sendall(batch * 20)
         unread.append(connection)
-    assert control(service) == before
+    assert service.control() == before
     wait_for_descriptors(service, files)
     for connection in unread:
         connection.close()
@@ -124,10 +123,10 @@ def test_who_does_not_read_is_cut_off(service: LiveService) -> None:
 
 def wait_for_descriptors(service: LiveService, files: int) -> None:
     for _ in range(300):
-        if descriptors(service) <= files + 2:
+        if service.descriptors <= files + 2:
             return
         time.sleep(0.1)
-    pytest.fail(f"{descriptors(service)} descriptors, where there were {files}")
+    pytest.fail(f"{service.descriptors} descriptors, where there were {files}")
 
 
 def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
@@ -135,8 +134,8 @@ def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
     settings = {"client_timeout": "60", "held_body_bytes": str(8 * 2**20)}
     size = 2 * 2**20
-    with running(store, tmp_path / "log", **settings) as service, ExitStack() as held:
-        before, answers = memory(service), control(service)
+    with launch(store, tmp_path / "log", **settings) as service, ExitStack() as held:
+        before, answers = service.memory, service.control()
         refused = 0
         for _ in range(60):
             connection = held.enter_context(connect(service))
@@ -145,9 +144,9 @@ def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
                 connection.sendall(HEAD % size + b" " * (size - 1))
                 refused += connection.recv(4096).startswith(b"HTTP/1.1 503 ")
         assert refused >= 56
-        assert memory(service) - before < 32 * 2**20
+        assert service.memory - before < 32 * 2**20
         # Small bodies that arrive at once are accepted.
-        assert control(service) == answers
+        assert service.control() == answers
         batch = {"scenes": [{"objects": ["bed"] * 60}] * 256}
         response = service.client.post("/missing/batch", json=batch)
         problem(response, 503, "bodies-full")
@@ -159,7 +158,7 @@ def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
 
 def test_connections_over_the_limit_get_a_plain_503(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
-    with running(store, tmp_path / "log", max_connections="8") as service, ExitStack() as held:
+    with launch(store, tmp_path / "log", SCENE_MAX_CONNECTIONS="8") as service, ExitStack() as held:
         for _ in range(8):
             held.enter_context(connect(service))
         (answer,), closed = exchange(service.port, Wire("", [LIVE], (503,), closes=True))

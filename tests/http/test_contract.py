@@ -8,9 +8,9 @@ import pytest
 import requests
 import schemathesis
 
-from tests.http.conftest import LiveService, launch
 from tests.http.contract import call, documented
 from tests.http.stores import make_store
+from tests.services import LiveService, launch
 
 pytestmark = pytest.mark.system
 

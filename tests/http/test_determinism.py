@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from benchmarks.load.connections import Connection, connect, prepared
-from tests.chaos.service import running
-from tests.http.conftest import LiveService
+from tests.services import LiveService, launch
 
 pytestmark = [pytest.mark.anyio, pytest.mark.system]
 
@@ -113,7 +112,7 @@ async def test_under_load_of_every_kind(live: LiveService, alone: dict[str, byte
 @pytest.fixture
 def restarted(shared_store: Path, tmp_path: Path) -> Iterator[LiveService]:
     """Another process over the same store."""
-    with running(shared_store, tmp_path / "log") as service:
+    with launch(shared_store, tmp_path / "log") as service:
         yield service
 
 

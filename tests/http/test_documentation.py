@@ -16,8 +16,8 @@ import pytest
 from app.api.example_requests import REQUESTS
 from scene_client import schemas
 from scene_client.schemas import Problem
-from tests.http.conftest import serve
 from tests.http.test_problems import problem
+from tests.services import serve
 
 pytestmark = pytest.mark.anyio
 

@@ -11,8 +11,8 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.http.conftest import serve
 from tests.http.stores import corrupt, publish
+from tests.services import serve
 
 pytestmark = pytest.mark.anyio
 

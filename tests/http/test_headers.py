@@ -8,7 +8,7 @@ import httpx
 import pytest
 
 from app.serving import questions
-from tests.http.conftest import LiveService
+from tests.services import LiveService
 
 pytestmark = pytest.mark.anyio
 

@@ -10,9 +10,9 @@ import pytest
 
 from app.main import create_app
 from app.settings import Settings
-from tests.http.conftest import NAMED, serve
 from tests.http.stores import corrupt
 from tests.http.test_problems import problem
+from tests.services import NAMED, serve
 
 pytestmark = pytest.mark.anyio
 

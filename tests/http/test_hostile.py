@@ -8,10 +8,9 @@ import pytest
 
 from tests.chaos import corpus
 from tests.chaos.attack import attack, faults_of_answer
-from tests.chaos.service import control, running
 from tests.chaos.wire import Wire, exchange, framing
-from tests.http.conftest import LiveService
 from tests.http.stores import make_store
+from tests.services import LiveService, launch
 
 pytestmark = pytest.mark.system
 
@@ -21,16 +20,16 @@ EVERY = 53  # a prime, so that each wrong value comes to stand at many places
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     folder = tmp_path_factory.mktemp("hostile")
-    with running(make_store(folder / "store"), folder / "log", client_timeout="5") as service:
+    with launch(make_store(folder / "store"), folder / "log", SCENE_CLIENT_TIMEOUT="5") as service:
         yield service
 
 
 def test_requests_of_the_corpus_are_refused_in_order(service: LiveService) -> None:
-    before = control(service)
+    before = service.control()
     report = attack(service.port, list(corpus.everything())[::EVERY])
     assert report.faults == []
     assert report.total >= 300
-    assert control(service) == before
+    assert service.control() == before
     log = service.log.read_text()
     assert "Traceback" not in log
     assert corpus.MARKER.split()[0] not in log

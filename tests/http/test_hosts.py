@@ -10,9 +10,9 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from app.settings import Settings
-from tests.http.conftest import LiveService, launch, serve
 from tests.http.streams import opened, talk
 from tests.http.test_problems import problem
+from tests.services import LiveService, serve
 
 SCENE = {"objects": ["bed"]}
 KEY = "incorrect-zebra-capacitor-nail"
@@ -133,15 +133,3 @@ def test_a_service_without_a_key_is_open_beyond_this_machine(
     tmp_path: Path, host: str, key: str | None, is_open: bool
 ) -> None:
     assert Settings(store=tmp_path, host=host, api_key=key).is_open == is_open
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("variables", [{}, {"SCENE_API_KEY": KEY}])
-def test_an_open_service_warns(
-    shared_store: Path, tmp_path: Path, variables: dict[str, str]
-) -> None:
-    service = launch(shared_store, tmp_path / "log", SCENE_HOST="0.0.0.0", **variables)
-    service.client.close()
-    service.process.terminate()
-    service.process.wait(timeout=30)
-    assert ("SCENE_API_KEY is not set" in service.log.read_text()) == (not variables)

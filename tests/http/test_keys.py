@@ -9,9 +9,9 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.http.conftest import ADMIN_KEY, serve
 from tests.http.test_documentation import operations
 from tests.http.test_problems import problem
+from tests.services import ADMIN_KEY, serve
 
 pytestmark = pytest.mark.anyio
 

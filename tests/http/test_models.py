@@ -15,9 +15,9 @@ import httpx
 import pytest
 
 from app.scene.relations import CANONICAL
-from tests.http.conftest import ADMIN_KEY, NAMED, serve
 from tests.http.stores import VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
+from tests.services import ADMIN_KEY, NAMED, serve
 
 pytestmark = pytest.mark.anyio
 

@@ -14,9 +14,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from app.api import catalogue, examples
 from app.serving.logs import JSONFormatter
-from tests.http.conftest import serve
 from tests.http.stores import corrupt, publish
 from tests.http.test_problems import problem
+from tests.services import serve
 
 pytestmark = pytest.mark.anyio
 

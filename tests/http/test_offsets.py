@@ -11,10 +11,10 @@ import httpx
 import pytest
 
 from app.scene.frames import body_pose
-from tests.http.conftest import serve
 from tests.http.stores import V, publish
 from tests.http.test_questions import ask
 from tests.reasoning.test_offsets import known
+from tests.services import serve
 
 pytestmark = pytest.mark.anyio
 

@@ -10,8 +10,8 @@ import httpx
 import pytest
 
 from app.serving import questions
-from tests.http.conftest import serve
 from tests.http.test_problems import problem
+from tests.services import serve
 
 pytestmark = pytest.mark.anyio
 

@@ -28,7 +28,7 @@ from scene_client.schemas import (
     Stamp,
     Viewpoint,
 )
-from tests.http.conftest import serve
+from tests.services import serve
 
 pytestmark = pytest.mark.anyio
 

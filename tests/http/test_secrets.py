@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.http.conftest import ADMIN_KEY, LiveService, launch
 from tests.http.streams import hear, opened, talk
+from tests.services import ADMIN_KEY, LiveService, launch
 
 pytestmark = pytest.mark.system
 

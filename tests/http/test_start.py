@@ -14,8 +14,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.http.conftest import LiveService, begin, launch
 from tests.http.stores import corrupt, make_store
+from tests.services import LiveService, begin, launch
 
 pytestmark = pytest.mark.system
 
@@ -123,16 +123,13 @@ def test_it_says_where_its_page_is(live: LiveService, shared_store: Path, tmp_pa
         assert found is not None, line
         assert "<html" in httpx.get(found[1]).text
     assert not any("compil" in line for line in messages(log))
+    assert any("SCENE_API_KEY is not set" in line for line in messages(log))
+    assert not any("SCENE_API_KEY is not set" in line for line in messages(live.log))
 
 
 def test_a_start_without_a_usable_default_says_so(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
     corrupt(store, "home", "1.0.0")
-    service = launch(store, tmp_path / "log")
-    try:
+    with launch(store, tmp_path / "log") as service:
         wait_for("not ready: http://", service.log, service.process)
         assert not any(line.startswith("ready: ") for line in messages(service.log))
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=30)

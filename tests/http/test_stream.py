@@ -30,11 +30,10 @@ from scene_client import (
     UnreachableError,
 )
 from scene_client.stream_messages import AnswerMessage
-from tests.chaos.service import memory, running
-from tests.http.conftest import ADMIN_KEY, LiveService, launch
 from tests.http.stores import make_store
 from tests.http.streams import ASK, answered, hear, opened, posted, say, talk, updates
 from tests.http.test_problems import problem
+from tests.services import ADMIN_KEY, LiveService, launch
 
 pytestmark = pytest.mark.system
 
@@ -97,13 +96,13 @@ def test_a_flood_is_answered_about_its_newest_state_only(live: LiveService) -> N
     scene: dict[str, Any] = {}
     with opened(live) as stream:
         talk(stream, "open", ask=ASK)
-        before = memory(live)
+        before = live.memory
         count = 0
         for turn in range(4):
             for update, scene in updates(1000, turn):  # noqa: B007 - the last is used
                 count += 1
                 say(stream, "update" if count % 1000 != 1 else "scene", seq=count, **update)
-        grown = memory(live) - before
+        grown = live.memory - before
         answers = covered = 0
         while True:
             answer = hear(stream)
@@ -324,25 +323,20 @@ def end(service: LiveService) -> None:
 
 def test_the_next_answer_is_of_the_model_that_was_promoted(tmp_path: Path) -> None:
     service = launch(make_store(tmp_path / "store"), tmp_path / "log")
-    try:
-        with opened(service) as stream:
-            talk(stream, "open", ask=ASK)
-            answer = talk(stream, "update", seq=1, objects=["bed", "lamp"])
-            assert answer["missing"]["model"]["version"] == "1.0.0"
-            response = service.client.put(
-                "/models/aliases/default",
-                json={"model": "home@1.1.0"},
-                headers={"X-Admin-Key": ADMIN_KEY},
-            )
-            assert response.status_code == 200
-            answer = talk(stream, "update", seq=2, objects=["desk"])
-            assert answer["missing"]["model"]["version"] == "1.1.0"
-            scene = {"objects": ["bed", "lamp", "desk"]}
-            assert answered(answer) == posted(service.client, scene, ASK)
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=30)
+    with service, opened(service) as stream:
+        talk(stream, "open", ask=ASK)
+        answer = talk(stream, "update", seq=1, objects=["bed", "lamp"])
+        assert answer["missing"]["model"]["version"] == "1.0.0"
+        response = service.client.put(
+            "/models/aliases/default",
+            json={"model": "home@1.1.0"},
+            headers={"X-Admin-Key": ADMIN_KEY},
+        )
+        assert response.status_code == 200
+        answer = talk(stream, "update", seq=2, objects=["desk"])
+        assert answer["missing"]["model"]["version"] == "1.1.0"
+        scene = {"objects": ["bed", "lamp", "desk"]}
+        assert answered(answer) == posted(service.client, scene, ASK)
 
 
 # -------------------------------------------------------------------------------- who may
@@ -352,15 +346,15 @@ def test_the_next_answer_is_of_the_model_that_was_promoted(tmp_path: Path) -> No
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     """A service with keys, with pages of one other origin, and of little patience and room."""
     folder = tmp_path_factory.mktemp("guarded")
-    with running(
+    with launch(
         make_store(folder / "store"),
         folder / "log",
-        api_key=API_KEY,
-        cors_origins=PAGE,
-        client_timeout="2",
-        stream_idle="1.5",
-        max_streams="3",
-        max_body_bytes="20000",
+        SCENE_API_KEY=API_KEY,
+        SCENE_CORS_ORIGINS=PAGE,
+        SCENE_CLIENT_TIMEOUT="2",
+        SCENE_STREAM_IDLE="1.5",
+        SCENE_MAX_STREAMS="3",
+        SCENE_MAX_BODY_BYTES="20000",
     ) as service:
         yield service
 
@@ -498,7 +492,7 @@ def test_a_text_frame_that_is_no_text_ends_the_stream(guarded: LiveService) -> N
 async def test_a_client_that_does_not_read_loses_its_place(guarded: LiveService) -> None:
     """Its answers are not kept: messages are merged while one answer waits."""
     url = f"ws://127.0.0.1:{guarded.port}/stream"
-    before = memory(guarded)
+    before = guarded.memory
     deaf = await connect(
         url, additional_headers=KEY, proxy=None, compression=None, max_queue=1, ping_interval=None
     )
@@ -519,7 +513,7 @@ async def test_a_client_that_does_not_read_loses_its_place(guarded: LiveService)
     line = line or _end_of_stream(guarded)
     assert line is not None
     assert time.monotonic() - began > 1
-    assert memory(guarded) - before < 32 * 2**20
+    assert guarded.memory - before < 32 * 2**20
     # Most messages have been merged, and few of the answers were made.
     assert line["messages"] > 2 * line["answers"]
     deaf.transport.abort()
@@ -571,8 +565,7 @@ sys.exit(main())
 
 
 def test_a_defect_ends_its_stream_alone(shared_store: Path, tmp_path: Path) -> None:
-    service = launch(shared_store, tmp_path / "log", program=("-c", DEFECTIVE))
-    try:
+    with launch(shared_store, tmp_path / "log", program=("-c", DEFECTIVE)) as service:
         with opened(service) as other, opened(service) as stream:
             talk(other, "open", ask={"outliers": {}})
             request = stream.response.headers["x-request-id"]  # type: ignore[union-attr]
@@ -588,10 +581,6 @@ def test_a_defect_ends_its_stream_alone(shared_store: Path, tmp_path: Path) -> N
             if entry.get("request_id") == request and entry.get("route") == "/stream"
         ]
         assert line["outcome"] == "internal-error"
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=30)
 
 
 # ----------------------------------------------------------------------------------- HTTP
@@ -621,8 +610,7 @@ def counted(service: LiveService) -> dict[tuple[str, ...], float]:
 
 
 def test_streams_are_counted_and_logged(tmp_path: Path) -> None:
-    service = launch(make_store(tmp_path / "store"), tmp_path / "log")
-    try:
+    with launch(make_store(tmp_path / "store"), tmp_path / "log") as service:
         with opened(service) as stream:
             talk(stream, "open")
             for seq in (1, 2):
@@ -652,7 +640,3 @@ def test_streams_are_counted_and_logged(tmp_path: Path) -> None:
         assert (line["messages"], line["answers"], line["superseded"]) == (5, 2, 0)
         assert (line["model"], line["version"]) == ("home", "1.0.0")
         assert line["compute_ms"] > 0
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=30)

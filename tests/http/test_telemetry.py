@@ -26,7 +26,7 @@ from pydantic import ValidationError
 from app.api import telemetry
 from app.main import create_app
 from app.settings import Settings
-from tests.http.conftest import launch
+from tests.services import launch
 
 SCENE = {"objects": ["bed", "lamp"]}
 MARKER = "xyzzy"

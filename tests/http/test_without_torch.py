@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.http.conftest import launch
 from tests.http.stores import make_store
+from tests.services import launch
 
 _WITHOUT = """
 import runpy, sys
@@ -16,8 +16,9 @@ runpy.run_module("app", run_name="__main__")
 
 def test_every_question_is_answered(tmp_path: Path) -> None:
     """By models of every variant."""
-    service = launch(make_store(tmp_path / "store"), tmp_path / "log", program=("-c", _WITHOUT))
-    try:
+    with launch(
+        make_store(tmp_path / "store"), tmp_path / "log", program=("-c", _WITHOUT)
+    ) as service:
         client = service.client
         listed = client.get("/models").json()
         assert not listed["failures"]
@@ -33,7 +34,3 @@ def test_every_question_is_answered(tmp_path: Path) -> None:
                 answer = client.post(f"/{question}", json=body)
                 assert answer.status_code == 200, answer.text
             assert client.get(f"/models/{entry['name']}/contexts").status_code == 200
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=30)

@@ -13,8 +13,8 @@ import pytest
 from app.api.stream import LEAST_COST, READING_BURST, READING_SHARE
 from app.settings import Settings
 from scene_client.stream_messages import COMMANDS, EVENTS, AnswerMessage
-from tests.http.conftest import launch
 from tests.http.streams import hear, opened
+from tests.services import LiveService
 
 pytestmark = pytest.mark.system
 
@@ -44,19 +44,13 @@ def shows(written: Any, real: Any, place: str = "") -> None:
         assert written == real, place
 
 
-def test_the_service_says_what_the_document_says(tmp_path: Path) -> None:
-    service = launch(REPOSITORY / "model_store", tmp_path / "log")
-    try:
-        with opened(service) as stream:
-            for who, message in conversation():
-                if who == "→":
-                    stream.send(json.dumps(message))
-                else:
-                    shows(message, hear(stream))
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=30)
+def test_the_service_says_what_the_document_says(shipped: LiveService) -> None:
+    with opened(shipped) as stream:
+        for who, message in conversation():
+            if who == "→":
+                stream.send(json.dumps(message))
+            else:
+                shows(message, hear(stream))
 
 
 def test_every_message_and_setting_is_in_the_document() -> None:

@@ -21,11 +21,10 @@ import yaml
 
 from app.settings import Settings
 from scene_client import Client
-from tests.chaos.service import running
 from tests.chaos.wire import BODY, Wire, exchange, wires
-from tests.http.conftest import ADMIN_KEY, LiveService
 from tests.http.stores import make_store
 from tests.http.streams import opened, talk
+from tests.services import ADMIN_KEY, LiveService, launch
 
 pytestmark = pytest.mark.system
 
@@ -115,7 +114,7 @@ def wait_until(condition: Callable[[], bool], log: Path | None = None) -> None:
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     folder = tmp_path_factory.mktemp("behind")
-    with running(make_store(folder / "store"), folder / "log", client_timeout="3") as service:
+    with launch(make_store(folder / "store"), folder / "log", SCENE_CLIENT_TIMEOUT="3") as service:
         yield service
 
 
@@ -375,7 +374,7 @@ def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
 ) -> None:
     store = make_store(tmp_path / "store")
     with (
-        running(store, tmp_path / "service", api_key=API_KEY) as service,
+        launch(store, tmp_path / "service", SCENE_API_KEY=API_KEY) as service,
         haproxy(service, tmp_path / "log") as proxy,
         httpx.Client(base_url=proxy.address) as client,
     ):
@@ -401,7 +400,7 @@ def test_a_service_that_is_not_ready_is_not_asked(
 ) -> None:
     store = make_store(tmp_path / "store")
     with (
-        running(store, tmp_path / "service") as service,
+        launch(store, tmp_path / "service") as service,
         haproxy(service, tmp_path / "log") as proxy,
     ):
         service.process.kill()

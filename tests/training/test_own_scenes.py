@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from app.registry import Store
-from tests.http.conftest import launch, serve
+from tests.services import launch, serve
 from training.cli import app
 
 pytestmark = [pytest.mark.slow, pytest.mark.anyio]
@@ -108,13 +108,8 @@ async def test_the_service_answers_with_it(workplace) -> None:
     assert answer["ignored"] == []
     assert "oscilloscope" in [entry["label"] for entry in answer["missing"]]
     assert any(entry["placements"] for entry in answer["missing"])
-    service = launch(workplace.store, workplace.folder / "log")
-    try:
+    with launch(workplace.store, workplace.folder / "log") as service:
         assert service.client.post("/missing", json=question).json()["missing"] == answer["missing"]
-    finally:
-        service.client.close()
-        service.process.terminate()
-        service.process.wait(timeout=60)
 
 
 def test_the_card_has_the_terms_that_were_given(workplace) -> None:

@@ -1,4 +1,7 @@
-"""The service in process and as a process of its own, over stores of small random machines."""
+"""The service in process and as a process of its own, over stores of small random machines.
+
+The fixtures are those of every test: `live` is one process for all tests that leave it as it is.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +19,8 @@ from typing import Any
 import httpx
 import pytest
 
-from app.main import create_app
-from app.settings import Settings
-from tests.http.stores import make_store
-
 ADMIN_KEY = "correct-horse-battery-staple"
+CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed": 11}
 NAMED = {"allowed_hosts": ["service"]}
 """Settings of a service in process, which its clients call http://service."""
 
@@ -30,6 +30,10 @@ Serve = Callable[..., AbstractAsyncContextManager[httpx.AsyncClient]]
 @asynccontextmanager
 async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient]:
     """A client of the application over a store, inside its lifespan."""
+    # Here, so that tests without a service do not wait for the import.
+    from app.main import create_app
+    from app.settings import Settings
+
     app = create_app(Settings(store=store, **{"admin_key": ADMIN_KEY, **NAMED, **settings}))
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
@@ -43,12 +47,16 @@ async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient
 @pytest.fixture(scope="session")
 def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store that no test changes."""
+    from tests.http.stores import make_store
+
     return make_store(tmp_path_factory.mktemp("store"))
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
     """A store of the test's own."""
+    from tests.http.stores import make_store
+
     return make_store(tmp_path / "store")
 
 
@@ -67,12 +75,58 @@ def admin() -> dict[str, str]:
 
 @dataclass
 class LiveService:
-    """A running ``python -m app``."""
+    """A running ``python -m app``, which ends with its ``with`` block."""
 
     process: subprocess.Popen[str]
     client: httpx.Client
     port: int
     log: Path
+
+    @property
+    def url(self) -> str:
+        """Where it listens."""
+        return f"http://127.0.0.1:{self.port}"
+
+    @property
+    def memory(self) -> int:
+        """Resident bytes."""
+        for line in Path(f"/proc/{self.process.pid}/status").read_text("ascii").splitlines():
+            if line.startswith("VmRSS:"):
+                return int(line.split()[1]) * 1024
+        raise ProcessLookupError(self.process.pid)
+
+    @property
+    def descriptors(self) -> int:
+        """Open files and sockets."""
+        return len(list(Path(f"/proc/{self.process.pid}/fd").iterdir()))
+
+    def control(self) -> dict[str, bytes]:
+        """The answers to one question of each kind, which never change."""
+        answers = {}
+        for question in ("relations", "missing", "outliers", "generate"):
+            body = CONTROL | ({"steps": 8} if question == "generate" else {})
+            headers = {"X-Request-Id": "control"}
+            response = self.client.post(f"/{question}", json=body, headers=headers)
+            assert response.status_code == 200, response.text
+            answers[question] = response.content
+        assert self.client.get("/health/ready").status_code == 200
+        return answers
+
+    def stop(self) -> str:
+        """End it as an orchestrator does; its whole log."""
+        self.client.close()
+        self.process.terminate()
+        try:
+            self.process.wait(timeout=30)
+        finally:
+            self.process.kill()
+        return self.log.read_text()
+
+    def __enter__(self) -> LiveService:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
 
 def begin(
@@ -124,8 +178,13 @@ def launch(
 @pytest.fixture(scope="session")
 def live(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     """The service as a process of its own."""
-    service = launch(shared_store, tmp_path_factory.mktemp("live") / "log")
-    yield service
-    service.client.close()
-    service.process.terminate()
-    service.process.wait(timeout=30)
+    with launch(shared_store, tmp_path_factory.mktemp("live") / "log") as service:
+        yield service
+
+
+@pytest.fixture(scope="session")
+def shipped(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    """The same with the shipped models."""
+    log = tmp_path_factory.mktemp("shipped") / "log"
+    with launch(repository / "model_store", log) as service:
+        yield service
