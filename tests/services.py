@@ -5,6 +5,7 @@ The fixtures are those of every test: `live` is one process for all tests that l
 
 from __future__ import annotations
 
+import gc
 import os
 import socket
 import subprocess
@@ -35,6 +36,8 @@ async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient
     from app.settings import Settings
 
     app = create_app(Settings(store=store, **{"admin_key": ADMIN_KEY, **NAMED, **settings}))
+    # As `python -m app` does: the runtime enables it when it has started.
+    gc.disable()
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
         app.router.lifespan_context(app),

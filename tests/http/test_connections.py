@@ -132,7 +132,7 @@ def wait_for_descriptors(service: LiveService, files: int) -> None:
 def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
     """Sixty bodies of 2 MiB less one byte: the service holds as many as its budget allows."""
     store = make_store(tmp_path / "store")
-    settings = {"client_timeout": "60", "held_body_bytes": str(8 * 2**20)}
+    settings = {"SCENE_CLIENT_TIMEOUT": "60", "SCENE_HELD_BODY_BYTES": str(8 * 2**20)}
     size = 2 * 2**20
     with launch(store, tmp_path / "log", **settings) as service, ExitStack() as held:
         before, answers = service.memory, service.control()

@@ -72,18 +72,8 @@ async def test_a_broken_default_keeps_the_service_not_ready(store: Path) -> None
         assert str(store) not in str(failures)
 
 
-@pytest.mark.parametrize("damage", ["flip", "truncate", "no weights", "extra"])
-async def test_another_broken_version_is_listed_as_refused(store: Path, damage: str) -> None:
-    folder = store / "plain" / "1.0.0"
-    weights = folder / "model.safetensors"
-    if damage == "flip":
-        corrupt(store, "plain", "1.0.0")
-    elif damage == "truncate":
-        weights.write_bytes(weights.read_bytes()[:-10])
-    elif damage == "no weights":
-        weights.unlink()
-    else:
-        (folder / "code.py").write_text("print()")
+async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
+    corrupt(store, "plain", "1.0.0")
     async with serve(store) as client:
         for path in READY:
             assert (await client.get(path)).status_code == 200

@@ -45,35 +45,21 @@ def test_names_are_those_of_this_machine_or_listed(
 
 
 @pytest.mark.anyio
-@pytest.mark.parametrize(
-    ("host", "accepted"),
-    [
-        ("127.0.0.1", True),
-        ("127.0.0.1:8000", True),
-        ("LOCALHOST:1", True),
-        ("[::1]:8000", True),
-        ("evil.example", False),
-        ("127.0.0.1.evil.example", False),
-        ("localhost@evil.example", False),
-        ("localhost:80:80", False),
-        ("localhost:port", False),
-        ("::1", False),
-        ("", False),
-    ],
-)
-async def test_a_page_of_another_name_is_refused(
-    shared_store: Path, host: str, accepted: bool
-) -> None:
+async def test_a_page_of_another_name_is_refused(shared_store: Path) -> None:
+    accepted = ("127.0.0.1", "127.0.0.1:8000", "LOCALHOST:1", "[::1]:8000")
+    others = ("evil.example", "127.0.0.1.evil.example", "localhost@evil.example")
+    malformed = ("localhost:80:80", "localhost:port", "::1", "")
     async with serve(shared_store, allowed_hosts=()) as client:
-        headers = {"Host": host}
-        response = await client.post("/relations", json=SCENE, headers=headers)
-        if accepted:
-            assert response.status_code == 200
-        else:
-            problem(response, 421, "host-refused")
-        # Orchestrators ask by the address of a replica.
-        for path in ("/health/live", "/health/ready", "/v2/health/ready"):
-            assert (await client.get(path, headers=headers)).status_code == 200
+        for host in (*accepted, *others, *malformed):
+            headers = {"Host": host}
+            response = await client.post("/relations", json=SCENE, headers=headers)
+            if host in accepted:
+                assert response.status_code == 200, host
+            else:
+                problem(response, 421, "host-refused")
+            # Orchestrators ask by the address of a replica.
+            for path in ("/health/live", "/health/ready", "/v2/health/ready"):
+                assert (await client.get(path, headers=headers)).status_code == 200
 
 
 @pytest.mark.anyio

@@ -145,8 +145,11 @@ async def test_administration_needs_the_admin_key_and_no_other(
         assert (await guarded.post("/models/refresh", headers=headers)).status_code == 200
 
 
-async def test_without_an_admin_key_no_key_administers(shared_store: Path) -> None:
-    async with serve(shared_store, api_key=API_KEY, admin_key=None) as client:
+@pytest.mark.parametrize("api_key", [None, API_KEY])
+async def test_without_an_admin_key_no_key_administers(
+    shared_store: Path, api_key: str | None
+) -> None:
+    async with serve(shared_store, api_key=api_key, admin_key=None) as client:
         for headers in ({}, {"X-Admin-Key": ""}, {"X-API-Key": API_KEY}, {"X-Admin-Key": "None"}):
             response = await client.post("/models/refresh", headers=headers)
             problem(response, 401, "unauthorized")

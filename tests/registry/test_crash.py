@@ -20,7 +20,7 @@ from app.registry import ModelSet, Store, load_model_set
 from tests.registry.publishers import KILLED
 from tests.registry.small_artifacts import description, state
 
-KILLS = 50
+KILLS = 20
 PUBLICATIONS = 5  # the kills are spread over the time that so many take
 
 

@@ -220,17 +220,6 @@ def test_relations_are_derived_again_after_each_move(service: Service) -> None:
     assert "on-top" not in relations
 
 
-def test_one_answer_covers_all_messages_before_it(service: Service) -> None:
-    stream = StreamScene()
-    service.take(stream, type="open")
-    for seq in (3, 4, 9):
-        service.take(stream, type="update", seq=seq, objects=["bed"])
-    message = service.answer(stream)
-    assert (message["seq"], message["superseded"]) == (9, 2)
-    message = service.answer(stream)
-    assert (message["seq"], message["superseded"]) == (9, 0)
-
-
 def test_what_is_asked_holds_until_something_else_is(service: Service) -> None:
     stream = StreamScene()
     service.take(stream, type="open", objects=["bed"])
@@ -240,21 +229,6 @@ def test_what_is_asked_holds_until_something_else_is(service: Service) -> None:
     assert answers(service.answer(stream)).keys() == {"relations"}
     service.take(stream, type="update", seq=3, ask=None)
     assert answers(service.answer(stream)).keys() == {"missing", "outliers"}
-
-
-def test_a_question_that_fails_leaves_the_others_their_answers(service: Service) -> None:
-    stream = StreamScene()
-    ask = {"missing": {"at": {"relation": "on-top", "object": "desk"}}, "outliers": {}}
-    service.take(stream, type="open", ask=ask)
-    service.take(stream, type="update", seq=1, objects=["desk", "bed"])
-    assert answers(service.answer(stream)).keys() == {"missing", "outliers"}
-    service.take(stream, type="update", seq=2, remove=["desk"])
-    message, errors = service.runner.run(stream.answer(service.view()))
-    error = errors["missing"]
-    assert isinstance(error, RequestError)
-    assert error.faults[0].location == ("ask", "missing", "at", "object")
-    assert answers(message).keys() == {"outliers"}
-    assert [entry["object"] for entry in message["outliers"]["outliers"]] == ["bed"]
 
 
 def test_a_late_answer_covers_its_messages(service: Service) -> None:
