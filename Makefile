@@ -33,12 +33,12 @@ run: $(SERVICE)  ## serve the shipped models on 127.0.0.1 (PORT=8000)
 test: checks  ## lint, format, types, import rules, then all tests but the slow ones
 	$(PYTEST) -m "not slow" $(ARGS)
 
-test-slow: $(EVERYTHING)  ## the slow tests: training runs from end to end (minutes)
+test-slow: $(EVERYTHING)  ## the slow tests: training runs, the site, further parameters (minutes)
 	$(BIN)/python -m app.compile
 	$(PYTEST) -m slow $(ARGS)
 
-test-fast: checks  ## lint, format, types, import rules, then the tests of mathematics and scenes
-	$(PYTEST) -m "not slow" tests/boltzmann tests/enumeration tests/registry tests/scene $(ARGS)
+test-fast: checks  ## the same checks, then tests without processes, browser and training (a minute)
+	$(PYTEST) -m "not slow and not system" $(addprefix tests/,boltzmann registry scene serving) $(ARGS)
 
 checks: $(EVERYTHING)
 	@# Compiled once, beside the checks, and not by every process of the tests.

@@ -29,7 +29,7 @@ def complaints(board: Board) -> list[str]:
     return [f"{one['id']}: {node['html'][:120]}" for one in found for node in one["nodes"]]
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> None:
     board = open_board(scene=None, color_scheme=scheme)
     page = board.page

@@ -124,7 +124,12 @@ def test_offsets_say_where_a_ghost_stands_and_how_far_it_varies(bedroom: Board) 
     assert placed["z"] == pytest.approx(top + found["size"]["z"] / 2, abs=2e-3)
 
 
-@pytest.mark.parametrize("example", ["bedroom", "kitchen", "desk"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "example", ["bedroom", pytest.param("kitchen", marks=SLOW), pytest.param("desk", marks=SLOW)]
+)
 def test_what_is_accepted_stands_where_the_page_says(
     open_board: OpenBoard, api: httpx.Client, example: str
 ) -> None:

@@ -119,15 +119,13 @@ def test_the_page_outlives_the_service(
 ) -> None:
     store = repository / "model_store"
     with launch(store, tmp_path / "log") as mortal:
-        home = f"http://127.0.0.1:{mortal.port}"
-        board = open_board(home=home, allow=("ERR_", "503"))
+        board = open_board(home=mortal.url, allow=("ERR_", "503"))
         mortal.process.kill()
         mortal.process.wait()
         board.add("laptop")
         expect(board.page.get_by_role("alert").first).to_contain_text("does not answer")
         assert board.things == ["desk", "chair", "laptop"]
-        mortal.client.close()
-        mortal = launch(store, tmp_path / "log2", port=mortal.port)
+    with launch(store, tmp_path / "log2", port=mortal.port):
         expect(board.page.locator("#banner")).to_be_hidden(timeout=30_000)
         board.settle()
         assert len(board.body("missing")["objects"]) == 3

@@ -64,6 +64,7 @@ def test_the_cpp_block_compiles_and_runs(
     assert done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_the_cpp_example_is_made_and_asks_all_four_questions(
     url: str, tmp_path: Path, bridge: Path, require_system_tool: Callable[[str], Path]

@@ -21,11 +21,8 @@ api = documented(examples=10)
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
     """A service of its own: the administration's routes change its store."""
     folder = tmp_path_factory.mktemp("contract")
-    service = launch(make_store(folder / "store"), folder / "log")
-    yield service
-    service.client.close()
-    service.process.terminate()
-    service.process.wait(timeout=30)
+    with launch(make_store(folder / "store"), folder / "log") as service:
+        yield service
 
 
 @pytest.fixture(scope="module")

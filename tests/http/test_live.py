@@ -33,15 +33,10 @@ def exchange(port: int, request: bytes) -> tuple[bytes, bytes]:
 
 def test_it_becomes_ready_within_seconds(shared_store: Path, tmp_path: Path) -> None:
     began = time.monotonic()
-    service = launch(shared_store, tmp_path / "log")
-    try:
+    with launch(shared_store, tmp_path / "log") as service:
         assert service.client.get("/health/ready").status_code == 200
         # Five seconds are promised on a quiet machine; tests share theirs.
         assert time.monotonic() - began < 20
-    finally:
-        service.client.close()
-        service.process.terminate()
-    service.process.wait(timeout=30)
     # It stopped in order, and then by the signal that it was sent, as a shell expects.
     assert service.process.returncode == -signal.SIGTERM
     assert "Application shutdown complete" in service.log.read_text()

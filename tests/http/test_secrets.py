@@ -43,25 +43,15 @@ def defective(
     request: pytest.FixtureRequest, shared_store: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[LiveService]:
     """A service that tells as much as it can be made to, and cannot say what is missing."""
-    service = launch(
+    with launch(
         shared_store,
         tmp_path_factory.mktemp("defective") / "log",
         program=("-c", DEFECTIVE),
         SCENE_API_KEY=API_KEY,
         SCENE_LOG_LEVEL="debug",
         SCENE_LOG_FORMAT=request.param,
-    )
-    yield service
-    service.client.close()
-    service.process.kill()
-    service.process.wait(timeout=30)
-
-
-def stop(service: LiveService) -> str:
-    """Everything that was written, the last words included."""
-    service.process.terminate()
-    service.process.wait(timeout=30)
-    return service.log.read_text()
+    ) as service:
+        yield service
 
 
 def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> None:
@@ -134,7 +124,7 @@ def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> N
             talk(stream, "update", seq=1, remove=[key])
     assert client.get("/health/live").status_code == 200
 
-    log = stop(defective)
+    log = defective.stop()
     # It did tell of the defect, and of requests: there was something to find a key in.
     assert "ValueError: no class for **********, **********" in log
     assert "GET /health/live 200" in log

@@ -278,7 +278,7 @@ async def test_a_client_connects_again_and_sends_the_whole_scene(tmp_path: Path)
         with pytest.raises(StreamProblemError):
             await anext(stream)
         waiting = asyncio.create_task(anext(stream))
-        await asyncio.to_thread(end, service)
+        await asyncio.to_thread(service.stop)
         # While there is no service, the client goes on.
         for _ in range(20):
             await stream.ping()
@@ -297,25 +297,19 @@ async def test_a_client_connects_again_and_sends_the_whole_scene(tmp_path: Path)
             assert await stream.update(remove=["a"]) == last + 1
             assert (await anext(stream)).seq == last + 1
         finally:
-            await asyncio.to_thread(end, service)
+            await asyncio.to_thread(service.stop)
 
 
 @pytest.mark.anyio
 async def test_a_client_gives_up_after_a_while(tmp_path: Path) -> None:
     service = launch(make_store(tmp_path / "store"), tmp_path / "log")
     async with StreamClient(f"http://127.0.0.1:{service.port}", reconnect=1.0) as stream:
-        await asyncio.to_thread(end, service)
+        await asyncio.to_thread(service.stop)
         with pytest.raises(StreamClosedError) as ended:
             await anext(stream)
         assert ended.value.code in {1001, 1012}
         with pytest.raises(StreamClosedError):
             await stream.update(["bed"])
-
-
-def end(service: LiveService) -> None:
-    service.client.close()
-    service.process.terminate()
-    service.process.wait(timeout=30)
 
 
 # -------------------------------------------------------------------------------- model swaps

@@ -175,19 +175,18 @@ def collector() -> Iterator[tuple[str, list[ExportTraceServiceRequest]]]:
 
 @pytest.mark.system
 def test_a_collector_is_sent_the_spans(shared_store: Path, tmp_path: Path) -> None:
-    with collector() as (url, taken):
-        service = launch(
+    with (
+        collector() as (url, taken),
+        launch(
             shared_store,
             tmp_path / "log",
             SCENE_OPENTELEMETRY="true",
             OTEL_EXPORTER_OTLP_ENDPOINT=url,
             OTEL_EXPORTER_OTLP_COMPRESSION="none",
-        )
-        assert service.client.post("/missing", json=SCENE).status_code == 200
-        service.client.close()
+        ) as service,
+    ):
         # What has not been sent yet is sent before the process ends.
-        service.process.terminate()
-        service.process.wait(timeout=30)
+        assert service.client.post("/missing", json=SCENE).status_code == 200
     spans = [
         span.name
         for request in taken

@@ -20,6 +20,8 @@ from app.registry import ModelSet, Store, load_model_set
 from tests.registry.publishers import KILLED
 from tests.registry.small_artifacts import description, state
 
+pytestmark = pytest.mark.system
+
 KILLS = 20
 PUBLICATIONS = 5  # the kills are spread over the time that so many take
 
@@ -146,7 +148,7 @@ def test_die_before_every_single_step(
 
 
 def test_publishers_and_readers_meet(publishers: Publishers, tmp_path: Path) -> None:
-    root, versions = tmp_path / "store", 25
+    root, versions = tmp_path / "store", 12
     results = [tmp_path / f"{n}.json" for n in range(4)]
     children = [
         publishers.start("race", root=str(root), results=str(path), versions=versions)
