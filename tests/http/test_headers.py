@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import httpx
@@ -68,7 +69,12 @@ async def test_a_defect_is_answered_with_the_same_headers(
 async def test_pages_keep_their_own_policy(client: httpx.AsyncClient, path: str) -> None:
     response = await client.get(path)
     check(response)
-    assert "script-src 'self'" in response.headers["content-security-policy"]
+    policy = response.headers["content-security-policy"]
+    directives = dict(part.strip().split(" ", 1) for part in policy.split(";"))
+    assert directives["default-src"] == "'none'"
+    assert directives["script-src"] == "'self'"
+    assert not re.search(r"https?:|\*", policy)
+    assert path != "/" or "unsafe" not in policy
 
 
 @pytest.mark.parametrize("path", ["/static/pages.css", "/docs/swagger-ui-bundle.js"])

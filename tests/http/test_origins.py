@@ -132,13 +132,3 @@ async def test_browsers_ask_beforehand_without_a_key(shared_store: Path) -> None
         response = await client.post("/relations", json=SCENE, headers=headers)
         assert response.status_code == 200
         allowed(response, LISTED)
-
-
-@pytest.mark.parametrize("media", ["text/plain", "application/x-www-form-urlencoded"])
-async def test_no_page_asks_without_asking_beforehand(
-    client: httpx.AsyncClient, media: str
-) -> None:
-    # The media types that a browser sends to anybody without a preflight.
-    headers = {"Origin": OTHER, "Content-Type": media}
-    response = await client.post("/relations", content=b'{"objects": ["bed"]}', headers=headers)
-    problem(response, 415, "unsupported-media-type")
