@@ -199,6 +199,7 @@ def machine_rows(joint):
     return joint.machine.edges(torch.arange(3).expand(len(joint.v), -1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DRAWN)
 def test_a_hot_chain_wanders_and_a_cold_one_settles(name):
     """At a high temperature every set of three classes is as likely as any other; near zero the

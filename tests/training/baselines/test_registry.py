@@ -47,6 +47,7 @@ def fitted(baseline: Baseline):
     return baseline.fit(furnished(300, seed=1), furnished(60, seed=2), STRUCTURE, seed=0)
 
 
+@pytest.mark.slow
 @named(EVERY)
 def test_every_trial_is_recorded(baseline):
     result = fitted(baseline)
@@ -109,6 +110,7 @@ def test_the_same_seed_gives_the_same_fit(baseline, train, validation):
     assert [trial.validation for trial in again.trials] == figures
 
 
+@pytest.mark.slow
 @named(EVERY)
 def test_the_seed_changes_what_it_is_said_to_change(baseline, train, validation):
     other = baseline.fit(train, validation, STRUCTURE, seed=1)
