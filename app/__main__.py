@@ -56,8 +56,8 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     """Sockets for all addresses of a host; a connection is refused until the server listens.
 
     Args:
-        send_timeout: seconds after which Linux ends a connection whose client acknowledges nothing
-            of what it is sent. Elsewhere only a proxy bounds that.
+        send_timeout: seconds after which Linux ends a connection whose client acknowledges no
+            bytes. On other systems only a proxy bounds that.
 
     Raises:
         OSError: the host has no usable address, or the port is not free.

@@ -25,7 +25,7 @@ def main() -> int:
     """
     settings = Settings()
     dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))
-    runtime = Runtime(settings.store)
+    runtime = Runtime(settings)
     asyncio.run(runtime.start())
     runtime.stop()
     compileall.compile_dir(Path(__file__).parent, quiet=1)

@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from app import __version__, api
-from app.serving.reading import Limits
 from app.serving.runtime import Runtime
 from app.settings import Settings
 
@@ -33,14 +32,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         pydantic.ValidationError: the environment's settings make no sense.
     """
     settings = settings or Settings()
-    runtime = Runtime(
-        settings.store,
-        Limits(settings.max_objects, settings.max_relations, settings.max_answer_bytes),
-        queue_rows=settings.queue_rows,
-        queue_requests=settings.queue_requests,
-        poll=settings.store_poll,
-        max_weights_bytes=settings.max_weights_bytes,
-    )
+    runtime = Runtime(settings)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

@@ -205,7 +205,7 @@ class Settings(BaseSettings):
     retry_after: Annotated[
         int, Field(ge=1, le=3600, description="seconds named in Retry-After when not ready")
     ] = 2
-    metrics: Annotated[bool, Field(description="count, and answer /metrics")] = True
+    metrics: Annotated[bool, Field(description="answer GET /metrics")] = True
     opentelemetry: Annotated[
         bool, Field(description="send traces to where OTEL_EXPORTER_OTLP_ENDPOINT says")
     ] = False

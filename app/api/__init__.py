@@ -65,7 +65,7 @@ def build(
     app.router.routes.extend(asked)
     for router in (
         stream.router,
-        # Before what it shares addresses with: the first that fits an address names its methods.
+        # First: of routes with one address, the first names the methods of a 405.
         models.administration,
         models.changes,
         models.router,

@@ -197,8 +197,8 @@ DRAINING: Final = ProblemType(
     "draining",
     503,
     "The service is ending",
-    "It finishes what it has begun and takes nothing new. Ask another instance, or this one after "
-    "Retry-After.",
+    "It finishes the requests in progress and takes no new ones. Ask another instance, or this one "
+    "after Retry-After.",
 )
 NOT_READY: Final = ProblemType(
     "not-ready",

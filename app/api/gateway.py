@@ -69,7 +69,7 @@ _SWITCHED: Final = 101
 # RFC 6455: the server met a condition that it did not expect.
 _DEFECT: Final = 1011
 
-# Browsers take answers for what they are, and keep none of what was computed.
+# Browsers do not guess the media type. They cache no answer (`_NOT_KEPT`).
 _ALWAYS: Final = (
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
@@ -158,7 +158,7 @@ class Gateway:
             self._note(scope, record, perf_counter() - began)
 
     def _is_known(self, headers: Sequence[tuple[bytes, bytes]], path: str) -> bool:
-        """Whether the Host header names this service, or nothing but health is asked."""
+        """Whether the Host header names this service, or the path is a health check."""
         given = [value for name, value in headers if name == b"host"]
         host = _HOST.fullmatch(given[0].lower()) if len(given) == 1 else None
         return (host is not None and host[1] in (self._hosts or ())) or path.endswith(HEALTH)
@@ -217,7 +217,7 @@ class Gateway:
         # Without the header a client would send its next request here as well.
         return ProblemError(
             catalogue.DRAINING,
-            "The service finishes what it has begun, and then ends.",
+            "The service finishes the requests in progress, and then ends.",
             headers={"Connection": "close"},
         )
 

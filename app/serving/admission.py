@@ -278,7 +278,7 @@ class WorkQueue:
     backlog: Backlog
     rows: int = 0
     _waiting: deque[_Job] = field(default_factory=deque)
-    _giving_way: deque[_Job] = field(default_factory=deque)
+    _low_priority: deque[_Job] = field(default_factory=deque)
     _draining: bool = False
     _costs: _Costs = field(default_factory=_Costs)
     _costly: Executor = field(init=False)
@@ -309,14 +309,14 @@ class WorkQueue:
         *,
         kind: str,
         size: int,
-        gives_way: bool = False,
+        low_priority: bool = False,
     ) -> Done[T]:
         """Answer a question.
 
         Args:
             call: the work; it may run in another thread.
             kind: jobs of one kind and about one size, at least 1, cost alike.
-            gives_way: to all those that do not.
+            low_priority: it runs after all jobs of normal priority.
 
         Raises:
             DeadlinePassedError: the deadline passed first; the work is dropped, or its result.
@@ -333,13 +333,13 @@ class WorkQueue:
             self._costs.learn(kind, size, done.processor)
             return done
 
-        counted = 0 if gives_way else 1
+        counted = 0 if low_priority else 1
         self.backlog.pending += counted
         try:
             if self._costs.expected(kind, size) > CHEAP:
-                async with _turn(self._turn, ticket) if gives_way else nullcontext():
+                async with _turn(self._turn, ticket) if low_priority else nullcontext():
                     return await _in_thread(lambda _: measured(), ticket, self._costly)
-            line = self._giving_way if gives_way else self._waiting
+            line = self._low_priority if low_priority else self._waiting
             loop = asyncio.get_running_loop()
             job = _Job(measured, ticket, loop.create_future())
             line.append(job)
@@ -377,7 +377,7 @@ class WorkQueue:
 
     def _drain(self) -> None:
         end = monotonic() + _TICK
-        while line := self._waiting or self._giving_way:
+        while line := self._waiting or self._low_priority:
             job = line.popleft()
             try:
                 if not job.future.done():
@@ -389,7 +389,7 @@ class WorkQueue:
                 # The error refers to this frame, and the future to the error: with the job in the
                 # frame they would keep the whole request until the collector runs.
                 del job
-            if (self._waiting or self._giving_way) and monotonic() > end:
+            if (self._waiting or self._low_priority) and monotonic() > end:
                 asyncio.get_running_loop().call_soon(self._drain)
                 return
         self._draining = False
@@ -397,7 +397,7 @@ class WorkQueue:
 
 @asynccontextmanager
 async def _turn(lock: asyncio.Lock, ticket: Ticket) -> AsyncIterator[None]:
-    """The turn of a question that gives way, if it comes before the deadline."""
+    """Hold the lock for jobs of low priority, if it is free before the deadline."""
     left = ticket.deadline - monotonic()
     try:
         await asyncio.wait_for(lock.acquire(), left if left < math.inf else None)

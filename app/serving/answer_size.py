@@ -22,7 +22,7 @@ _OBJECT: Final = 200  # missing, or judged
 _OFFSET: Final = 250
 _WARNING: Final = 400
 _UNIT: Final = 12  # the number of a hidden unit
-# Of 128 characters, the longest that the contract allows, each of at most four bytes.
+# Of an id: 128 characters, the most that the contract allows, each of at most four bytes.
 _LONGEST_NAME: Final = 4 * 128 + 3
 
 
@@ -75,7 +75,8 @@ def require(size: Callable[[int], int], reading: Reading, limit: int, parameter:
     Raises:
         RequestError: it is too large.
     """
-    if estimate(size, reading, _LONGEST_NAME) <= limit:
+    longest = max(_LONGEST_NAME, reading.unknown.vocabulary.longest_label + 1)
+    if estimate(size, reading, longest) <= limit:
         return
     exact = estimate(size, reading, reading.longest_name())
     if exact > limit:

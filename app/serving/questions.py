@@ -34,7 +34,7 @@ async def relations(request: Request, asked: RelationsRequest) -> Answer:
         reasoning.relations,
         reading.scene,
         top_k=asked.top_k,
-        # The rounded probability, as it is answered, decides what is left out.
+        # A little lower: the rounded probability decides which relations are left out.
         min_probability=asked.min_probability * (1 - 1e-5),
         pairs=None if asked.pairs is None else _pairs(asked, reading),
         include_opposites=asked.include_opposites,

@@ -69,7 +69,7 @@ class Record:
 
 @dataclass(slots=True)
 class Request(Ticket):
-    """One request from beginning to end, whatever is promoted or refreshed meanwhile.
+    """One request, with one snapshot of the models from beginning to end.
 
     Attributes:
         id: goes into every answer.
@@ -79,7 +79,7 @@ class Request(Ticket):
         record: what becomes known about it.
         holding: whether rows of the models' queues are held for it already.
         known: what `read` found, where several questions are asked about one scene.
-        gives_way: its questions run after those of other requests.
+        low_priority: its questions run after those of other requests.
         look_ups: of labels that the models do not know.
     """
 
@@ -90,7 +90,7 @@ class Request(Ticket):
     record: Record = field(default_factory=Record)
     holding: bool = False
     known: tuple[ServedModel, Reading] | None = None
-    gives_way: bool = False
+    low_priority: bool = False
     look_ups: LookUps = field(default_factory=LookUps)
 
     def read(
@@ -135,7 +135,7 @@ class Request(Ticket):
                 kind=_kind_of_cost(name, scene, kwargs),
                 # The relation part is computed for pairs of objects.
                 size=(1 + len(scene.objects)) ** 2,
-                gives_way=self.gives_way,
+                low_priority=self.low_priority,
             )
         finally:
             model.queue.give_back(rows)

@@ -9,12 +9,10 @@ import logging
 import sys
 from collections.abc import Awaitable, Callable, Iterable
 from functools import wraps
-from pathlib import Path
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 from app.compiling import check_cache, progress
 from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
-from app.registry.verified import MAX_WEIGHTS_BYTES
 from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.errors import (
     AliasConflictError,
@@ -36,6 +34,7 @@ from app.serving.metrics import Metrics
 from app.serving.models import DEFAULT, Key, ServedModels, prepare
 from app.serving.reading import Limits
 from app.serving.request import Record, Request
+from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 
 P = ParamSpec("P")
@@ -84,36 +83,27 @@ class Runtime:
     """The one holder of the current snapshot.
 
     Args:
-        store: directory of published models.
-        limits: of scenes and answers.
-        queue_rows: scenes that may wait for one model.
-        queue_requests: requests that may wait to be read.
-        metrics: of the service.
-        poll: seconds between two checks of the store; 0 for none.
-        max_weights_bytes: versions with a larger weights file are refused.
+        settings: of the service.
 
     Attributes:
         backlog: the requests that wait to be read.
+        metrics: of the service.
     """
 
-    def __init__(
-        self,
-        store: Path,
-        limits: Limits | None = None,
-        metrics: Metrics | None = None,
-        *,
-        queue_rows: int = 4096,
-        queue_requests: int = 256,
-        poll: float = 0,
-        max_weights_bytes: int = MAX_WEIGHTS_BYTES,
-    ) -> None:
-        self.metrics = metrics or Metrics()
-        self.backlog = Backlog(queue_requests)
-        self._store = Store(store, lock_timeout=_LOCK_TIMEOUT, max_weights_bytes=max_weights_bytes)
-        self._limits = limits or Limits()
-        self._queue_rows = queue_rows
+    def __init__(self, settings: Settings) -> None:
+        self.metrics = Metrics()
+        self.backlog = Backlog(settings.queue_requests)
+        self._store = Store(
+            settings.store,
+            lock_timeout=_LOCK_TIMEOUT,
+            max_weights_bytes=settings.max_weights_bytes,
+        )
+        self._limits = Limits(
+            settings.max_objects, settings.max_relations, settings.max_answer_bytes
+        )
+        self._queue_rows = settings.queue_rows
         self._threads = Threads()
-        self._poll = poll
+        self._poll = settings.store_poll
         self._polling: asyncio.Task[None] | None = None
         self._changing = asyncio.Lock()
         self._models: ServedModels | None = None
@@ -169,7 +159,7 @@ class Runtime:
             NotReadyError, DrainingError: they cannot.
         """
         if self.draining:
-            raise DrainingError("The service finishes what it has begun, and then ends.")
+            raise DrainingError("The service finishes the requests in progress, and then ends.")
         self.models.resolve(DEFAULT)
 
     def drain(self) -> None:

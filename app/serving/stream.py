@@ -150,7 +150,7 @@ async def _answers(
     except ServingError as error:
         return {}, dict.fromkeys(asked, error)
     # One reading and one deadline for all questions.
-    request = replace(request, known=(model, reading), gives_way=True)
+    request = replace(request, known=(model, reading), low_priority=True)
     found: dict[str, Answer] = {}
     errors: dict[str, ServingError] = {}
     for name in asked:

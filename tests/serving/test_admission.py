@@ -166,16 +166,16 @@ async def test_questions_are_counted_until_they_are_answered_and_drawings_are_no
 async def test_questions_of_streams_give_way_and_hold_up_no_request(queue: WorkQueue) -> None:
     order: list[str] = []
 
-    async def ask(name: str, *, gives_way: bool) -> None:
+    async def ask(name: str, *, low_priority: bool) -> None:
         def note() -> None:
             order.append(f"{name}, {queue.backlog.pending} counted")
 
-        await queue.run(note, ENDLESS, kind="cheap", size=1, gives_way=gives_way)
+        await queue.run(note, ENDLESS, kind="cheap", size=1, low_priority=low_priority)
 
     await asyncio.gather(
-        ask("stream 1", gives_way=True),
-        ask("stream 2", gives_way=True),
-        ask("request", gives_way=False),
+        ask("stream 1", low_priority=True),
+        ask("stream 2", low_priority=True),
+        ask("request", low_priority=False),
     )
     # All of one tick: the request is first, and alone is counted.
     assert order == ["request, 1 counted", "stream 1, 1 counted", "stream 2, 1 counted"]
@@ -191,14 +191,14 @@ async def test_costly_questions_of_streams_let_requests_go_first(queue: WorkQueu
         assert release.wait(30)
         order.append(name)
 
-    def ask(name: str, *, gives_way: bool) -> asyncio.Future[Any]:
+    def ask(name: str, *, low_priority: bool) -> asyncio.Future[Any]:
         call = partial(note, name)
-        run = queue.run(call, ENDLESS, kind="costly", size=1, gives_way=gives_way)
+        run = queue.run(call, ENDLESS, kind="costly", size=1, low_priority=low_priority)
         return asyncio.ensure_future(run)
 
-    waiting = [ask(f"stream {number}", gives_way=True) for number in (1, 2, 3)]
+    waiting = [ask(f"stream {number}", low_priority=True) for number in (1, 2, 3)]
     await asyncio.to_thread(began.wait, 30)
-    waiting.append(ask("request", gives_way=False))
+    waiting.append(ask("request", low_priority=False))
     await asyncio.sleep(0)
     release.set()
     await asyncio.gather(*waiting)
@@ -209,7 +209,7 @@ async def test_nobody_waits_past_the_deadline_for_a_turn(queue: WorkQueue) -> No
     release = threading.Event()
 
     def ask(call: Call, ticket: Ticket) -> asyncio.Future[Any]:
-        run = queue.run(call, ticket, kind="costly", size=1, gives_way=True)
+        run = queue.run(call, ticket, kind="costly", size=1, low_priority=True)
         return asyncio.ensure_future(run)
 
     first = ask(lambda: release.wait(30), ENDLESS)

@@ -18,10 +18,10 @@ from app.serving import questions
 from app.serving.answers import written
 from app.serving.errors import DeadlinePassedError, RequestError, UnknownModelError
 from app.serving.metrics import Metrics
-from app.serving.reading import Limits
 from app.serving.request import Request
 from app.serving.runtime import Runtime
 from app.serving.stream import Streams, StreamScene, TokenBucket
+from app.settings import Settings
 from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest
 from scene_client.stream_messages import Open, Update, Whole
 from tests.http.stores import make_store
@@ -34,9 +34,9 @@ LABELS = ["bed", "lamp", "chair", "desk", "toilet", "floor"]
 class Service:
     """A runtime, and a loop to ask it on."""
 
-    def __init__(self, store: Path, limits: Limits | None = None) -> None:
+    def __init__(self, store: Path, **settings: Any) -> None:
         self.runner = asyncio.Runner()
-        self.runtime = Runtime(store, limits, queue_rows=256)
+        self.runtime = Runtime(Settings(store=store, store_poll=0, **settings))
         self.runner.run(self.runtime.start())
 
     def view(self) -> Request:
@@ -284,7 +284,7 @@ def test_another_model_answers_from_the_next_message_on(service: Service) -> Non
 
 
 def test_no_scene_is_larger_than_the_service_allows(tmp_path: Path) -> None:
-    small = Service(make_store(tmp_path / "store"), Limits(objects=3, relations=1))
+    small = Service(make_store(tmp_path / "store"), max_objects=3, max_relations=1)
     try:
         stream = StreamScene()
         small.take(stream, type="open", objects=["bed", "lamp"])
