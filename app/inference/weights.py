@@ -96,7 +96,7 @@ class Weights:
 
     @property
     def scenes(self) -> NDArray[np.float32]:
-        """(N, V) presence in the stored scenes; unpacked anew each time, since they are large."""
+        """(N, V) presence in the stored scenes; unpacked at each call, since they are large."""
         return unpack_scenes(self["fantasies"], self.spec.V)
 
 

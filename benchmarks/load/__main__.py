@@ -25,7 +25,7 @@ from benchmarks.report import describe_machine
 _MANY = 32
 _DRAWN = 8
 _QUANTILES = (0.5, 0.9, 0.99, 0.999)
-# At a rate that leaves the service air: half of what it answers at 32 connections itself.
+# Share of its own rate at 32 connections, so that it is not saturated.
 _SHARE = 0.5
 
 
