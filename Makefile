@@ -40,7 +40,7 @@ test-slow: $(EVERYTHING)  ## the slow tests: training runs, the site, further pa
 	$(PYTEST) -m slow $(ARGS)
 
 test-fast: checks  ## the same checks, then tests without processes, browser and training (a minute)
-	$(PYTEST) -m "not slow and not system" $(addprefix tests/,boltzmann enumeration http registry scene serving) \
+	$(PYTEST) -m "not slow and not system" $(addprefix tests/,machines enumeration http registry scene serving) \
 		--ignore tests/enumeration/test_scene_chains.py $(ARGS)
 
 checks: $(EVERYTHING)

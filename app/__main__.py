@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import gc
+import os
 import socket
 import sys
 from contextlib import suppress
@@ -117,6 +118,9 @@ def serve(settings: Settings, began: float) -> int:
     gc.disable()
     gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
     _give_back_what_is_large()
+    # Products of one question are small, and threads for them would take cores from other
+    # processes. numpy reads this when it is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from app.server import build
 
     server = build(settings, began)

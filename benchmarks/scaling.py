@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from app import reasoning
+from app import questions
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.description import Calibration, Description, VocabularyEntry
 from app.scene.scene import Scene, SceneObject
@@ -93,10 +93,10 @@ def _call(ask: Question, artifact: Artifact) -> Callable[[], object]:
 
 def _questions(scene: Scene) -> Mapping[str, Question]:
     return {
-        "relations": lambda artifact: reasoning.relations(artifact, scene),
-        "missing": lambda artifact: reasoning.missing(artifact, scene),
-        "outliers": lambda artifact: reasoning.outliers(artifact, scene),
-        f"generate of {SCENES}": lambda artifact: reasoning.generate(
+        "relations": lambda artifact: questions.relations(artifact, scene),
+        "missing": lambda artifact: questions.missing(artifact, scene),
+        "outliers": lambda artifact: questions.outliers(artifact, scene),
+        f"generate of {SCENES}": lambda artifact: questions.generate(
             artifact, scene, count=SCENES, seed=1
         ),
     }

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from app.reasoning.calibration import sigmoid
-from app.reasoning.posterior import Posterior
+from app.questions.calibration import sigmoid
+from app.questions.posterior import Posterior
 from app.registry import Artifact, Store, load_model_set
 from app.scene import Scene, SceneObject, derive_relations
 from training.oracle.drawn import DrawnPosterior

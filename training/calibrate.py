@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from app.reasoning import misplaced
-from app.reasoning.placements import PLACES
-from app.reasoning.posterior import posterior
+from app.questions import misplaced
+from app.questions.missing import PLACES
+from app.questions.posterior import posterior
 from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
 from app.scene import CANONICAL
 from training.batches import SceneTensors

@@ -24,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.reasoning.plausible import room_fit
-from app.reasoning.posterior import posterior
+from app.questions.generate import room_fit
+from app.questions.posterior import posterior
 from app.registry import Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
 from app.scene import Scene, SceneObject
 from training.batches import SceneTensors

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from app.inference.spec import Form, Variant
+from app.inference.variants import Form, Variant
 from training.machines import MachineSpec, build
 
 DATA = Path("../shared/data")

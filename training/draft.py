@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from app.inference.closed_form import ClosedForm
+from app.inference.posterior import ClosedForm
 from app.registry import Artifact, Calibration, Offsets
 from app.scene import Vocabulary
 from training.machines import BoltzmannMachine

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from app.inference.spec import FACTORISED
+from app.inference.variants import FACTORISED
 from training.batches import SceneTensors, seen_triples
 from training.checkpoints import load_checkpoint, save_checkpoint
 from training.config import Config

@@ -6,7 +6,7 @@ M, P, U.
 
 from __future__ import annotations
 
-from app.inference.spec import MachineSpec
+from app.inference.variants import MachineSpec
 from app.inference.weights import Weights
 
 __all__ = ["MachineSpec", "Weights"]

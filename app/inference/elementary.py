@@ -2,7 +2,7 @@
 
 The C library's functions are called number by number; these are plain arithmetic, so that the
 compiler applies them to a whole vector register at once. Errors are below 2 units in the last place
-(`tests/boltzmann/test_elementary.py`).
+(`tests/machines/test_elementary.py`).
 
 Source: range reduction and minimax polynomials of Moshier's Cephes library (`expf`, `logf`).
 """

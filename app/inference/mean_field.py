@@ -7,12 +7,13 @@ from m2 = sigmoid(beta c2) on, in turn; beta is one over the temperature. With o
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.weights import Weights
+if TYPE_CHECKING:
+    from app.inference.weights import Weights
 
 Floats = NDArray[np.floating[Any]]
 
@@ -21,9 +22,15 @@ SWEEPS: Final = 10
 
 
 def sigmoid(x: Floats) -> Floats:
-    """1 / (1 + e^-x), without overflow."""
-    e = np.exp(-np.abs(x))
-    found: Floats = np.where(x >= 0, np.ones_like(e), e) / (1 + e)
+    """1 / (1 + e^-x); below -80 as there, since e^88 is the largest float32."""
+    found: Floats = np.exp(np.minimum(-x, 80))
+    found += 1
+    return np.reciprocal(found, out=found)
+
+
+def softplus(x: Floats) -> Floats:
+    """log(1 + e^x)."""
+    found: Floats = np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
     return found
 
 

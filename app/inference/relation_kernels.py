@@ -1,8 +1,6 @@
-"""Compiled loops of the relation part: log-odds of units whose logits are normal.
+"""Compiled loops over relation units: the residual look-up, the mean field, implications.
 
-Formulas in `closed_form`. A pair is a subject class and an object class; it has one unit a
-relation. Inner loops run over a fixed number of pairs, or over four rows of weights at a time, so
-that the compiler keeps vector registers full however small a scene is.
+Formulas in `relations` and, of implications, in `training/machines/implications.py`.
 """
 
 from __future__ import annotations
@@ -11,16 +9,106 @@ import numpy as np
 
 from app.compiling import compiled, compiled_in_any_order, inlined
 from app.inference.elementary import exp, log, logistic
-from app.inference.matrix_kernels import ROWS, add_products
-
-NO_UNIT = np.float32(-30.0)
-"""No log-odds of a relation is below."""
 
 SPREAD, SHIFT = 2654435761, 16
 """A pair's key times the first, shifted by the second, is the number of its bucket."""
 
-_PAIRS = 32
-_CANDIDATES = 16
+_DAMPING = np.float32(0.8)
+# Relations that imply each other are drawn in twice so many groups.
+_GROUPS = 4
+# One more neighbour says less and less.
+_MOST = np.float32(3.0)
+
+
+@compiled
+def pair_rows(start, keys, pairs):
+    """The row of each pair (E,), i V + j; the last row, of nothing, where it has none."""
+    # A search by halves costs more: its branches are unpredictable.
+    found = np.empty(len(pairs), np.int64)
+    for e in range(len(pairs)):
+        pair = pairs[e]
+        bucket = (pair * SPREAD >> SHIFT) & (len(start) - 2)
+        found[e] = len(keys)
+        for row in range(start[bucket], start[bucket + 1]):
+            if keys[row] == pair:
+                found[e] = row
+    return found
+
+
+@compiled
+def pair_terms(w, first, ends, z, base):
+    """What the logits of pairs have whatever the context: z_e into (B, K, P), the rest (B, R, P).
+
+    Args:
+        w: `relations.SharedArrays`.
+        first: the first of the R relations.
+        ends: `relations.Ends`, (B, P) each.
+    """
+    # By name: to take an array from the tuple again and again is to count references to it.
+    S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
+    subjects, objects, log_i, log_j = ends.i, ends.j, ends.log_i, ends.log_j
+    for b in range(len(z)):
+        pairs = pair_rows(w.start, w.key, subjects[b] * len(S) + objects[b])
+        for p in range(len(pairs)):
+            i, j, own = subjects[b, p], objects[b, p], pairs[p]
+            for k in range(z.shape[1]):
+                z[b, k, p] = S[i, k] * O[j, k]
+            for c in range(base.shape[1]):
+                a = first + c
+                total = s[i, a] + n[a, 0] * log_i[b, p] + o[j, a] + n[a, 1] * log_j[b, p]
+                base[b, c, p] = total + residual[own, a]
+
+
+@compiled_in_any_order
+def unit_terms(w, g, a, ends):
+    """Of units (E,): logits without U_e·h1, and z_e (E, K).
+
+    Args:
+        w: `relations.SharedArrays`.
+        g: (A, K), whose products with z_e belong to the logit.
+        a: (E,) relation.
+        ends: `relations.Ends`, (E,) each.
+    """
+    S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
+    i, j, log_i, log_j = ends.i, ends.j, ends.log_i, ends.log_j
+    pairs = pair_rows(w.start, w.key, i * len(S) + j)
+    base, z = np.empty(len(a), np.float32), np.empty((len(a), S.shape[1]), np.float32)
+    for e in range(len(a)):
+        S_i, O_j, into, row = S[i[e]], O[j[e]], z[e], g[a[e]]
+        total = s[i[e], a[e]] + n[a[e], 0] * log_i[e] + o[j[e], a[e]] + n[a[e], 1] * log_j[e]
+        total += residual[pairs[e], a[e]]
+        for k in range(len(into)):
+            into[k] = S_i[k] * O_j[k]
+            total += row[k] * into[k]
+        base[e] = total
+    return base, z
+
+
+@compiled_in_any_order
+def spreads(C, q, spread):
+    """√3 σ of logits (B, R, P): the root of 3 q'C q.
+
+    Args:
+        C: (B, R, r (r + 1) / 2) the lower half, twice what is off the diagonal.
+        q: (B, R r, P).
+    """
+    (B, R, P), r = spread.shape, q.shape[1] // spread.shape[1]
+    row, variance = np.empty(P, np.float32), np.empty(P, np.float32)
+    for b in range(B):
+        for c in range(R):
+            variance[:], t = np.float32(0.0), 0
+            for s in range(c * r, (c + 1) * r):
+                row[:] = np.float32(0.0)
+                for u in range(c * r, s + 1):
+                    weight = C[b, c, t]
+                    t += 1
+                    for p in range(P):
+                        row[p] += weight * q[b, u, p]
+                for p in range(P):
+                    variance[p] += row[p] * q[b, s, p]
+            for p in range(P):
+                spread[b, c, p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
+
 
 _ROOT_3 = np.float32(3.0**0.5)
 # Where three nodes are enough, as √3 σ.
@@ -31,400 +119,313 @@ _TAIL = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 
 
 @compiled
-def set_means(x, out):
-    """sigmoid(x) into out."""
-    for k in range(len(x)):
-        out[k] = logistic(x[k])
+def log_odds(means, spreads, least):
+    """See `relations.to_log_odds`: in place of means (E,), for √3 σ."""
+    wide = np.flatnonzero(spreads >= _NARROW)
+    some = _wide_log_odds(means[wide], spreads[wide])
+    one, four = np.float32(1.0), np.float32(4.0)
+    for e in range(len(means)):
+        size, q = abs(means[e]), exp(spreads[e])
+        u = exp(-size)
+        a, b, c = one + u, one + u * q, q + u
+        middle = four * b * c
+        away = size - log((middle + a * (q * c + b)) / (middle + a * (c + q * b)))
+        means[e] = max(away if means[e] >= 0.0 else -away, least)
+    for k in range(len(wide)):
+        means[wide[k]] = max(some[k], least)
 
 
 @compiled
-def means(x):
-    """sigmoid(x)."""
-    mean = np.empty(len(x), np.float32)
-    set_means(x, mean)
-    return mean
-
-
-@compiled_in_any_order
-def _moments(mean, w, first, last):
-    """Of relations first to last - 1, in N contexts with means (N, H1): (R, d) + G m, and C."""
-    N = len(mean)
-    through = np.empty((N, *w.g.shape), np.float32)
-    C = np.zeros((N, *w.FF.shape[:2]), np.float32)
-    spread = np.empty(mean.shape, np.float32)
-    for n in range(N):
-        for h in range(mean.shape[1]):
-            spread[n, h] = mean[n, h] * (np.float32(1.0) - mean[n, h])
-    for a in range(first, last):
-        for n in range(N):
-            through[n, a] = w.g[a]
-        add_products(w.G[a], mean, through[:, a])
-        add_products(w.FF[a], spread, C[:, a])
-    return through, C
-
-
-@compiled
-def residual_row(start, keys, pair):
-    """Which row of w' is that of a pair; the last, of zeros, where it has none."""
-    # A search by halves costs more: nobody can guess its branches.
-    bucket = (pair * SPREAD >> SHIFT) & (len(start) - 2)
-    for row in range(start[bucket], start[bucket + 1]):
-        if keys[row] == pair:
-            return row
-    return len(keys)
-
-
-@inlined
-def _log_odds(mean, spread):
-    """log-odds of E[sigmoid(ℓ)] for a normal ℓ, by three nodes: 0 and ±√3 σ with weights 4 : 1 : 1.
-
-    Off by .0003 at most in p where √3 σ < `_NARROW`. With u = e^-|mean| and q = e^spread the nodes
-    are u/(1 + u), uq/(1 + uq) and u/(q + u), and nothing can overflow.
-    """
-    u, q = exp(-abs(mean)), exp(spread)
-    a, b, c = np.float32(1.0) + u, np.float32(1.0) + u * q, q + u
-    on = np.float32(4.0) * b * c + a * (q * c + b)
-    off = np.float32(4.0) * b * c + a * (c + q * b)
-    away = abs(mean) - log(on / off)
-    return away if mean >= np.float32(0.0) else -away
-
-
-@compiled
-def _wide_log_odds(mean, spread, out):
-    """The same of many (E,), by the trapezoidal rule: for any σ up to 10 and more."""
-    E = len(mean)
-    u, step, q = np.empty(E, np.float32), np.empty(E, np.float32), np.empty(E, np.float32)
+def _wide_log_odds(means, spreads):
+    """The same by the trapezoidal rule, without a least value."""
+    one, E = np.float32(1.0), len(means)
+    u, step, q = np.empty(E, np.float32), np.empty(E, np.float32), np.ones(E, np.float32)
     on, off = np.empty(E, np.float32), np.empty(E, np.float32)
     for e in range(E):
-        u[e] = exp(-abs(mean[e]))
-        step[e] = exp(_STEP / _ROOT_3 * spread[e])
-        q[e] = np.float32(1.0)
-        on[e] = off[e] = np.float32(1.0) / (np.float32(1.0) + u[e])
+        u[e], step[e] = exp(-abs(means[e])), exp(_STEP / _ROOT_3 * spreads[e])
+        on[e] = off[e] = one / (one + u[e])
     for node in range(len(_TAIL)):
         weight = _TAIL[node]
         for e in range(E):
             q[e] = min(q[e] * step[e], np.float32(1e30))
-            up = np.float32(1.0) / (np.float32(1.0) + u[e] * q[e])
-            down = np.float32(1.0) / (q[e] + u[e])
+            up, down = one / (one + u[e] * q[e]), one / (q[e] + u[e])
             on[e] += weight * (q[e] * up + down)
             off[e] += weight * (up + q[e] * down)
     for e in range(E):
-        away = abs(mean[e]) - log(on[e] / off[e])
-        out[e] = away if mean[e] >= np.float32(0.0) else -away
+        away = abs(means[e]) - log(on[e] / off[e])
+        on[e] = away if means[e] >= 0.0 else -away
+    return on
 
 
 @compiled
-def to_log_odds(means, spreads):
-    """Log-odds of E[sigmoid] in place of the means (E,) of logits, for their √3 σ."""
-    # All of them without a branch, many at a time; then the few wide ones again.
-    wide = 0
-    for e in range(len(means)):
-        wide += spreads[e] >= _NARROW
-    where = np.empty(wide, np.int64)
-    some, some_spreads = np.empty(wide, np.float32), np.empty(wide, np.float32)
-    if wide:
-        wide = 0
-        for e in range(len(means)):
-            if spreads[e] >= _NARROW:
-                where[wide], some[wide], some_spreads[wide] = e, means[e], spreads[e]
-                wide += 1
-        _wide_log_odds(some, some_spreads, some)
-    for e in range(len(means)):
-        means[e] = max(_log_odds(means[e], spreads[e]), NO_UNIT)
-    for k in range(wide):
-        means[where[k]] = max(some[k], NO_UNIT)
+def accumulate(keys, weights, rows, size):
+    """Sums (size, K) of weighted rows by key; key -1 is left out.
 
-
-@compiled_in_any_order
-def _rows(through, C, w, first, last):
-    """Mean and coordinates of a logit as rows (A, 1 + r, K) on S_i * O_j and constants (A, 1 + r).
-
-    With C = L L' the variance q'C q is |L'q|²: the coordinates are L'q.
+    Args:
+        keys: (E,), or (2E,) for two keys of each row.
+        weights, rows: (E,) and (E, K).
     """
-    A, r, K = len(w.g), w.Y.shape[1], w.Y.shape[2]
-    R = -(-(1 + r) // ROWS) * ROWS
-    rows, constants = np.zeros((A, R, K), np.float32), np.zeros((A, R), np.float32)
-    L = np.zeros((r, r), np.float32)
-    for a in range(first, last):
-        t = 0
-        for p in range(r):
-            for q in range(p + 1):
-                total = C[a, t]
-                for k in range(q):
-                    total -= L[p, k] * L[q, k]
-                # Directions that nothing varies in have no root to divide by.
-                if p == q:
-                    L[p, p] = np.sqrt(max(total, np.float32(0.0)))
-                else:
-                    L[p, q] = total / L[q, q] if L[q, q] > 0.0 else np.float32(0.0)
-                t += 1
-        through_a, rows_a, Y_a = through[a], rows[a], w.Y[a]
-        constants[a, 0] = through_a[K]
-        for k in range(K):
-            rows_a[0, k] = through_a[k]
-        for p in range(r):
-            for q in range(p + 1):
-                weight, row, into = L[p, q], Y_a[p], rows_a[1 + q]
-                constants[a, 1 + q] += weight * w.Y0[a, p]
-                for k in range(K):
-                    into[k] += weight * row[k]
-    return rows, constants
+    found = np.zeros((size, rows.shape[1]), np.float32)
+    for n in range(len(keys)):
+        if keys[n] >= 0:
+            e = n % len(rows)
+            into, row, weight = found[keys[n]], rows[e], weights[e]
+            for k in range(len(row)):
+                into[k] += weight * row[k]
+    return found
+
+
+@compiled
+def expanded(G, a, z):
+    """U_e = G[a_e]'z_e, (E, H1)."""
+    found = np.zeros((len(a), G.shape[2]), np.float32)
+    for e in range(len(a)):
+        into, shared, factors = found[e], G[a[e]], z[e]
+        for k in range(len(factors)):
+            row, factor = shared[k], factors[k]
+            for h in range(len(into)):
+                into[h] += factor * row[h]
+    return found
+
+
+@compiled
+def _set_means(x, out):
+    for k in range(len(x)):
+        out[k] = logistic(x[k])
 
 
 @compiled_in_any_order
-def _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread):
-    """Mean and √3 σ of the logits of all units of pairs (E,), into (A, E up to whole blocks)."""
-    rows, constants = functions
-    A, R, K = rows.shape
-    # By name: to take an array from the tuple again and again is to count references to it.
-    S, O, s, o, n = w.S, w.O, w.s, w.o, w.n  # noqa: E741
-    start_of, keys, residual, r, V = w.start, w.key, w.residual, w.Y.shape[1], len(w.S)
-    z, base = np.zeros((_PAIRS, K), np.float32), np.zeros((A, _PAIRS), np.float32)
-    y = np.empty((R, _PAIRS), np.float32)
-    for start in range(0, len(subjects), _PAIRS):
-        for e in range(min(_PAIRS, len(subjects) - start)):
-            i, j = subjects[start + e], objects[start + e]
-            log_i, log_j = log_subjects[start + e], log_objects[start + e]
-            S_i, O_j, z_e = S[i], O[j], z[e]
-            for k in range(K):
-                z_e[k] = S_i[k] * O_j[k]
-            own = residual_row(start_of, keys, i * V + j)
-            for a in range(A):
-                total = s[i, a] + n[a, 0] * log_i + o[j, a] + n[a, 1] * log_j
-                base[a, e] = total + residual[own, a]
-        for a in range(A):
-            for p in range(1 + r):
-                y_p, constant = y[p], constants[a, p]
-                for e in range(_PAIRS):
-                    y_p[e] = constant
-            add_products(rows[a], z, y.T)
-            base_a, y_0 = base[a], y[0]
-            into, variance = mean[a, start : start + _PAIRS], spread[a, start : start + _PAIRS]
-            for e in range(_PAIRS):
-                into[e] = base_a[e] + y_0[e]
-                variance[e] = np.float32(0.0)
-            for p in range(r):
-                y_p = y[1 + p]
-                for e in range(_PAIRS):
-                    variance[e] += y_p[e] * y_p[e]
-            for e in range(_PAIRS):
-                variance[e] = np.sqrt(np.float32(3.0) * variance[e])
+def _products(rows, m, out):
+    """out = rows m."""
+    for e in range(len(rows)):
+        row, total = rows[e], np.float32(0.0)
+        for k in range(len(row)):
+            total += row[k] * m[k]
+        out[e] = total
+
+
+@compiled_in_any_order
+def _selected_products(rows, a, through, out):
+    """out_e = rows_e · through[a_e]."""
+    for e in range(len(rows)):
+        row, other, total = rows[e], through[a[e]], np.float32(0.0)
+        for k in range(len(row)):
+            total += row[k] * other[k]
+        out[e] = total
+
+
+@compiled
+def normal_without_itself(y, U, base, slopes):
+    """Mean and √3 σ of logits of units (E,), for y without their own slopes.
+
+    Args:
+        U: (E, H1).
+    """
+    mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
+    rest, m = np.empty_like(y), np.empty_like(y)
+    for e in range(len(U)):
+        row = U[e]
+        for k in range(len(y)):
+            rest[k] = y[k] - slopes[e] * row[k]
+        _set_means(rest, m)
+        mean[e], variance = _moments(row, m)
+        mean[e] += base[e]
+        spread[e] = np.sqrt(np.float32(3.0) * variance)
+    return mean, spread
+
+
+@compiled_in_any_order
+def _moments(row, m):
+    mean = variance = np.float32(0.0)
+    for k in range(len(row)):
+        mean += row[k] * m[k]
+        variance += row[k] * row[k] * (m[k] * (np.float32(1.0) - m[k]))
+    return mean, variance
+
+
+@compiled
+def fixed_point(x, G, a, base, z, r, gate, sweeps):
+    """The mean field of `RelationUnits.fixed_point`: y (H1,) and slopes (E,).
+
+    Args:
+        G: (A, K, H1), U_e = G[a_e]'z_e; of length 0 where z (E, H1) is U.
+        r, gate: (E,).
+    """
+    E, (A, K, _) = len(a), G.shape
+    y, m, logits = x.copy(), np.empty_like(x), np.empty(E, np.float32)
+    slopes, on = np.zeros(E, np.float32), np.empty(E, np.float32)
+    shared, through = G.reshape(A * K, -1), np.empty(A * K, np.float32)
+    factors = np.empty((A, K), np.float32)
+    for sweep in range(sweeps):
+        _set_means(y, m)
+        if A:
+            _products(shared, m, through)
+            _selected_products(z, a, through.reshape(A, K), logits)
+        else:
+            _products(z, m, logits)
+        for e in range(E):
+            logits[e] += base[e]
+        _set_means(logits, on)
+        kept = _DAMPING if sweep else np.float32(0.0)
+        for e in range(E):
+            slopes[e] = kept * slopes[e] + (np.float32(1.0) - kept) * gate[e] * (r[e] - on[e])
+        y[:] = x
+        if A:
+            factors[:] = np.float32(0.0)
+            for e in range(E):
+                into, row, slope = factors[a[e]], z[e], slopes[e]
+                for k in range(K):
+                    into[k] += slope * row[k]
+            _add_rows(factors.reshape(-1), shared, y)
+        else:
+            _add_rows(slopes, z, y)
+    return y, slopes
+
+
+@compiled
+def _add_rows(weights, rows, out):
+    for e in range(len(rows)):
+        row, weight = rows[e], weights[e]
+        for k in range(len(out)):
+            out[k] += weight * row[k]
+
+
+@compiled
+def _no_steps(relations, n):
+    """Where steps lead, and what the paths of two steps say, before any relation holds.
+
+    A step is a relation in one direction: a from subject to object, A + a back.
+
+    Returns:
+        degree (2A, n), how many of each step lead from a class; near (2A, n, n), where they lead;
+        seen (n, n, 2A), of paths that begin with each step, the bits of their second; and what
+        paths say of the relations from class to class, (n, n, A).
+    """
+    steps = 2 * relations
+    degree, near = np.zeros((steps, n), np.int64), np.empty((steps, n, n), np.int64)
+    seen = np.zeros((n, n, steps), np.uint64)
+    return degree, near, seen, np.zeros((n, n, relations), np.float32)
+
+
+@compiled
+def _hold(known, weight, a, i, j):
+    """Relation a holds between two different classes: count its two steps, and new paths."""
+    # Arrays whole and by index: a slice of one costs more than what is done with it.
+    degree, near, seen, paths = known
+    steps = len(degree)
+    both = (a, i, j), (steps // 2 + a, j, i)
+    for c, x, y in both:
+        near[c, x, degree[c, x]] = y
+        degree[c, x] += 1
+    for c, x, y in both:
+        for d in range(steps):
+            for at in range(degree[d, y]):
+                _add_path(seen, paths, weight, x, near[d, y, at], c, d)
+            # What a step leads to from x leads to x by the opposite step.
+            back = (d + steps // 2) % steps
+            for at in range(degree[d, x]):
+                _add_path(seen, paths, weight, near[d, x, at], y, back, c)
 
 
 @inlined
-def _whole_blocks(pairs):
-    return -(-pairs // _PAIRS) * _PAIRS
+def _add_path(seen, paths, weight, x, y, first, second):
+    steps, bit = seen.shape[2], np.uint64(1) << np.uint64(second)
+    if not seen[x, y, first] & bit:
+        seen[x, y, first] |= bit
+        for b in range(paths.shape[2]):
+            paths[x, y, b] += weight[steps + first * steps + second, b]
 
 
 @compiled
-def relation_log_odds(y, w, classes, log_counts, slopes, shift):
-    """Log-odds of E[sigmoid(ℓ_e + shift_e)] between the classes of a scene, (A, n, n).
+def _implied(known, weight, direct):
+    """What all that holds implies for each relation from class to class, (n, n, A).
 
     Args:
-        slopes: (A, n, n) or empty; what a unit itself adds to y is taken out to first order,
-            ℓ_e(m) changing by slope σ_e².
-        shift: (A, n, n) or empty.
+        direct: whether the relations of a pair say something of each other.
     """
-    A, n = len(w.g), len(classes)
-    subjects, objects = np.empty(n * n, np.int64), np.empty(n * n, np.int64)
-    log_subjects, log_objects = np.empty(n * n, np.float32), np.empty(n * n, np.float32)
-    for i in range(n):
-        for j in range(n):
-            e = i * n + j
-            subjects[e], objects[e] = classes[i], classes[j]
-            log_subjects[e], log_objects[e] = log_counts[i], log_counts[j]
-    size = _whole_blocks(n * n)
-    mean, spread = np.zeros((A, size), np.float32), np.empty((A, size), np.float32)
-    through, C = _moments(means(y).reshape(1, -1), w, 0, A)
-    functions = _rows(through[0], C[0], w, 0, A)
-    _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread)
-    if len(slopes):
-        own = slopes.reshape(A, -1)
-        for a in range(A):
-            for e in range(n * n):
-                mean[a, e] -= own[a, e] * spread[a, e] * spread[a, e] / np.float32(3.0)
-    if len(shift):
-        shifts = shift.reshape(A, -1)
-        for a in range(A):
-            for e in range(n * n):
-                mean[a, e] += shifts[a, e]
-    to_log_odds(mean.reshape(-1), spread.reshape(-1))
-    return mean[:, : n * n].copy().reshape(A, n, n)
+    degree, near, _, paths = known
+    (steps, n), A = degree.shape, weight.shape[1]
+    shift, degrees = paths.copy(), weight[steps + steps * steps :]
+    out, into = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
+    for c in range(steps):
+        # What leads into a class by one step leads out of it by the opposite one.
+        back = (c + A) % steps
+        for x in range(n):
+            for b in range(A):
+                out[x, b] += degrees[c, b] * min(np.float32(degree[c, x]), _MOST)
+                into[x, b] += degrees[steps + c, b] * min(np.float32(degree[back, x]), _MOST)
+    for x in range(n):
+        for y in range(n):
+            for b in range(A):
+                shift[x, y, b] += out[x, b] + into[y, b]
+    for c in range(steps):
+        back = (c + A) % steps
+        for x in range(n):
+            for at in range(degree[c, x]):
+                y = near[c, x, at]
+                for b in range(A):
+                    if direct:
+                        shift[x, y, b] += weight[c, b]
+                    # Degrees are of all other classes than these two.
+                    if degree[c, x] <= _MOST:
+                        shift[x, y, b] -= degrees[c, b]
+                    if degree[back, y] <= _MOST:
+                        shift[x, y, b] -= degrees[steps + c, b]
+    return shift
 
 
 @compiled
-def log_odds_apart(y, w, F, classes, log_counts, slopes, shift, i, j):
-    """All relations between two classes, without anything given of the two, (2, A, P).
+def implied(weight, n, a, i, j):
+    """What relations that hold, of different classes, imply for all others, (2, n, n, A).
 
-    What is given of a pair is taken out of y to first order: ℓ_e(m) changes by
-
-        sum_e' slope_e' cov(ℓ_e, ℓ_e'),   cov = sum_k U_ek U_e'k m_k (1 - m_k)
-
-    over the units e' of the pair, both ways.
+    First all they do; then without what those of a pair imply for each other.
 
     Args:
-        F: (A r up to whole rows, H1) the directions of all relations.
-        slopes: (A, n, n) or empty.
-        shift: (A, n, n) or empty, what other pairs imply.
-        i, j: (P,) places of the classes; the relations from i to j come first.
+        weight: (F, A), see `RelationUnits.implication_weights`.
+        n: classes of the scene.
+        a, i, j: (E,).
     """
-    A, P = len(w.g), len(i)
-    subjects, objects = np.empty(2 * P, np.int64), np.empty(2 * P, np.int64)
-    log_subjects, log_objects = np.empty(2 * P, np.float32), np.empty(2 * P, np.float32)
-    for p in range(P):
-        for way in range(2):
-            one, other = (i[p], j[p]) if way == 0 else (j[p], i[p])
-            e = way * P + p
-            subjects[e], objects[e] = classes[one], classes[other]
-            log_subjects[e], log_objects[e] = log_counts[one], log_counts[other]
-    size = _whole_blocks(2 * P)
-    mean, spread = np.zeros((A, size), np.float32), np.empty((A, size), np.float32)
-    on = means(y)
-    through, C = _moments(on.reshape(1, -1), w, 0, A)
-    functions = _rows(through[0], C[0], w, 0, A)
-    _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread)
-    if len(slopes):
-        own = np.empty((P, 2, A), np.float32)
-        for p in range(P):
-            for a in range(A):
-                own[p, 0, a] = slopes[a, i[p], j[p]]
-                # Of a class with itself the two ways are one.
-                own[p, 1, a] = slopes[a, j[p], i[p]] if i[p] != j[p] else np.float32(0.0)
-        _take_out(_covariances(F, on), w, subjects, objects, own, mean)
-    if len(shift):
-        for a in range(A):
-            for p in range(P):
-                mean[a, p] += shift[a, i[p], j[p]]
-                mean[a, P + p] += shift[a, j[p], i[p]]
-    to_log_odds(mean.reshape(-1), spread.reshape(-1))
-    found = np.empty((2, A, P), np.float32)
-    for way in range(2):
-        for a in range(A):
-            for p in range(P):
-                found[way, a, p] = mean[a, way * P + p]
+    known = _no_steps(weight.shape[1], n)
+    for e in range(len(a)):
+        _hold(known, weight, a[e], i[e], j[e])
+    found = np.empty((2, n, n, weight.shape[1]), np.float32)
+    found[0], found[1] = _implied(known, weight, True), _implied(known, weight, False)
     return found
 
 
-@compiled_in_any_order
-def _covariances(F, mean):
-    """F diag(m (1 - m)) F'."""
-    spread = np.empty(F.shape, np.float32)
-    for q in range(len(F)):
-        row, into = F[q], spread[q]
-        for h in range(len(mean)):
-            into[h] = row[h] * (mean[h] * (np.float32(1.0) - mean[h]))
-    found = np.zeros((len(F), len(F)), np.float32)
-    add_products(F, spread, found)
-    return found
+@compiled
+def draw_in_groups(weight, logits, free, uniform, other, r):
+    """Draw relations that imply each other into r (A, n, n): group after group, given all before.
 
+    Groups are drawn too; a(i, j) and a(j, i) are never in one.
 
-@compiled_in_any_order
-def _take_out(covariances, w, subjects, objects, slopes, mean):
-    """mean (A, 2P) -= what the units of each pair add to each other, for their slopes (P, 2, A)."""
-    S, O, Y0, Y = w.S, w.O, w.Y0, w.Y  # noqa: E741
-    (A, r, K), P = Y.shape, len(slopes)
-    z, q = np.empty(K, np.float32), np.empty((2, A * r), np.float32)
-    pull, back = np.empty(A * r, np.float32), np.empty(A * r, np.float32)
-    for p in range(P):
-        pull[:] = np.float32(0.0)
-        for way in range(2):
-            e, q_way = way * P + p, q[way]
-            S_i, O_j = S[subjects[e]], O[objects[e]]
-            for k in range(K):
-                z[k] = S_i[k] * O_j[k]
+    Args:
+        weight: (F, A), as above.
+        logits: (A, n, n) without implications.
+        free: (A, n, n) which relations to draw; the others stay as they are.
+        uniform, other: (A, n, n) in [0, 1), for relations and for groups.
+    """
+    A, n, _ = r.shape
+    known, group = _no_steps(A, n), np.full(r.shape, -1, np.int64)
+    for a in range(A):
+        for i in range(n):
+            for j in range(n):
+                if free[a, i, j]:
+                    # One draw for both ways says which comes first, in the sooner or later half.
+                    later = other[a, min(i, j), max(i, j)] < 0.5
+                    half = _GROUPS if later == (i < j) else 0
+                    group[a, i, j] = half + np.int64(2 * _GROUPS * other[a, i, j]) % _GROUPS
+    for turn in range(-1, 2 * _GROUPS):
+        if turn >= 0:
+            shift = _implied(known, weight, True)
             for a in range(A):
-                slope = slopes[p, way, a]
-                for t in range(r):
-                    row, total = Y[a, t], Y0[a, t]
-                    for k in range(K):
-                        total += row[k] * z[k]
-                    q_way[a * r + t] = total
-                    pull[a * r + t] += slope * total
-        for s in range(A * r):
-            row, total = covariances[s], np.float32(0.0)
-            for t in range(A * r):
-                total += row[t] * pull[t]
-            back[s] = total
-        for way in range(2):
-            for a in range(A):
-                total = np.float32(0.0)
-                for t in range(r):
-                    total += q[way, a * r + t] * back[a * r + t]
-                mean[a, way * P + p] -= total
-
-
-@compiled
-def placement_log_odds(y, W, w, candidates, anchors, log_counts):
-    """Relations of absent candidates to anchors and back, (N, A, m) both, were they there."""
-    A, N, m = len(w.g), len(candidates), len(anchors)
-    found = np.empty((2, N, A, m), np.float32)
-    subjects, objects = np.empty(2 * m, np.int64), np.empty(2 * m, np.int64)
-    log_subjects, log_objects = np.zeros(2 * m, np.float32), np.zeros(2 * m, np.float32)
-    log_objects[:m] = log_counts
-    log_subjects[m:] = log_counts
-    size = _whole_blocks(2 * m)
-    mean, spread = np.zeros((A, size), np.float32), np.empty((A, size), np.float32)
-    for start in range(0, N, _CANDIDATES):
-        some = candidates[start : start + _CANDIDATES]
-        through, C = _moments(_means_with(y, W, some), w, 0, A)
-        for c in range(len(some)):
-            subjects[:m], objects[:m] = some[c], anchors
-            subjects[m:], objects[m:] = anchors, some[c]
-            functions = _rows(through[c], C[c], w, 0, A)
-            _normal(functions, w, subjects, log_subjects, objects, log_objects, mean, spread)
-            to_log_odds(mean.reshape(-1), spread.reshape(-1))
-            found[0, start + c] = mean[:, :m]
-            found[1, start + c] = mean[:, m : 2 * m]
-    return found[0], found[1]
-
-
-@compiled
-def _means_with(y, W, candidates):
-    """Means of h1 once each candidate is there, (N, H1): as factorial as without it."""
-    mean = np.empty((len(candidates), len(y)), np.float32)
-    for c in range(len(candidates)):
-        row, into = W[candidates[c]], mean[c]
-        for k in range(len(y)):
-            into[k] = logistic(y[k] + row[k])
-    return mean
-
-
-@compiled_in_any_order
-def _normal_unit(functions, w, a, i, log_i, j, log_j):
-    """Mean and √3 σ of the logit of one unit."""
-    rows, constants = functions
-    K, r = w.S.shape[1], w.Y.shape[1]
-    S_i, O_j, z = w.S[i], w.O[j], np.empty(K, np.float32)
-    mean = w.s[i, a] + w.n[a, 0] * log_i + w.o[j, a] + w.n[a, 1] * log_j
-    mean += w.residual[residual_row(w.start, w.key, i * len(w.S) + j), a]
-    for k in range(K):
-        z[k] = S_i[k] * O_j[k]
-    variance = np.float32(0.0)
-    for p in range(1 + r):
-        row, dot = rows[a, p], constants[a, p]
-        for k in range(K):
-            dot += row[k] * z[k]
-        if p == 0:
-            mean += dot
-        else:
-            variance += dot * dot
-    return mean, np.sqrt(np.float32(3.0) * variance)
-
-
-@compiled
-def placed_log_odds(y, W, w, candidates, anchor, relation, log_count, outgoing):
-    """One relation of absent candidates to one anchor, or back, (N,)."""
-    N, a, none = len(candidates), relation, np.float32(0.0)
-    mean, spread = np.empty(N, np.float32), np.empty(N, np.float32)
-    for start in range(0, N, _CANDIDATES):
-        some = candidates[start : start + _CANDIDATES]
-        through, C = _moments(_means_with(y, W, some), w, a, a + 1)
-        for c in range(len(some)):
-            functions = _rows(through[c], C[c], w, a, a + 1)
-            i, log_i, j, log_j = some[c], none, anchor, log_count
-            if not outgoing:
-                i, log_i, j, log_j = anchor, log_count, some[c], none
-            found = _normal_unit(functions, w, a, i, log_i, j, log_j)
-            mean[start + c], spread[start + c] = found
-    to_log_odds(mean, spread)
-    return mean
+                for i in range(n):
+                    for j in range(n):
+                        if group[a, i, j] == turn:
+                            p = logistic(logits[a, i, j] + shift[i, j, a])
+                            r[a, i, j] = uniform[a, i, j] < p
+        for a in range(A):
+            for i in range(n):
+                for j in range(n):
+                    if group[a, i, j] == turn and r[a, i, j] and i != j:
+                        _hold(known, weight, a, i, j)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.spec import MachineSpec, feature_count
+from app.inference.variants import MachineSpec
 
 WORD = 32
 """Bits of the words that stored scenes are packed into."""
@@ -19,44 +18,26 @@ WORD = 32
 def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     """Kind of number (float or int) and shape of each array of a machine.
 
-    All variants:
+    All variants have these; for the others see `variants`.
 
         b (V,), c1 (H1,), c2 (H2,), W (V, H1), J (H1, H2), Q (C, H1)
         triples (T, 3) the (a, i, j) that have a weight of their own, sorted
         fantasies (N, ceil(V / 32)) stored scenes as bits; fantasy_rooms (N,) -1 for none
-
-    Triway: d (A,), s and o (A, V), S and O (V, K), R (A, K), M (A, K, H1), P (A, H1), n (A, 2),
-    usual (V,), residual (T,), kappa (A,), gamma (1 + G, A, F) and B (G, H1).
-    RBM: d (T,), U (T, H1). GBM: the same and g (T, 2). Product RBM: d, S, O, M, P.
     """
-    V, A, K, T, H1, H2 = spec.V, spec.A, spec.K, spec.T, spec.H1, spec.H2
+    V, H1, H2 = spec.V, spec.H1, spec.H2
     floats: dict[str, tuple[int, ...]] = {
         "b": (V,), "c1": (H1,), "c2": (H2,), "W": (V, H1), "J": (H1, H2), "Q": (spec.C, H1)
     }  # fmt: skip
-    ints: dict[str, tuple[int, ...]] = {"triples": (T, 3)}
+    ints: dict[str, tuple[int, ...]] = {"triples": (spec.T, 3)}
     if spec.N:
         ints |= {"fantasies": (spec.N, -(-V // WORD)), "fantasy_rooms": (spec.N,)}
-    if spec.variant == "triway":
-        floats |= {
-            "d": (A,), "s": (A, V), "o": (A, V), "S": (V, K), "O": (V, K), "R": (A, K),
-            "M": (A, K, H1), "P": (A, H1), "n": (A, 2), "usual": (V,), "residual": (T,),
-            "kappa": (A,),
-        }  # fmt: skip
-        if spec.G:
-            floats |= {"gamma": (1 + spec.G, A, feature_count(A)), "B": (spec.G, H1)}
-    elif spec.variant == "product_rbm":
-        floats |= {"d": (T,), "S": (V, K), "O": (V, K), "M": (A, K, H1), "P": (A, H1)}
-    else:
-        floats |= {"d": (T,), "U": (T, H1)}
-        if spec.variant == "gbm":
-            floats["g"] = (T, 2)
-    kinds = ((float, floats), (int, ints))
+    kinds = ((float, floats | spec.kind.shapes(spec)), (int, ints))
     return {name: (kind, shape) for kind, some in kinds for name, shape in some.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """The arrays of a machine, by the names of `layout`; nobody changes them.
+    """The arrays of a machine, by the names of `layout`; they never change.
 
     Attributes:
         spec: sizes and form.
@@ -87,7 +68,7 @@ class Weights:
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.arrays[name]
 
-    @cached_property
+    @property
     def triple_keys(self) -> NDArray[np.int64]:
         """(T,) one number for each triple, (a V + i) V + j; ascending."""
         relation, subject, object_ = self["triples"].astype(np.int64).T
@@ -98,6 +79,11 @@ class Weights:
     def scenes(self) -> NDArray[np.float32]:
         """(N, V) presence in the stored scenes; unpacked at each call, since they are large."""
         return unpack_scenes(self["fantasies"], self.spec.V)
+
+    def room_bias(self, room: int | None) -> NDArray[Any]:
+        """c1 + Q[t], (H1,); c1 where the room type is not known, or the machine has none."""
+        bias: NDArray[Any] = self["c1"]
+        return bias if room is None or not self.spec.C else bias + self["Q"][room]
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from app.inference import MachineSpec, Weights
-from app.inference.closed_form import ClosedForm
-from app.inference.completions import Completions
-from app.inference.scene_chains import SceneChains
-from app.inference.scoring import ContextScorer
+from app.inference.chains import SceneChains
+from app.inference.objects import ContextScorer
+from app.inference.posterior import ClosedForm, Completions
 from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.description import Calibration, Description
@@ -99,10 +98,15 @@ class Artifact:
         gain: NDArray[np.float32] = self.scorer.gain(self.weights["c1"])
         return gain
 
+    def context_rows(self) -> NDArray[np.float32]:
+        """(T, H1) what each triple that has a weight of its own says of the context."""
+        relation, subject, object_ = self.weights["triples"].astype(np.int64).T
+        return self.spec.kind.units(self.weights).rows_of(relation, subject, object_)
+
     @cached_property
     def scene_chains(self) -> SceneChains:
         """Compiled chains that draw scenes."""
-        return SceneChains(self.weights)
+        return SceneChains(self.weights, self.closed_form.units)
 
 
 def write_artifact(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from app.registry.description import Calibration, PairSlope
 
-Table = NDArray[np.float64]
+Table = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class RelationSlopes:
 
 def _table(entries: tuple[PairSlope, ...]) -> Table:
     bends = max((len(e.bends) for e in entries), default=0)
-    table = np.zeros((len(entries), 4 + 2 * bends))
+    table = np.zeros((len(entries), 4 + 2 * bends), np.float32)
     for row, e in zip(table, entries, strict=True):
         row[:4] = e.intercept, e.slope, e.log_count, e.log_classes
         row[4 : 4 + 2 * len(e.bends)] = np.ravel(e.bends)

@@ -16,6 +16,7 @@ from app.scene.relations import CANONICAL
 from app.scene.scene import Scene
 
 A = len(CANONICAL)
+Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,31 +70,39 @@ def pool_instances(
             raise ValueError(f"{name} has shape {array.shape}, must be {(A, size, size)}")
     if confidence.shape != (size,):
         raise ValueError(f"confidence has shape {confidence.shape}, must be {(size,)}")
-    labels = np.asarray(classes, dtype=np.int64, order="C")
-    sure = np.asarray(confidence, dtype=np.float64, order="C")
-    distinct, counts, present, on, seen = _pool(
-        labels, sure, np.ascontiguousarray(holds), np.ascontiguousarray(observed)
-    )
+    labels = np.asarray(classes, dtype=np.int64)
+    distinct, _, row, counts, present = pool_classes(labels, np.asarray(confidence, np.float64))
+    on, seen = pooled(row, len(distinct), holds, observed)
     return ClassEvidence(distinct, counts, present, on, seen, room_type)
 
 
 @compiled
-def _pool(classes, confidence, holds, observed):
-    """The fields of the evidence, less the room type."""
-    size = len(classes)
-    distinct = np.unique(classes)
-    n = len(distinct)
-    row = np.searchsorted(distinct, classes)
-    counts, absent = np.zeros(n, np.int64), np.ones(n)
-    for i in range(size):
-        counts[row[i]] += 1
-        absent[row[i]] *= 1.0 - confidence[i]
-    on, seen = pooled(row, n, holds, observed)
-    return distinct, counts, 1.0 - absent, on, seen
+def pool_classes(
+    classes: NDArray[np.int64], confidence: NDArray[np.float64]
+) -> tuple[Places, Places, Places, Places, NDArray[np.float64]]:
+    """The n distinct classes of N instances, ascending.
+
+    Returns:
+        The classes, the first instance of each, the place of each instance's class (N,), how many
+        instances each has, and the probability that at least one is there.
+    """
+    distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
+    counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
+    absent, n = np.ones(len(classes), np.float64), 0
+    for instance in np.argsort(classes, kind="mergesort"):
+        if n == 0 or distinct[n - 1] != classes[instance]:
+            distinct[n], first[n] = classes[instance], instance
+            n += 1
+        row[instance] = n - 1
+        counts[n - 1] += 1
+        absent[n - 1] *= 1.0 - confidence[instance]
+    return distinct[:n], first[:n], row, counts[:n], 1.0 - absent[:n]
 
 
 @compiled
-def pooled(row, n, holds, observed):
+def pooled(
+    row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Relations of instances (A, N, N), which hold and which were observed, by class, (A, n, n).
 
     Args:
@@ -104,12 +113,9 @@ def pooled(row, n, holds, observed):
     for a in range(A):
         for i in range(size):
             for j in range(size):
-                if i == j:
-                    continue
-                if holds[a, i, j]:
-                    on[a, row[i], row[j]] = seen[a, row[i], row[j]] = True
-                elif observed[a, i, j]:
+                if i != j and (holds[a, i, j] or observed[a, i, j]):
                     seen[a, row[i], row[j]] = True
+                    on[a, row[i], row[j]] |= holds[a, i, j]
     return on, seen
 
 

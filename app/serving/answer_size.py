@@ -11,7 +11,7 @@ from typing import Final
 
 from pydantic_core import to_json
 
-from app import reasoning
+from app import questions
 from app.serving.errors import Fault, Reason, RequestError
 from app.serving.reading import Reading
 
@@ -27,14 +27,14 @@ _LONGEST_NAME: Final = 4 * 128 + 3
 
 
 def of_relations(
-    found: Sequence[reasoning.RelationAnswer], disagreements: Sequence[reasoning.Disagreement]
+    found: Sequence[questions.RelationAnswer], disagreements: Sequence[questions.Disagreement]
 ) -> Callable[[int], int]:
     """Bytes of a `RelationsAnswer` without its envelope, by the bytes of the longest name."""
     entries = len(found) + 2 * len(disagreements)
     return lambda name: entries * (_RELATION + 2 * name)
 
 
-def of_missing(found: Sequence[reasoning.MissingAnswer]) -> Callable[[int], int]:
+def of_missing(found: Sequence[questions.MissingAnswer]) -> Callable[[int], int]:
     """The same of a `MissingAnswer`."""
     places = causes = 0
     for entry in found:
@@ -44,7 +44,7 @@ def of_missing(found: Sequence[reasoning.MissingAnswer]) -> Callable[[int], int]
     return lambda name: fixed + (places + causes + len(found)) * name
 
 
-def of_outliers(found: reasoning.OutliersFound) -> Callable[[int], int]:
+def of_outliers(found: questions.OutliersFound) -> Callable[[int], int]:
     """The same of an `OutliersAnswer`."""
     causes = 0
     for entry in found.outliers:
@@ -54,7 +54,7 @@ def of_outliers(found: reasoning.OutliersFound) -> Callable[[int], int]:
     return lambda name: fixed + (2 * judged + causes + 2 * misplaced) * name
 
 
-def of_generated(drawn: Sequence[reasoning.GeneratedScene]) -> Callable[[int], int]:
+def of_generated(drawn: Sequence[questions.GeneratedScene]) -> Callable[[int], int]:
     """The same of a `GenerateAnswer`."""
     objects = sum([len(scene.objects) for scene in drawn])
     relations = sum([len(scene.relations) for scene in drawn])

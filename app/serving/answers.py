@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from pydantic_core import from_json, to_json
 
-from app import reasoning
+from app import questions
 from app.scene.relations import CANONICAL, canonicalise, opposite
 from app.serving.reading import Reading
 from app.serving.rounding import DIGITS, significant
@@ -47,8 +47,8 @@ def scene_notes(reading: Reading) -> Answer:
 
 def relations(
     envelope: Answer,
-    found: Sequence[reasoning.RelationAnswer],
-    disagreements: Sequence[reasoning.Disagreement],
+    found: Sequence[questions.RelationAnswer],
+    disagreements: Sequence[questions.Disagreement],
     reading: Reading,
     *,
     min_probability: float,
@@ -74,7 +74,7 @@ def relations(
 def missing(
     envelope: Answer,
     coverage: float,
-    found: Sequence[reasoning.MissingAnswer],
+    found: Sequence[questions.MissingAnswer],
     reading: Reading,
 ) -> Answer:
     """See `scene_client.schemas.MissingAnswer`."""
@@ -103,7 +103,7 @@ def missing(
     return envelope
 
 
-def outliers(envelope: Answer, found: reasoning.OutliersFound, reading: Reading) -> Answer:
+def outliers(envelope: Answer, found: questions.OutliersFound, reading: Reading) -> Answer:
     """See `scene_client.schemas.OutliersAnswer`."""
     ids = reading.ids
     envelope["threshold"] = float(f"{found.threshold:.{DIGITS}g}")
@@ -136,7 +136,7 @@ def outliers(envelope: Answer, found: reasoning.OutliersFound, reading: Reading)
     return envelope
 
 
-def generate(envelope: Answer, seed: int, drawn: Sequence[reasoning.GeneratedScene]) -> Answer:
+def generate(envelope: Answer, seed: int, drawn: Sequence[questions.GeneratedScene]) -> Answer:
     """See `scene_client.schemas.GenerateAnswer`."""
     envelope["seed"] = seed
     envelope["scenes"] = [
@@ -170,12 +170,12 @@ def written(answer: Any) -> bytes:
 
 
 def _because(
-    causes: Sequence[reasoning.Because], ids: Sequence[str], rounded: Iterator[float]
+    causes: Sequence[questions.Because], ids: Sequence[str], rounded: Iterator[float]
 ) -> list[Answer]:
     return [{"object": ids[place], "log_odds_change": next(rounded)} for place, _ in causes]
 
 
-def _placement(place: reasoning.Placement, ids: Sequence[str], rounded: Iterator[float]) -> Answer:
+def _placement(place: questions.Placement, ids: Sequence[str], rounded: Iterator[float]) -> Answer:
     relation, object_, _, offset = place
     entry: Answer = {"relation": relation, "object": ids[object_], "probability": next(rounded)}
     if offset is not None:
@@ -193,7 +193,7 @@ def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Ans
     return {"subject": ids[subject], "relation": relation, "object": ids[object_]}
 
 
-def _disagreement(entry: reasoning.Disagreement, reading: Reading) -> Answer:
+def _disagreement(entry: questions.Disagreement, reading: Reading) -> Answer:
     """A disagreement from the end that the request spelled its relation from."""
     subject, object_, observed, expected, probability, observed_probability = entry
     triples = {canonicalise(subject, relation, object_) for relation in observed}

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 
-from app import reasoning
+from app import questions
 from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreError
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import WorkQueue
@@ -70,12 +70,12 @@ class ServedModel:
         return {"h1": spec.H1, "h2": spec.H2} if spec.H2 else {"h1": spec.H1}
 
     @cached_property
-    def contexts(self) -> Mapping[str, tuple[reasoning.ContextUnit, ...]]:
+    def contexts(self) -> Mapping[str, tuple[questions.ContextUnit, ...]]:
         """Its hidden units by their strongest objects and relations, layer by layer.
 
         Takes a fifth of a second the first time.
         """
-        return reasoning.contexts(self.artifact)
+        return questions.contexts(self.artifact)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import secrets
 from collections.abc import Callable
 from dataclasses import replace
 
-from app import reasoning
+from app import questions
 from app.scene.frames import viewer_axes
 from app.scene.relations import opposite
 from app.serving import answer_size, answers
@@ -31,7 +31,7 @@ async def relations(request: Request, asked: RelationsRequest) -> Answer:
     model, reading = request.read(asked)
     found, disagreements = await request.ask(
         model,
-        reasoning.relations,
+        questions.relations,
         reading.scene,
         top_k=asked.top_k,
         # A little lower: the rounded probability decides which relations are left out.
@@ -66,7 +66,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
     viewpoint = asked.viewpoint
     found = await request.ask(
         model,
-        reasoning.missing,
+        questions.missing,
         reading.scene,
         top_k=asked.top_k,
         candidates=candidates,
@@ -88,7 +88,7 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
     model, reading = request.read(asked)
     found = await request.ask(
         model,
-        reasoning.outliers,
+        questions.outliers,
         reading.scene,
         sensitivity=asked.sensitivity,
         threshold=asked.threshold,
@@ -105,8 +105,8 @@ async def generate(request: Request, asked: GenerateRequest) -> Answer:
     _check_context(asked, model)
     seed = secrets.randbits(DRAWN_SEED_BITS) if asked.seed is None else asked.seed
 
-    def draw(stop: Callable[[], bool]) -> tuple[reasoning.GeneratedScene, ...]:
-        return reasoning.generate(
+    def draw(stop: Callable[[], bool]) -> tuple[questions.GeneratedScene, ...]:
+        return questions.generate(
             model.artifact,
             reading.scene,
             count=asked.count,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from app import reasoning
+from app import questions
 from app.registry import Artifact
 from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
@@ -28,17 +28,17 @@ def warm_up(artifact: Artifact) -> None:
     bare = replace(scene, relations=None)
     seen = observe(bare, typical_sizes=artifact.vocabulary.sizes)
     scenes = scene, bare, seen
-    stand = [reasoning.relations(artifact, one) for one in scenes]
-    missing = [entry for one in scenes for entry in reasoning.missing(artifact, one)]
+    stand = [questions.relations(artifact, one) for one in scenes]
+    missing = [entry for one in scenes for entry in questions.missing(artifact, one)]
     if len(scene.objects) > 1:
         for one in (scene, bare):
-            reasoning.missing(artifact, one, at=("on-top", 0))
-            reasoning.missing(artifact, one, at=("under", 0))
+            questions.missing(artifact, one, at=("on-top", 0))
+            questions.missing(artifact, one, at=("under", 0))
     # With threshold 0 every object is an outlier: reasons and companions are asked for, too.
-    _, outliers, misplaced = reasoning.outliers(artifact, scene, threshold=0.0)
+    _, outliers, misplaced = questions.outliers(artifact, scene, threshold=0.0)
     for one in scenes[1:]:
-        outliers += reasoning.outliers(artifact, one).outliers
-    generated = reasoning.generate(artifact, scene, count=2, seed=0, steps=STEPS)
+        outliers += questions.outliers(artifact, one).outliers
+    generated = questions.generate(artifact, scene, count=2, seed=0, steps=STEPS)
     numbers = [entry.probability for both in stand for found in both for entry in found]
     numbers += [number for entry in missing for number in (entry.probability, entry.log_odds)]
     numbers += [cause.log_odds_change for entry in missing for cause in entry.because]

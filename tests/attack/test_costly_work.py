@@ -16,7 +16,7 @@ import httpx
 import pytest
 from pydantic import ValidationError
 
-from app import reasoning
+from app import questions
 from app.settings import Settings
 from tests.http.stores import VOCABULARY
 from tests.services import launch, serve
@@ -30,7 +30,7 @@ HOME = {"objects": LABELS[:4]}
 def blocked(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], threading.Event]]:
     """Let /outliers wait from now on until the event it returns is set, or for five seconds."""
     release = threading.Event()
-    original = reasoning.outliers
+    original = questions.outliers
 
     @wraps(original)
     def outliers(*args: Any, **kwargs: Any) -> Any:
@@ -38,7 +38,7 @@ def blocked(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], threading.
         return original(*args, **kwargs)
 
     def block() -> threading.Event:
-        monkeypatch.setattr(reasoning, "outliers", outliers)
+        monkeypatch.setattr(questions, "outliers", outliers)
         return release
 
     yield block

@@ -1,7 +1,7 @@
 """Hundreds of promotions, roll-backs and refreshes under load, some of a broken store.
 
 Each answer names a version by its digest, and says exactly what that version says when it is asked
-alone, in this process, through the reasoning.
+alone, in this process, through the questions.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from app import reasoning
+from app import questions
 from app.registry import Artifact, Store
 from app.serving.reading import Limits, read_scene
 from app.serving.rounding import significant
@@ -51,7 +51,7 @@ def offline(artifact: Artifact) -> Answers:
     for body in SCENES:
         request = MissingRequest.model_validate(body)
         scene = read_scene(request, artifact.vocabulary, Limits()).scene
-        found = reasoning.missing(artifact, scene, top_k=request.top_k)
+        found = questions.missing(artifact, scene, top_k=request.top_k)
         rounded = [significant([entry.probability, entry.log_odds]) for entry in found]
         labels = [entry.label for entry in found]
         answers.append([(name, *pair) for name, pair in zip(labels, rounded, strict=True)])

@@ -3,7 +3,7 @@ r"""The formulas of docs/models.md, read as they are written: loops over states 
 Each function below is the formula in its decorator, term by term, against the code or against the
 enumerated joint. The page must hold the formula in these very words, and no other: whoever changes
 one changes both. That the code agrees with the joint everywhere is tested in tests/enumeration and
-tests/reasoning, which the page names.
+tests/questions, which the page names.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 import torch
 
-from app.inference.closed_form import ClosedForm
-from app.reasoning.calibration import (
+from app.inference.posterior import ClosedForm
+from app.questions.calibration import (
     exclusive,
     false_log_odds,
     intruder_line,
     missing_logits,
     placed_logits,
     relation_probability,
+    sigmoid,
 )
-from app.reasoning.listing import likeliest_classes
 from app.registry import Calibration
 from app.registry.description import CountSlope
 from tests.conftest import REPOSITORY
@@ -506,7 +506,8 @@ def calibrated_relations() -> None:
     log_odds = rng.normal(size=(1, 2, 3, 3)).astype(np.float32)
     counts = np.array([1, 2, 5])
     logs = np.log(np.outer(counts, counts)).astype(np.float32)
-    found = relation_probability(slopes, log_odds, logs, 3)
+    found = relation_probability(slopes, log_odds.reshape(1, 2, 9), logs.reshape(9), 3)
+    found = found.reshape(1, 2, 3, 3)
     for a, i, j in product(range(2), range(3), range(3)):
         alpha, beta, gamma, delta, *bends = slopes[a]
         x = alpha + beta * log_odds[0, a, i, j]
@@ -537,9 +538,9 @@ def missing_objects() -> None:
     found, odds = calibration(), np.array([0.3, -1.2, 2.0, 0.1])
     entry = found.missing
     logits = missing_logits(found, odds, 7)
-    where, p = likeliest_classes(logits, np.ones(4, dtype=np.bool_), 4)
+    p = sigmoid(logits)
     constant = entry.intercept + entry.log_count * math.log(7)
-    assert p == near([sigma(constant + entry.slope * odds[i]) for i in where])
+    assert p == near([sigma(constant + entry.slope * z) for z in odds])
 
 
 @formula(r"p'_i = p_i \, p(r_e = 1 \mid v_i = 1, \text{rest})")

@@ -74,7 +74,7 @@ async def test_a_defect_spoils_one_entry_only(
 ) -> None:
     from app.serving import questions
 
-    real = questions.reasoning.outliers
+    real = questions.questions.outliers
 
     def fail_on_sofas(artifact: Any, scene: Any, **parameters: Any) -> Any:
         if any(thing.label == "sofa" for thing in scene.objects):
@@ -85,7 +85,7 @@ async def test_a_defect_spoils_one_entry_only(
             return found._replace(outliers=(first._replace(log_odds=fault), *others))
         return real(artifact, scene, **parameters)
 
-    monkeypatch.setattr(questions.reasoning, "outliers", fail_on_sofas)
+    monkeypatch.setattr(questions.questions, "outliers", fail_on_sofas)
     scenes = [{"objects": ["bed"]}, {"objects": ["sofa"]}, {"objects": ["lamp"]}]
     response = await client.post("/outliers/batch", json={"scenes": scenes})
     assert [entry["status"] for entry in response.json()["results"]] == [200, 500, 200]

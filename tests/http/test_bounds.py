@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
-from app import reasoning
+from app import questions
 from app.serving.admission import WorkQueue
 from tests.http.test_problems import problem
 from tests.services import launch, serve
@@ -26,14 +26,14 @@ QUESTIONS = ("relations", "missing", "outliers", "generate")
 def hold(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], threading.Event]]:
     """From the call on, drawing waits for the event that it returns, in the worker thread."""
     release = threading.Event()
-    draw = reasoning.generate
+    draw = questions.generate
 
     def slow(*args: Any, **kwargs: Any) -> Any:
         release.wait(30)
         return draw(*args, **kwargs)
 
     def begin() -> threading.Event:
-        monkeypatch.setattr(reasoning, "generate", slow)
+        monkeypatch.setattr(questions, "generate", slow)
         return release
 
     yield begin

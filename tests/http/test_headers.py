@@ -57,7 +57,7 @@ async def test_a_defect_is_answered_with_the_same_headers(
     def fail(*_: Any, **__: Any) -> Any:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(questions.reasoning, "missing", fail)
+    monkeypatch.setattr(questions.questions, "missing", fail)
     response = await client.post("/missing", json={"objects": ["bed"]})
     assert response.status_code == 500
     check(response)

@@ -99,7 +99,7 @@ from app.serving import questions
 def fail(*_, **__):
     raise ZeroDivisionError
 
-questions.reasoning = SimpleNamespace(**{**vars(questions.reasoning), "missing": fail})
+questions.questions = SimpleNamespace(**{**vars(questions.questions), "missing": fail})
 sys.exit(main())
 """
 

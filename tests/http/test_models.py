@@ -224,14 +224,14 @@ async def test_a_version_that_cannot_answer_is_refused(
 ) -> None:
     from app.serving import warm_up
 
-    real = warm_up.reasoning.outliers
+    real = warm_up.questions.outliers
 
     def fails(artifact: Any, scene: Any, **parameters: Any) -> Any:
         if artifact.manifest.version == "2.0.0":
             raise RuntimeError("secret detail")
         return real(artifact, scene, **parameters)
 
-    monkeypatch.setattr(warm_up.reasoning, "outliers", fails)
+    monkeypatch.setattr(warm_up.questions, "outliers", fails)
     async with serve(store) as client:
         publish(store, "home", "2.0.0", seed=2, alias="default")
         response = await client.post("/models/refresh", headers=admin)
@@ -249,7 +249,7 @@ async def test_a_model_whose_answers_are_not_finite_is_refused(
 
     from app.serving import warm_up
 
-    real = warm_up.reasoning.missing
+    real = warm_up.questions.missing
 
     def not_finite(artifact: Any, scene: Any, **parameters: Any) -> Any:
         found = real(artifact, scene, **parameters)
@@ -257,7 +257,7 @@ async def test_a_model_whose_answers_are_not_finite_is_refused(
             return found
         return tuple(dataclasses.replace(entry, log_odds=float("inf")) for entry in found)
 
-    monkeypatch.setattr(warm_up.reasoning, "missing", not_finite)
+    monkeypatch.setattr(warm_up.questions, "missing", not_finite)
     async with serve(store) as client:
         publish(store, "home", "2.0.0", seed=2)
         problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")

@@ -122,7 +122,7 @@ async def test_a_defect_is_told(shared_store: Path, monkeypatch: pytest.MonkeyPa
         raise RuntimeError("broken")
 
     async with serve(shared_store) as client:
-        monkeypatch.setattr("app.reasoning.missing", fail)
+        monkeypatch.setattr("app.questions.missing", fail)
         problem(await client.post("/missing", json=SCENE), 500, "internal-error")
         found = await told(client)
     assert requests(found) == {("POST", "internal-error", "/missing"): 1}

@@ -13,7 +13,7 @@ import pytest
 from app.scene.frames import body_pose
 from tests.http.stores import V, publish
 from tests.http.test_questions import ask
-from tests.reasoning.test_offsets import known
+from tests.questions.test_offsets import known
 from tests.services import serve
 
 pytestmark = pytest.mark.anyio

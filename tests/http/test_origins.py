@@ -103,7 +103,7 @@ async def test_errors_can_be_read_too(
     def fail(*_: Any, **__: Any) -> Any:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(questions.reasoning, "missing", fail)
+    monkeypatch.setattr(questions.questions, "missing", fail)
     origin = {"Origin": LISTED}
     media = origin | {"Content-Type": "application/json"}
     for status, response in (

@@ -547,7 +547,7 @@ async def test_a_defect_is_a_problem_without_details(
     def fail(*_: Any, **__: Any) -> Any:
         raise ZeroDivisionError(MARKER)
 
-    monkeypatch.setattr(questions.reasoning, question, fail)
+    monkeypatch.setattr(questions.questions, question, fail)
     response = await client.post(f"/{question}", json={"objects": ["bed"]})
     document = problem(response, 500, "internal-error")
     # The log has what the client is not told, under the same id.
@@ -563,14 +563,14 @@ async def test_an_answer_that_is_not_finite_is_a_defect(
 
     from app.serving import questions
 
-    real = questions.reasoning.missing
+    real = questions.questions.missing
 
     def not_finite(*args: Any, **parameters: Any) -> Any:
         return tuple(
             dataclasses.replace(entry, log_odds=float("nan")) for entry in real(*args, **parameters)
         )
 
-    monkeypatch.setattr(questions.reasoning, "missing", not_finite)
+    monkeypatch.setattr(questions.questions, "missing", not_finite)
     response = await client.post("/missing", json={"objects": ["bed"]})
     problem(response, 500, "internal-error")
     batch = await client.post("/missing/batch", json={"scenes": [{"objects": ["bed"]}]})

@@ -150,7 +150,7 @@ async def test_disagreements_name_the_pairs_as_they_were_stated(
     client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever is stated of a pair, the same is expected of it."""
-    monkeypatch.setattr(import_module("app.reasoning.disagreements"), "EXPECTED", 0)
+    monkeypatch.setattr(import_module("app.questions.relations"), "EXPECTED", 0)
     objects = ["bed", "chair", {"id": "l", "label": "lamp"}]
     expected: list[str] = []
     for relation in (*CANONICAL, *map(opposite, CANONICAL)):

@@ -33,7 +33,7 @@ def fail(*_, **__):
     raise ValueError("no class for {API_KEY}, {ADMIN_KEY}")
 
 # Not in the module itself, or the models would be refused when they are warmed up.
-questions.reasoning = SimpleNamespace(**{{**vars(questions.reasoning), "missing": fail}})
+questions.questions = SimpleNamespace(**{{**vars(questions.questions), "missing": fail}})
 sys.exit(main())
 """
 

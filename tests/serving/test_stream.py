@@ -261,7 +261,7 @@ def test_a_label_that_another_model_lacks_is_a_problem_of_each_question(service:
 def test_an_answer_with_a_number_that_is_not_finite_is_not_written(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = questions.reasoning.outliers
+    real = questions.questions.outliers
 
     def broken(artifact: Any, scene: Any, **parameters: Any) -> Any:
         found = real(artifact, scene, **parameters)
@@ -270,7 +270,7 @@ def test_an_answer_with_a_number_that_is_not_finite_is_not_written(
 
     stream = StreamScene()
     service.take(stream, type="open", objects=["desk", "bed"], ask=ASK)
-    monkeypatch.setattr(questions.reasoning, "outliers", broken)
+    monkeypatch.setattr(questions.questions, "outliers", broken)
     with pytest.raises(ValueError, match="not finite"):
         service.answer(stream)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from app.reasoning import missing
+from app.questions import missing
 from app.registry import Artifact, Store, load_model_set
 from app.scene import CANONICAL, Scene, SceneObject
 from training.config import load_config

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from app.reasoning import misplaced, outliers
+from app.questions import misplaced, outliers
 from app.registry import Calibration
-from tests.reasoning.artifacts import artifact_of
+from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, rooms
 from tests.training.evaluation.scenes import WIDE, larger_machine, random_scenes, scene, tensors
 from training.calibrate import calibrate, fit_misplaced, fit_relations, rising_curve

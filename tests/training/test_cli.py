@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from app.reasoning import generate, missing, outliers, relations
+from app.questions import generate, missing, outliers, relations
 from app.registry import Store
 from app.scene import Scene, SceneObject
 from training.cli import app

@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.reasoning import misplaced, missing, outliers, relations
+from app.questions import misplaced, missing, outliers, relations
 from app.registry import Artifact, Calibration, CountSlope, Slope
 from app.scene import CANONICAL, Scene, canonicalise
 from training.batches import SceneTensors

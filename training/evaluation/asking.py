@@ -1,4 +1,4 @@
-"""Questions put to `app.reasoning` as a robot puts them, the answers as columns.
+"""Questions put to `app.questions` as a robot puts them, the answers as columns.
 
 A sample of the cases is asked once more in another order: an answer that follows the order of the
 questions knows more than its scene, and the evaluation stops.
@@ -13,8 +13,8 @@ from typing import TypeVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from app import reasoning
-from app.reasoning import Sensitivity
+from app import questions
+from app.questions import Sensitivity
 from app.registry import Artifact
 from app.scene import CANONICAL, Scene, SceneObject
 from training.cases import scene_of
@@ -79,7 +79,7 @@ def missing_probabilities(
     """
     vocabulary = artifact.vocabulary
     found = np.full(len(vocabulary), -np.inf)
-    for answer in reasoning.missing(
+    for answer in questions.missing(
         artifact, scene, top_k=len(vocabulary), coverage=coverage, at=at, details=False
     ):
         found[vocabulary.index(answer.label)] = answer.probability
@@ -101,7 +101,7 @@ class Verdict:
 
 def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Verdict:
     """Every object of a scene at one of `SENSITIVITIES`."""
-    found = reasoning.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
+    found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
     n = len(scene.objects)
     probability, log_odds, flagged = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.bool_)
     for answer in found:
@@ -122,6 +122,6 @@ def relation_probabilities(
     n = len(scene.objects)
     found = np.zeros((len(CANONICAL), n, n))
     most = max(1, len(CANONICAL) * n * n)
-    for answer in reasoning.relations(artifact, scene, top_k=most, pairs=pairs)[0]:
+    for answer in questions.relations(artifact, scene, top_k=most, pairs=pairs)[0]:
         found[CANONICAL.index(answer.relation), answer.subject, answer.object] = answer.probability
     return found

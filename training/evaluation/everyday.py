@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from app import reasoning
+from app import questions
 from app.registry import Artifact
 from app.scene import Scene, SceneObject, opposite
 from training.config import DATA
@@ -143,7 +143,7 @@ def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
     names = [thing.id for thing in scene.objects]
     if not names:
         return {}
-    found, _ = reasoning.relations(artifact, scene, top_k=_RELATIONS, include_opposites=True)
+    found, _ = questions.relations(artifact, scene, top_k=_RELATIONS, include_opposites=True)
     p: dict[str, float] = {}
     for answer in found:
         mine = names[answer.subject] == subject
@@ -160,7 +160,7 @@ def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Line
     return {f"{name}: an expected object is among five": hits}
 
 
-def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[reasoning.MissingAnswer, ...]:
+def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[questions.MissingAnswer, ...]:
     """The first five; none where the service would refuse the question."""
     scene = _scene(artifact, fact["objects"])
     at = None
@@ -170,7 +170,7 @@ def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[reasoning.MissingAn
         at = fact["at"]["relation"], anchor
     if not scene.objects:
         return ()
-    return reasoning.missing(artifact, scene, top_k=_LISTED, at=at)
+    return questions.missing(artifact, scene, top_k=_LISTED, at=at)
 
 
 def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
@@ -196,9 +196,9 @@ def _outliers(
     return dict(zip(LINES[5:8], (first, caught, alarms), strict=True))
 
 
-def _judged(artifact: Artifact, labels: Sequence[str]) -> tuple[reasoning.OutlierAnswer, ...]:
+def _judged(artifact: Artifact, labels: Sequence[str]) -> tuple[questions.OutlierAnswer, ...]:
     scene = _scene(artifact, labels)
-    return reasoning.outliers(artifact, scene).outliers
+    return questions.outliers(artifact, scene).outliers
 
 
 def _scenes(artifact: Artifact, rooms: list[dict[str, Any]], seeds: list[int]) -> Lines:
@@ -217,5 +217,5 @@ def _drawn(
         index = artifact.vocabulary.room_index(room["room"])
         given = replace(Scene(()), room_type=index)
         for seed in seeds:
-            found = reasoning.generate(artifact, given, count=_DRAWN, seed=seed)
+            found = questions.generate(artifact, given, count=_DRAWN, seed=seed)
             yield room, [set(scene.objects) for scene in found]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from app.reasoning.generate import STEPS
+from app.questions.generate import STEPS
 from training.evaluation.generation import Contradictions, Drawn, Sampler
 from training.evaluation.relations import spread_units
 from training.machines import BoltzmannMachine, Triway

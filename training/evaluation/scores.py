@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from app.reasoning.posterior import posterior
+from app.questions.posterior import posterior
 from app.registry import Artifact
 from app.scene import CANONICAL, OPPOSITES, Scene
 from training.batches import Batch

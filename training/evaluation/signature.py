@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from app.reasoning import Sensitivity
+from app.questions import Sensitivity
 from app.registry import Artifact
 from app.scene import Scene, SceneObject
 from training.batches import SceneTensors

@@ -6,7 +6,7 @@ U.
 
 from __future__ import annotations
 
-from app.inference.spec import MachineSpec
+from app.inference.variants import MachineSpec
 from training.machines.gbm import GBM
 from training.machines.machine import BoltzmannMachine
 from training.machines.product_rbm import ProductRBM

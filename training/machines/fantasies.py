@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from app.inference import weights
-from app.inference.scene_chains import OTHER_ROOM
+from app.inference.chains import OTHER_ROOM
 from training.machines.bernoulli import bernoulli
 from training.machines.gibbs import FREE, Clamp, State, initial_state
 from training.machines.machine import BoltzmannMachine

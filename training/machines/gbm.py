@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from app.inference.spec import MachineSpec
+from app.inference.variants import MachineSpec
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 from training.machines.rbm import RBM, scale

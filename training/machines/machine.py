@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from app.inference.spec import MachineSpec
+from app.inference.variants import MachineSpec
 from training.machines.edges import Edges, triple_keys
 
 

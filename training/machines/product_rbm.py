@@ -14,7 +14,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from app.inference.spec import MachineSpec
+from app.inference.variants import MachineSpec
 from training.machines.machine import BoltzmannMachine
 from training.machines.rbm import RBM, scale
 

@@ -14,7 +14,7 @@ from typing import Self, TypeVar
 import torch
 from torch import Tensor, nn
 
-from app.inference.spec import MachineSpec
+from app.inference.variants import MachineSpec
 from training.machines.edges import Edges, triple_edges
 from training.machines.machine import BoltzmannMachine
 

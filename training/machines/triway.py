@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding, softplus
 
-from app.inference.spec import MachineSpec, feature_count
+from app.inference.variants import MachineSpec, feature_count
 from training.machines.edges import Edges, PairEdges, find_triples, pair_edges, triple_keys
 from training.machines.implications import implied
 from training.machines.machine import BoltzmannMachine

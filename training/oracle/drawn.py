@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from app.reasoning.given import pull_of
-from app.reasoning.present import Present
-from app.reasoning.unlisted import with_unlisted
+from app.questions.posterior import Present, pull_of, with_unlisted
 from app.registry.artifact import Artifact
 from app.scene.scene import Scene
 from training.machines import BoltzmannMachine

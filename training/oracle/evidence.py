@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from app.reasoning.present import Present, present
+from app.questions.posterior import Present, present
 from app.scene.evidence import class_evidence
 from app.scene.scene import Scene
 from training.machines import BoltzmannMachine, Triway

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from app.inference import relation_kernels
+from app.inference import relations
 from training.machines import BoltzmannMachine, Triway
 from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
 
 # As a plain number: tensors do not take numpy's.
-NO_UNIT = float(relation_kernels.NO_UNIT)
+NO_UNIT = float(relations.NO_UNIT)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import get_args
 
 import pytest
 
-from app.inference.spec import FACTORISED, Form, Variant
+from app.inference.variants import FACTORISED, Form, Variant
 from tests.training.baselines.furnished import STRUCTURE, A, furnished, tensors
 from training.baselines import OBJECTS, RELATIONS
 from training.baselines.judges import missing_mrr, partial_mrr

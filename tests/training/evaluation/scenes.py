@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from app.scene import pool_instances
-from tests.reasoning.artifacts import LARGER
+from tests.questions.artifacts import LARGER
 from training.batches import SceneTensors, scene_tensors
 from training.datasets import EncodedScene
 from training.machines import build

@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from app.reasoning import missing, relations
+from app.questions import missing, relations
 from app.registry import CountSlope
-from tests.reasoning.artifacts import LARGER, artifact_of, calibration
+from tests.questions.artifacts import LARGER, artifact_of, calibration
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
 from training.cases import scene_of

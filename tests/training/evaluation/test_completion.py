@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from app.scene import ObjectClass, Vocabulary
-from tests.reasoning.artifacts import artifact_of
+from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,

@@ -192,7 +192,7 @@ def test_machines_are_sampled_from_their_distribution(name):
     deviation = (p * (1 - p) / 2000).sqrt()
     assert bool(((drawn.v.mean(0) - p).abs() < 5 * deviation).all())
     if machine.spec.G:
-        return  # Relations that imply each other have no joint: tests/boltzmann/test_implications.
+        return  # Relations that imply each other have no joint: tests/machines/test_implications.
     grid = torch.zeros(len(joint.v), machine.spec.A, machine.spec.V, machine.spec.V)
     edges = joint.edges
     present = joint.r * edges.ends_present(joint.v)

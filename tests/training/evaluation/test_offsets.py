@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from app.scene.relations import LEFT, ON_TOP
-from tests.reasoning.artifacts import LARGER, larger_artifact
+from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
 from tests.training.test_offsets import MEAN, STD, apart, draws
 from training.datasets import encode, generate_rooms, rooms_vocabulary

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from app.reasoning import missing
+from app.questions import missing
 from app.registry import CountSlope, PairSlope
 from app.scene import CANONICAL, OPPOSITES, Scene, SceneObject
-from tests.reasoning.artifacts import artifact_of
+from tests.questions.artifacts import artifact_of
 from tests.training.evaluation.scenes import (
     NO_STRUCTURE,
     WIDE,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from app.registry import Thresholds
-from tests.reasoning.artifacts import LARGER, artifact_of
+from tests.questions.artifacts import LARGER, artifact_of
 from tests.training.evaluation.scenes import (
     flat,
     knowing,

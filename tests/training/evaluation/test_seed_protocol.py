@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.reasoning.artifacts import LARGER
+from tests.questions.artifacts import LARGER
 from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
 from training.batches import relation_units
 from training.evaluation.contenders import Contender

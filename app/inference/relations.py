@@ -1,0 +1,603 @@
+"""Probabilities of relations: p(r_e = 1) = E[sigmoid(ℓ_e(h1))] with ℓ_e(h1) = base_e + U_e·h1.
+
+The logit is a sum of many small independent terms, so it is taken as normal, with
+
+    mean base_e + U_e·m   and variance   σ_e² = sum_k U_ek² m_k (1 - m_k)
+
+for the means m of h1, and the mean of its sigmoid by quadrature. Errors are measured in
+docs/decisions/inference.md. Which units exist, with their base and U, is the variant's:
+`FreeUnits` have a row of U each, `SharedUnits` form theirs from factors. Everything else stands
+once.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.inference import relation_kernels as kernels
+from app.inference.mean_field import SWEEPS, sigmoid
+
+if TYPE_CHECKING:
+    from app.inference.weights import Weights
+
+Floats = NDArray[np.float32]
+Places = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+NO_UNIT: Final = np.float32(-30.0)
+"""No log-odds of a relation is below."""
+
+NEVER: Final = np.float32(-1e4)
+"""The logit of a relation without a unit, which is off at any temperature."""
+
+Table = tuple[NDArray[np.int32], NDArray[np.int32]]
+
+NOTHING: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
+
+# Of the variance of a logit on average, how much the directions F_a leave out. A probability
+# changes by a twentieth of what its variance loses. Of the 33 directions of `indoor-triway` 11
+# are kept: all would take twice the time of /relations, and change p by .005 at most.
+_LEFT_OUT: Final = 4e-3
+
+
+def to_log_odds(mean: Floats, spread: Floats) -> Floats:
+    """Log-odds of E[sigmoid(ℓ)] for normal logits of that mean and √3 σ, `NO_UNIT` at least.
+
+    Three nodes, 0 and ±√3 σ with weights 4 : 1 : 1, where σ < .75: off by .0003 at most in p. With
+    u = e^-|mean| and q = e^spread they are u/(1 + u), uq/(1 + uq) and u/(q + u), and nothing can
+    overflow. Wider ones by the trapezoidal rule, for any σ up to 10 and more.
+    """
+    found = mean.reshape(-1).astype(np.float32)
+    kernels.log_odds(found, spread.reshape(-1), NO_UNIT)
+    return found.reshape(mean.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """Relations that are given, on or off: E units between the n classes of a scene.
+
+    Attributes:
+        a: (E,) relation.
+        i, j: (E,) places of subject and object class in the scene.
+        r: (E,) 1 where it holds, else 0.
+        g: (E,) presence of both ends.
+    """
+
+    a: Places
+    i: Places
+    j: Places
+    r: Floats
+    g: Floats
+
+
+class Units(NamedTuple):
+    """Relation units that exist, of those asked for.
+
+    Attributes:
+        place: (E,) which of those asked for.
+        a: (E,) relation.
+        base: (E,) ℓ_e without U_e·h1.
+        z: (E, K') their factors: U_e = G[a]'z_e; U_e itself where there is no G.
+    """
+
+    place: Places
+    a: Places
+    base: Floats
+    z: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """The context of a scene, given what was observed.
+
+    Attributes:
+        classes: (n,) int64, distinct.
+        presence: (n,).
+        log_counts: (n,) log of the instances of each.
+        x: (H1,) logits of h1 given the objects.
+        y: (H1,) given the relations as well, as questions about relations see it.
+        given: the relations; None where there are none.
+        units: those of `given`.
+        slopes: of `units`, as questions about relations see them.
+        object_y, object_slopes: y and slopes as questions about objects see them.
+        through: (n, H1) what each class adds to y through the second layer; None with one layer.
+    """
+
+    classes: Places
+    presence: Floats
+    log_counts: Floats
+    x: Floats
+    y: Floats
+    given: Given | None
+    units: Units | None
+    slopes: Floats
+    object_y: Floats
+    object_slopes: Floats
+    through: Floats | None
+
+    def ends(self, i: Places, j: Places) -> Ends:
+        """The classes at some places."""
+        p, n = self.presence, self.log_counts
+        return Ends(self.classes[i], self.classes[j], n[i], n[j], p[i], p[j])
+
+
+class Ends(NamedTuple):
+    """Subject and object classes, the logs of their counts, and their presence; one shape."""
+
+    i: Places
+    j: Places
+    log_i: Floats
+    log_j: Floats
+    p_i: Floats
+    p_j: Floats
+
+
+class Between(NamedTuple):
+    """The logits between the n classes of a scene, and what given relations say of them.
+
+    Attributes:
+        mean, spread: (A, n, n) of the logits, see `RelationUnits.normal`.
+        slopes: (A, n, n), 0 where nothing is given; these three are empty where nothing is.
+        shift: (A, n, n) what the given relations imply for each.
+        apart: the same without those of the pair itself.
+    """
+
+    mean: Floats
+    spread: Floats
+    slopes: Floats
+    shift: Floats
+    apart: Floats
+
+
+class SharedArrays(NamedTuple):
+    """Weights of a Triway's units as the compiled loop takes them.
+
+    Attributes:
+        S, O: (V, K + 1), their last column 1.  s, o: (V, A).  n: (A, 2).
+        start, key: see `pair_rows`.
+        residual: (pairs + 1, A) w'; the last row is 0.
+    """
+
+    S: Floats
+    O: Floats  # noqa: E741
+    s: Floats
+    o: Floats
+    n: Floats
+    start: NDArray[np.int32]
+    key: NDArray[np.int32]
+    residual: Floats
+
+
+class RelationUnits(ABC):
+    """The relation units of a machine.
+
+    Attributes:
+        G: (A, K', H1) what the units of a relation share; of length 0 where each has a row of U.
+    """
+
+    G: Floats
+
+    def __init__(self, weights: Weights) -> None:
+        self._W, self._A, self._V = weights["W"], weights.spec.A, weights.spec.V
+
+    @abstractmethod
+    def select(self, a: Places, ends: Ends) -> Units:
+        """The units of relations a (E,)."""
+
+    @abstractmethod
+    def normal(
+        self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
+    ) -> tuple[Floats, Floats]:
+        """Mean and √3 σ of logits between pairs (B, P), both (B, R, P), for means of h1 (B, H1).
+
+        R is 1 where one relation is asked for, else A. The mean of what has no unit is `NEVER`.
+
+        Args:
+            known: the means are 0 or 1, so nothing varies.
+        """
+
+    def rows(self, units: Units) -> Floats:
+        """U of units, (E, H1)."""
+        if not len(self.G):
+            return units.z
+        found: Floats = kernels.expanded(self.G, units.a, units.z)
+        return found
+
+    def rows_of(self, a: Places, i: Places, j: Places) -> Floats:
+        """U of relations a between classes i and j that have units, (E, H1)."""
+        none = np.zeros(len(a), np.float32)
+        return self.rows(self.select(a, Ends(i, j, none, none, none, none)))
+
+    def fixed_point(
+        self, x: Floats, given: Given, ends: Ends, sweeps: int = SWEEPS
+    ) -> tuple[Floats, Units, Floats]:
+        """The mean field given relations: y (H1,), the units, and their slopes.
+
+        From x on, with m = sigmoid(y) and g the presence of both ends:
+
+            y = x + sum_e slope_e U_e,   slope_e = g_e (r_e - sigmoid(base_e + U_e·m))
+        """
+        units = self.select(given.a, ends)
+        G, z = self.G, units.z
+        if 2 * len(z) < G.shape[0] * G.shape[1]:
+            # Fewer rows of U than rows that the units share.
+            G, z = NOTHING, self.rows(units)
+        r, g = given.r[units.place], given.g[units.place]
+        y, slopes = kernels.fixed_point(x, G, units.a, units.base, z, r, g, sweeps)
+        return y, units, slopes
+
+    def between(self, context: Context) -> Between:
+        """Logits between the classes of a scene."""
+        n = len(context.classes)
+        mean, spread = self.normal(sigmoid(context.y)[None], context.ends(*all_pairs(n)))
+        shape = self._A, n, n
+        return Between(mean.reshape(shape), spread.reshape(shape), *self.said(context))
+
+    def said(self, context: Context) -> tuple[Floats, Floats, Floats]:
+        """`slopes`, `shift` and `apart` of `Between`."""
+        given, units, n = context.given, context.units, len(context.classes)
+        if given is None or units is None:
+            return NOTHING, NOTHING, NOTHING
+        slopes = np.zeros((self._A, n, n), dtype=np.float32)
+        where = units.place
+        slopes[given.a[where], given.i[where], given.j[where]] = context.slopes
+        return slopes, *self.implied(context.x, n, given)
+
+    def implied(self, x: Floats, n: int, given: Given) -> tuple[Floats, Floats]:
+        """`shift` and `apart` of `Between`, given the logits x of h1 given the objects."""
+        weight = self.implication_weights(x)
+        if not len(weight):
+            return NOTHING, NOTHING
+        on = (given.r > 0) & (given.i != given.j)
+        found = kernels.implied(weight, n, given.a[on], given.i[on], given.j[on])
+        shift, apart = np.ascontiguousarray(found.transpose(0, 3, 1, 2))
+        return shift, apart
+
+    def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
+        """What each feature of the given relations says of each relation, (F, A), or empty."""
+        del x, beta
+        return NOTHING.reshape(0, 0)
+
+    def log_odds(self, between: Between) -> Floats:
+        """Of all relations between the classes, each without itself to first order, (A, n, n).
+
+        A small slope of a given unit itself changes ℓ_e(m) by slope_e σ_e².
+        """
+        mean, spread = between.mean, between.spread
+        if len(between.slopes):
+            mean = mean - between.slopes * spread * spread / np.float32(3)
+        if len(between.shift):
+            mean = mean + between.shift
+        return to_log_odds(mean, spread)
+
+    def without_itself(
+        self, context: Context, a: Places, i: Places, j: Places, slopes: Floats, shift: Floats
+    ) -> Floats:
+        """Of some units (E,), their own slopes taken out of y exactly, (E,).
+
+        Args:
+            i, j: (E,) places.
+            shift: (A, n, n) or empty.
+        """
+        units = self.select(a, context.ends(i, j))
+        mean, spread = kernels.normal_without_itself(
+            context.y, self.rows(units), units.base, slopes[units.place]
+        )
+        if len(shift):
+            mean += shift[a, i, j][units.place]
+        found = np.full(len(a), NO_UNIT)
+        found[units.place] = to_log_odds(mean, spread)
+        return found
+
+    @abstractmethod
+    def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
+        """Of pairs of classes, places (P,), without all that is given of the pair, (2, A, P)."""
+
+    def placement_log_odds(
+        self, context: Context, candidates: Places, anchors: Places, only: int | None = None
+    ) -> tuple[Floats, Floats]:
+        """Of absent candidates, were they there, to the anchors and back, (N, R, m) both.
+
+        Args:
+            candidates: (N,) classes.
+            anchors: (m,) places.
+            only: one relation; None for all A.
+        """
+        m = len(anchors)
+        shape = len(candidates), 2 * m
+        i, j = np.empty(shape, np.int64), np.empty(shape, np.int64)
+        log_i, log_j = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        p_i, p_j = np.ones(shape, np.float32), np.ones(shape, np.float32)
+        i[:, :m] = j[:, m:] = candidates[:, None]
+        j[:, :m] = i[:, m:] = context.classes[anchors]
+        log_j[:, :m] = log_i[:, m:] = context.log_counts[anchors]
+        p_j[:, :m] = p_i[:, m:] = context.presence[anchors]
+        both = Ends(i, j, log_i, log_j, p_i, p_j)
+        means = sigmoid(context.y + self._W[candidates])
+        found = to_log_odds(*self.normal(means, both, only))
+        return found[:, :, :m], found[:, :, m:]
+
+    def shares(self, context: Context) -> Floats:
+        """What each class and its relations add to y, (n, H1)."""
+        found: Floats = context.presence[:, None] * self._W[context.classes]
+        given, units = context.given, context.units
+        if given is not None and units is not None:
+            i, j = given.i[units.place], given.j[units.place]
+            keys = np.stack([i, np.where(i == j, -1, j)])
+            found += self._sums(units, keys, context.object_slopes, len(context.classes))
+        return found
+
+    def common(self, context: Context) -> tuple[Floats, Places]:
+        """What the relations between two classes add to y, (P, H1), and (n, n) which row; or -1."""
+        n = len(context.classes)
+        given, units = context.given, context.units
+        index = np.full((n, n), -1)
+        if given is None or units is None:
+            return np.zeros((0, self._W.shape[1]), np.float32), index
+        i, j = given.i[units.place], given.j[units.place]
+        keys = np.where(i == j, -1, np.minimum(i, j) * n + np.maximum(i, j))
+        filled = np.zeros(n * n, np.bool_)
+        filled[keys[keys >= 0]] = True
+        pairs = np.flatnonzero(filled)
+        index.reshape(-1)[pairs] = np.arange(len(pairs))
+        rows = np.where(keys < 0, -1, index.reshape(-1)[keys])
+        found = self._sums(units, rows, context.object_slopes, len(pairs))
+        return found, np.maximum(index, index.T)
+
+    def _sums(self, units: Units, keys: Places, slopes: Floats, size: int) -> Floats:
+        """Sums of slope_e U_e over the units of each key, (size, H1); -1 is left out.
+
+        Args:
+            keys: (E,), or (2, E) for two keys of each unit.
+        """
+        if not len(self.G):
+            summed: Floats = kernels.accumulate(keys.reshape(-1), slopes, units.z, size)
+            return summed
+        A, K, H1 = self.G.shape
+        keys = np.where(keys < 0, -1, keys * A + units.a).reshape(-1)
+        factors = kernels.accumulate(keys, slopes, units.z, size * A).reshape(size, A * K)
+        found: Floats = factors @ self.G.reshape(A * K, H1)
+        return found
+
+
+class FreeUnits(RelationUnits):
+    """Units of the triples seen in training alone, each with a row of U of its own.
+
+    ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1
+
+    Other triples have no unit: they say nothing, and their log-odds are `NO_UNIT`.
+
+    Args:
+        U: (T, H1).
+        g: (T, 2); none for zeros.
+    """
+
+    def __init__(self, weights: Weights, U: Floats, g: Floats | None = None) -> None:
+        super().__init__(weights)
+        self.G = NOTHING
+        self._U, self._d, self._g = U, weights["d"], g
+        self._table, index = _pair_table(weights)
+        self._index = np.full((len(self._table[1]) + 1, self._A), -1, np.int32)
+        self._index[index] = np.arange(len(U))
+
+    def select(self, a: Places, ends: Ends) -> Units:
+        """See `RelationUnits`."""
+        rows = self._index[kernels.pair_rows(*self._table, ends.i * self._V + ends.j), a]
+        place = np.flatnonzero(rows >= 0)
+        rows = rows[place]
+        base = self._d[rows]
+        if self._g is not None:
+            base = base + self._g[rows, 0] * ends.p_i[place] + self._g[rows, 1] * ends.p_j[place]
+        return Units(place, a[place], base.astype(np.float32), self._U[rows])
+
+    def normal(
+        self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
+    ) -> tuple[Floats, Floats]:
+        """See `RelationUnits`."""
+        del known  # means of 0 and 1 have no variance
+        asked = _asked(self._A, only)
+        shape = len(means), asked.stop - asked.start, ends.i.shape[1]
+        b, a, p = (part.reshape(-1) for part in np.indices(shape))
+        units = self.select(asked.start + a, Ends(*(end[b, p] for end in ends)))
+        mean, spread = np.full(shape, NEVER), np.zeros(shape, np.float32)
+        U, place = units.z, units.place
+        if len(means) == 1:
+            m = means[0]
+            logits, variance = U @ m, (U * U) @ (m * (1 - m))
+        else:
+            m = means[b[place]]
+            logits = np.einsum("eh,eh->e", U, m)
+            m *= 1 - m
+            variance = np.einsum("eh,eh->e", U * U, m)
+        mean.reshape(-1)[place] = units.base + logits
+        spread.reshape(-1)[place] = np.sqrt(3 * variance)
+        return mean, spread
+
+    def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
+        """See `RelationUnits`; exactly."""
+        del between
+        ends = context.ends(np.stack([i, j], 1), np.stack([j, i], 1))
+        y = np.tile(context.y, (len(i), 1))
+        given, units, n = context.given, context.units, len(context.classes)
+        if given is not None and units is not None:
+            keys = given.i[units.place] * n + given.j[units.place]
+            pulls = kernels.accumulate(keys, context.slopes, units.z, n * n)
+            y -= pulls[i * n + j] + np.where((i != j)[:, None], pulls[j * n + i], 0)
+        found = to_log_odds(*self.normal(sigmoid(y), ends))
+        return np.ascontiguousarray(found.transpose(2, 1, 0))
+
+
+class SharedUnits(RelationUnits):
+    """A unit for every triple, whose weights but a sparse residual are shared; see `Triway`.
+
+    With z_e = (S_i * O_j, 1): U_e = G[a]'z_e, where G[a] are the rows of M[a], then P[a]. The
+    variance of a logit is q'C q, with coordinates q = Y[a] z_e in the directions F_a of largest
+    variance and C = F_a diag(m (1 - m)) F_a'.
+    """
+
+    def __init__(self, weights: Weights) -> None:
+        super().__init__(weights)
+        A = self._A
+        ones = np.ones((self._V, 1), np.float32)
+        table, index = _pair_table(weights)
+        residual = np.zeros((len(table[1]) + 1, A), np.float32)
+        residual[index] = weights["residual"]
+        self._w = SharedArrays(
+            np.concatenate([weights["S"], ones], 1),
+            np.concatenate([weights["O"], ones], 1),
+            np.ascontiguousarray(weights["s"].T),
+            np.ascontiguousarray(weights["o"].T),
+            weights["n"],
+            *table,
+            residual,
+        )
+        self.G = np.concatenate([weights["M"], weights["P"][:, None]], 1)
+        self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
+        F, self._Y = _directions(weights)
+        self._F = F.reshape(-1, F.shape[2])
+        # Products of two directions: what C's lower half is made of, all but the diagonal twice.
+        p, q = np.tril_indices(F.shape[1])
+        self._FF = _columns(F[:, p] * F[:, q] * np.where(p == q, 1, 2)[:, None])
+        self._GT = _columns(self.G)
+        self._B = weights["B"] if weights.spec.G else None
+        if self._B is not None:
+            gamma = weights["gamma"].swapaxes(1, 2).copy()
+            # No relation has a say in itself.
+            gamma[:, range(A), range(A)] = 0
+            self._gamma = gamma.reshape(len(gamma), -1)
+
+    def select(self, a: Places, ends: Ends) -> Units:
+        """See `RelationUnits`."""
+        base, z = kernels.unit_terms(self._w, self._g, a, ends)
+        return Units(np.arange(len(a)), a, base, z)
+
+    def normal(
+        self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
+    ) -> tuple[Floats, Floats]:
+        """See `RelationUnits`."""
+        asked, (B, P), K = _asked(self._A, only), ends.i.shape, self._Y.shape[2]
+        R = asked.stop - asked.start
+        z, mean = np.empty((B, K, P), np.float32), np.empty((B, R, P), np.float32)
+        kernels.pair_terms(self._w, asked.start, ends, z, mean)
+        mean += (self._of(asked, means, self._GT) + self._g[asked]) @ z
+        spread = np.zeros((B, R, P), np.float32)
+        if not known:
+            q = self._Y[asked].reshape(-1, K) @ z
+            kernels.spreads(self._of(asked, means * (1 - means), self._FF), q, spread)
+        return mean, spread
+
+    def _of(self, asked: slice, rows: Floats, columns: Floats) -> Floats:
+        """Products of rows (B, H1) with the columns (H1, A n) of R relations, (B, R, n)."""
+        n = columns.shape[1] // self._A
+        found: Floats = rows @ columns[:, asked.start * n : asked.stop * n]
+        return found.reshape(len(rows), -1, n)
+
+    def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
+        """See `RelationUnits`.
+
+        beta (gamma_0 + sum_q z_q gamma_q),   z = B sigmoid(beta x)
+        """
+        if self._B is None:
+            return super().implication_weights(x, beta)
+        scale = np.append(np.float32(1), self._B @ sigmoid(beta * x))
+        weight: Floats = (np.float32(beta) * scale) @ self._gamma
+        return weight.reshape(-1, self._A)
+
+    def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
+        """See `RelationUnits`; to first order.
+
+        ℓ_e(m) changes by sum_e' slope_e' cov(ℓ_e, ℓ_e'), cov = sum_k U_ek U_e'k m_k (1 - m_k),
+        over the given units e' of the pair, both ways.
+        """
+        A, P = self._A, len(i)
+        start, end = np.concatenate([i, j]), np.concatenate([j, i])
+        mean, spread = between.mean[:, start, end], between.spread[:, start, end]
+        if len(between.slopes):
+            m, classes = sigmoid(context.y), context.classes
+            z = self._w.S[classes[start]] * self._w.O[classes[end]]
+            # (2, P, A, r): both ways of each pair.
+            q = (z @ self._Y.reshape(len(self._F), -1).T).reshape(2, P, A, -1)
+            slopes = between.slopes[:, start, end].T.reshape(2, P, A, 1).copy()
+            # Of a class with itself the two ways are one.
+            slopes[1, i == j] = 0
+            pull = (slopes * q).sum(0).reshape(P, -1)
+            back = (pull @ self._F) * (m * (1 - m)) @ self._F.T
+            mean -= (q * back.reshape(P, A, -1)).sum(3).reshape(2 * P, A).T
+        if len(between.apart):
+            mean += between.apart[:, start, end]
+        found = to_log_odds(mean, spread).reshape(A, 2, P)
+        return np.ascontiguousarray(found.swapaxes(0, 1))
+
+
+@lru_cache(maxsize=128)
+def all_pairs(n: int) -> tuple[Places, Places]:
+    """First and second place of all pairs of n, (1, n²) each."""
+    every = np.arange(n)
+    return np.repeat(every, n)[None], np.tile(every, n)[None]
+
+
+def _columns(matrices: Floats) -> Floats:
+    """Rows of all relations (A, n, H1) as columns (H1, A n): a product of few rows is faster."""
+    return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
+
+
+def _asked(relations: int, only: int | None) -> slice:
+    """All relations, or one. A slice copies nothing."""
+    return slice(0, relations) if only is None else slice(only, only + 1)
+
+
+def _pair_table(weights: Weights) -> tuple[Table, tuple[Places, Places]]:
+    """The pairs of classes that a triple has a weight for, as `pair_rows` takes them.
+
+    Returns:
+        Buckets and keys; and of each triple the row of its pair, and its relation.
+    """
+    size = weights.spec.V**2
+    triples = weights.triple_keys
+    pairs = np.unique(triples % size)
+    buckets = 1 << (2 * len(pairs)).bit_length()
+    bucket = (pairs * kernels.SPREAD >> kernels.SHIFT) & (buckets - 1)
+    order = np.argsort(bucket, kind="stable")
+    row = np.empty_like(order)
+    row[order] = np.arange(len(order))
+    start = np.searchsorted(bucket[order], np.arange(buckets + 1))
+    index = row[np.searchsorted(pairs, triples % size)], triples // size
+    return (start.astype(np.int32), pairs[order].astype(np.int32)), index
+
+
+def _directions(weights: Weights) -> tuple[Floats, Floats]:
+    """F (A, r, H1), and Y (A, r, K + 1) with q = Y z, z = (S_i * O_j, 1).
+
+    Directions of largest variance of U_e h1, over pairs of classes as often as the machine's
+    stored scenes have them, and with h1 as it is in these.
+    """
+    spec = weights.spec
+    rows = np.concatenate([weights["P"][:, None], weights["M"]], 1).astype(np.float64)
+    share, spread = np.ones(spec.V), np.full(spec.H1, 0.25)
+    if spec.N:
+        share = weights.scenes.mean(0).astype(np.float64)
+        mean = sigmoid(weights["c1"] + weights.scenes @ weights["W"]).astype(np.float64)
+        spread = (mean * (1 - mean)).mean(0)
+    share = share / share.sum()
+    ones = np.ones((spec.V, 1))
+    left, right = (
+        np.concatenate([ones, weights[name].astype(np.float64)], 1) for name in ("S", "O")
+    )
+    # E[z z'] of z = (1, S_i * O_j) for independent i and j, and its root.
+    moment = (left.T @ (share[:, None] * left)) * (right.T @ (share[:, None] * right))
+    scale = np.trace(moment) / len(moment)
+    root = np.linalg.cholesky(moment + 1e-9 * scale * np.eye(len(moment)))
+    covariance = root.T @ ((rows * spread) @ rows.transpose(0, 2, 1)) @ root
+    values, vectors = np.linalg.eigh(covariance)
+    left_out = np.cumsum(values.clip(min=0), axis=1)
+    kept = max(1, int((left_out > _LEFT_OUT).sum(1).max()))
+    vectors = vectors[:, :, -kept:]
+    Y = np.linalg.solve(root.T, vectors).transpose(0, 2, 1)
+    F = vectors.transpose(0, 2, 1) @ root.T @ rows
+    return F.astype(np.float32), np.roll(Y, -1, axis=2).astype(np.float32)

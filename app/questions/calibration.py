@@ -1,0 +1,114 @@
+"""From a machine's log-odds to the probabilities that the answers promise, and the best of them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.compiling import compiled, inlined
+from app.inference.elementary import logistic
+from app.inference.mean_field import sigmoid
+from app.registry.description import Calibration
+
+Floats = NDArray[np.floating[Any]]
+Places = NDArray[np.int64]
+
+__all__ = ["sigmoid"]
+
+
+@compiled
+def bend(entry: Floats, logits: Floats) -> None:
+    """Bend log-odds (n,) in place by the line of a calibration, see `PairSlope`.
+
+    Args:
+        entry: (4 + 2K,) a row of those of `RelationSlopes`.
+    """
+    for j in range(len(logits) if len(entry) > 4 else 0):
+        x = y = logits[j]
+        for k in range(4, len(entry), 2):
+            y += entry[k + 1] * max(x - entry[k], np.float32(0.0))
+        logits[j] = y
+
+
+@compiled
+def relation_probability(
+    slopes: Floats, log_odds: Floats, log_count: Floats, classes: int
+) -> Floats:
+    """Probability that a relation holds between one pair of instances, (B, A, N).
+
+    Args:
+        slopes: (A, 4 + 2K), one of those of `RelationSlopes`.
+        log_odds: (B, A, N) of the class-level units.
+        log_count: (N,), log of the instance pairs of both classes.
+        classes: how many distinct ones the scene has.
+    """
+    p = np.empty_like(log_odds)
+    size = np.log(classes)
+    for a in range(p.shape[1]):
+        slope, weight = slopes[a, 1], slopes[a, 2]
+        intercept = np.float32(slopes[a, 0] + slopes[a, 3] * size)
+        for b in range(len(p)):
+            row, found = log_odds[b, a], p[b, a]
+            for j in range(len(row)):
+                found[j] = intercept + slope * row[j] + weight * log_count[j]
+            bend(slopes[a], found)
+    # Of all at once, since a row may be short.
+    logits = p.reshape(-1)
+    for e in range(len(logits)):
+        logits[e] = logistic(np.float32(logits[e]))
+    return p
+
+
+@inlined
+def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
+    """Scale p(a(x,y)) and p(a(y,x)), which exclude each other, down to a sum of at most 1."""
+    total = np.maximum(forward + backward, np.float32(1.0))
+    return forward / total, backward / total
+
+
+def missing_logits(calibration: Calibration, log_odds: Floats, listed: int) -> Floats:
+    """Logits of "this class is there unlisted", with so many classes listed."""
+    return calibration.missing.log_odds(log_odds, listed)
+
+
+def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int) -> Floats:
+    """log p(relation | both are there), calibrated as placements are, from that of the machine.
+
+    Args:
+        entry: (4 + 2K,), the relation's row of `RelationSlopes.placement`.
+        log_p: of the class-level unit.
+        log_count: of the anchor's instances.
+        classes: how many distinct ones there are with the candidate.
+    """
+    intercept, gain, weight, size = entry[:4]
+    odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
+    logits = intercept + gain * odds + weight * log_count + size * math.log(classes)
+    bend(entry, logits)
+    found: Floats = -np.logaddexp(0.0, -logits)
+    return found
+
+
+def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
+    """Logits of p(there unlisted) · p(stands so | there).
+
+    Args:
+        log_p: log of the second factor, calibrated.
+    """
+    both = log_p - np.logaddexp(0.0, -missing_logits(calibration, log_odds, listed))
+    found: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
+    return found
+
+
+def intruder_line(calibration: Calibration, classes: int) -> tuple[float, float]:
+    """Intercept and slope of the log-odds of being an intruder among so many distinct classes."""
+    entry = calibration.outlier
+    return entry.intercept + entry.log_count * math.log(classes), entry.slope
+
+
+def false_log_odds(calibration: Calibration, log_odds: Floats) -> Floats:
+    """Log-odds of a stated relation being false."""
+    entry = calibration.misplaced
+    return entry.intercept + entry.slope * log_odds

@@ -1,0 +1,342 @@
+"""What else should be here, and where?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.compiling import compiled
+from app.inference.relations import NO_UNIT
+from app.questions.answers import (
+    EXPLAINED,
+    Because,
+    MissingAnswer,
+    Offset,
+    Placement,
+    entries,
+    strongest_reasons,
+)
+from app.questions.calibration import (
+    missing_logits,
+    placed_logits,
+    placement_log_p,
+    sigmoid,
+)
+from app.questions.posterior import Posterior, posterior
+from app.questions.ranking import best, likeliest_places
+from app.registry.artifact import Artifact
+from app.registry.offsets import NOTHING, Offsets, look_up
+from app.scene.frames import Axes, viewer_axes
+from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP, RELATIONS, canonicalise, opposite
+from app.scene.scene import Scene
+
+_VIEWER = viewer_axes()
+_BLOCK: Final = 32
+
+PLACES: Final = 3
+"""How many placements an answer lists."""
+
+_SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
+_UNTURNED: Final = np.eye(3)
+_PER_METRE: Final = 1000.0  # answers are rounded to millimetres
+
+
+def missing(
+    artifact: Artifact,
+    scene: Scene,
+    *,
+    top_k: int = 10,
+    candidates: Sequence[int] | None = None,
+    at: tuple[str, int] | None = None,
+    coverage: float | None = None,
+    axes: Axes | None = _VIEWER,
+    details: bool = True,
+) -> tuple[MissingAnswer, ...]:
+    """Unlisted classes by the probability that they are there all the same, likeliest first.
+
+    A class that is there is listed with probability `coverage`. The lower the coverage, the less an
+    unlisted class counts as absent. Each probability is of its own: they do not sum to one. Listed
+    classes and structure are never proposed.
+
+    Args:
+        top_k: at most so many.
+        candidates: class indices to choose from; present classes and structure among them are
+            passed over.
+        at: (relation, position of an object): the probability is that a class is there, unlisted,
+            *and* stands so to that object.
+        coverage: from 0 to 1; by default the model's. At 1 unlisted classes count as absent.
+        axes: the viewer's, in the frame that offsets are answered in (`viewer_axes`); None where
+            nobody knows where the viewer looks.
+        details: also say where each would stand, and what speaks for it.
+
+    Raises:
+        ValueError: top_k below 1, a coverage outside [0, 1], a candidate outside the vocabulary, an
+            unknown relation, or an anchor that is no object of the scene.
+    """
+    spec, calibration = artifact.spec, artifact.calibration
+    if top_k < 1:
+        raise ValueError(f"top_k must be at least 1, not {top_k}")
+    coverage = calibration.coverage if coverage is None else coverage
+    if not 0 <= coverage <= 1:
+        raise ValueError(f"coverage must be in [0, 1], not {coverage}")
+    place = _place(scene, spec.A, at)
+    given = posterior(artifact, scene)
+    structure = artifact.vocabulary.structure
+    usable = ~structure
+    usable[given.present.classes] = False
+    absent = np.flatnonzero(usable)
+    chosen = _chosen(absent, spec.V, candidates)
+    if not chosen.any():
+        return ()
+    log_odds = given.absent_posterior(absent, coverage)
+    listed = max(1, int(np.count_nonzero(~structure[given.present.classes])))
+    if place is None:
+        logits = missing_logits(calibration, log_odds, listed)
+    else:
+        logits = _at_place(artifact, given, place, absent, chosen, log_odds, listed, top_k)
+    # By logit: probabilities near 0 or 1 may all round to one number.
+    where = best(logits, chosen, top_k)
+    probabilities = sigmoid(logits[where].astype(np.float64))
+    found = absent[where]
+    labels = artifact.vocabulary.labels
+    standing: Sequence[tuple[Placement, ...]] = [()] * len(found)
+    because: Sequence[tuple[Because, ...]] = [()] * len(found)
+    if details:
+        standing = placements(artifact, given, found, axes, place, scene.relations or ())
+        because = _reasons(given, found)
+    return tuple(
+        entries(
+            MissingAnswer,
+            [labels[index] for index in found.tolist()],
+            probabilities.tolist(),
+            log_odds[where].tolist(),
+            standing,
+            because,
+        )
+    )
+
+
+def _at_place(
+    artifact: Artifact,
+    given: Posterior,
+    place: tuple[int, int, bool],
+    absent: NDArray[np.int64],
+    chosen: NDArray[np.bool_],
+    log_odds: NDArray[np.floating[Any]],
+    listed: int,
+    top_k: int,
+) -> NDArray[np.floating[Any]]:
+    """Logits of p(there) · p(stands so | there) of the best `top_k` candidates at least, (N,).
+
+    Candidates are asked in blocks, the likeliest to be there first. A product is never above its
+    first factor: once the next candidate is less likely to be there than `top_k` others are at the
+    place, no later one can be among the best. What was not asked is -inf.
+    """
+    relation, anchor, outgoing = place
+    row = int(given.present.row[anchor])
+    there = missing_logits(artifact.calibration, log_odds, listed)
+    logits = np.full_like(there, -np.inf)
+    order = np.flatnonzero(chosen)
+    order = order[np.argsort(-there[order], kind="stable")]
+    for start in range(0, len(order), _BLOCK):
+        some = order[start : start + _BLOCK]
+        likeliest = np.sort(logits[order[:start]])[-top_k:]
+        if len(likeliest) == top_k and there[some[0]] < likeliest[0]:
+            break
+        log_p = place_log_p(artifact, given, absent[some], relation, row, outgoing=outgoing)
+        logits[some] = placed_logits(artifact.calibration, log_odds[some], log_p, listed)
+    return logits
+
+
+def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, ...]]:
+    """The classes that are there and change the log-odds of what was found most."""
+    if not len(given.present.classes):
+        return [()] * len(found)
+    explained = found[:EXPLAINED]
+    reasons = strongest_reasons(given.present.first, given.reasons_for_absent(explained))
+    return reasons + [()] * (len(found) - len(explained))
+
+
+def _place(
+    scene: Scene, relations: int, at: tuple[str, int] | None
+) -> tuple[int, int, bool] | None:
+    """(canonical relation, object, whether the missing thing is the relation's subject)."""
+    if at is None:
+        return None
+    name, anchor = at
+    if not 0 <= anchor < len(scene.objects):
+        raise ValueError(f"anchor {anchor} is none of the {len(scene.objects)} objects")
+    relation, subject, _ = canonicalise("missing", name, "anchor")
+    if relation >= relations:
+        raise ValueError(f"the model has no relation {name!r}, only {CANONICAL[:relations]}")
+    return relation, anchor, subject == "missing"
+
+
+def _chosen(
+    absent: NDArray[np.int64], classes: int, candidates: Sequence[int] | None
+) -> NDArray[np.bool_]:
+    """(N,) bool over the absent classes."""
+    if candidates is None:
+        return np.ones(len(absent), dtype=np.bool_)
+    for index in candidates:
+        if not 0 <= index < classes:
+            raise ValueError(f"candidate {index} must be a class index below V = {classes}")
+    return np.isin(absent, np.array(candidates, dtype=np.int64))
+
+
+def place_log_p(
+    artifact: Artifact,
+    given: Posterior,
+    candidates: NDArray[np.int64],
+    relation: int,
+    anchor: int,
+    *,
+    outgoing: bool,
+) -> NDArray[np.floating[Any]]:
+    """Calibrated log p(the candidate stands so to the anchor | it is there), (N,).
+
+    Args:
+        candidates: (N,) absent classes.
+        relation: canonical; from the candidate to the anchor if `outgoing`, else back.
+        anchor: place in the classes that are present.
+    """
+    return placement_log_p(
+        artifact.relation_slopes.asked_place[relation],
+        given.placed_log_p(candidates, relation, anchor, outgoing=outgoing),
+        *(float(given.present.log_counts[anchor]), len(given.present.classes) + 1),
+    )
+
+
+def placements(
+    artifact: Artifact,
+    given: Posterior,
+    candidates: NDArray[np.int64],
+    axes: Axes | None,
+    at: tuple[int, int, bool] | None = None,
+    stated: Collection[tuple[int, int, int]] = (),
+) -> list[tuple[Placement, ...]]:
+    """The likeliest relations of each candidate to what is present, best first.
+
+    All relations in both directions, to all but structure; instances of a class are spoken of by
+    the first. No placement puts a candidate under an object that stands on another.
+
+    Args:
+        candidates: (N,) absent classes.
+        axes: what offsets are answered in, see `offsets_of`.
+        at: canonical relation, object, and whether the missing thing is its subject: the place that
+            was asked about comes first, spoken of by that object. Structure is no place of its own.
+        stated: canonical relations between the objects of the scene.
+    """
+    present = given.present
+    anchors = np.flatnonzero(~artifact.vocabulary.structure[present.classes])
+    if not len(anchors):
+        return [()] * len(candidates)
+    forward, backward = given.placement_log_odds(candidates, anchors)
+    A, first, asked = forward.shape[1], present.first[anchors].tolist(), -1
+    if A > ON_TOP and stated:
+        standing = {subject for relation, subject, _ in stated if relation == ON_TOP}
+        backward[:, ON_TOP, [thing in standing for thing in first]] = NO_UNIT
+    asked_p: NDArray[np.floating[Any]] | None = None
+    if at is not None:
+        relation, object_, to_it = at
+        (found,) = np.nonzero(anchors == present.row[object_])
+        if len(found):
+            asked = ((0 if to_it else A) + relation) * len(first) + int(found[0])
+            row = int(anchors[found[0]])
+            asked_p = np.exp(
+                place_log_p(artifact, given, candidates, relation, row, outgoing=to_it)
+            )
+            first[found[0]] = object_
+    which, relations, outgoing, anchor, probabilities = likeliest_places(
+        *(artifact.relation_slopes.placement, forward, backward, present.log_counts[anchors]),
+        *(len(present.classes) + 1, PLACES, asked),
+    )
+    if asked_p is not None:
+        probabilities[:: len(which) // len(candidates)] = asked_p
+    offsets: Sequence[Offset | None] = [None] * len(which)
+    if artifact.offsets is not None:
+        ends = candidates[which], present.classes[anchors[anchor]]
+        offsets = offsets_of(artifact.offsets, relations, *ends, outgoing, axes)
+    named = zip(relations.tolist(), outgoing.tolist(), strict=True)
+    listed = entries(
+        Placement,
+        [(RELATIONS if out else _SEEN_FROM_ANCHORS)[number] for number, out in named],
+        [first[number] for number in anchor.tolist()],
+        probabilities.tolist(),
+        offsets,
+    )
+    each = len(listed) // len(candidates)
+    return [tuple(listed[k : k + each]) for k in range(0, len(listed), each)]
+
+
+def offsets_of(
+    known: Offsets,
+    relation: NDArray[np.int64],
+    missing: NDArray[np.int64],
+    anchor: NDArray[np.int64],
+    outgoing: NDArray[np.bool_],
+    axes: Axes | None,
+) -> Sequence[Offset | None]:
+    """From n anchors to n missing things.
+
+    Args:
+        relation, missing, anchor: (n,) canonical relation, class of the missing thing and of its
+            anchor.
+        outgoing: (n,) the missing thing is the relation's subject.
+        axes: the viewer's, in the frame to answer in; None where nobody knows where he looks. Then
+            left and front have no offset, and what lies on a thing lies in no direction from it.
+    """
+    ends = (relation, missing, anchor, outgoing)
+    if axes is None:
+        mean, spread, scenes = _lay(known.tables, *ends, _UNTURNED, False)
+    else:
+        mean, spread, scenes = _lay(known.tables, *ends, np.array(axes), True)
+    counts = scenes.tolist()
+    found = entries(Offset, map(tuple, mean.tolist()), map(tuple, spread.tolist()), counts)
+    if NOTHING not in counts:
+        return found
+    return [offset if offset.scenes != NOTHING else None for offset in found]
+
+
+@compiled
+def _lay(
+    tables: tuple[NDArray[Any], ...],
+    relation: NDArray[np.int64],
+    missing: NDArray[np.int64],
+    anchor: NDArray[np.int64],
+    outgoing: NDArray[np.bool_],
+    axes: NDArray[np.float64],
+    looking: bool,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Means and spreads (n, 3), and scenes (n,), of `offsets_of`."""
+    subject, other = np.where(outgoing, missing, anchor), np.where(outgoing, anchor, missing)
+    offset, scenes = look_up(tables, relation, subject, other)
+    n = len(relation)
+    mean, spread = np.zeros((n, 3)), np.zeros((n, 3))
+    for k in range(n):
+        if looking:
+            for axis in range(3):
+                toward, square = offset[k, axis], offset[k, 3 + axis] ** 2
+                for to in range(3):
+                    mean[k, to] += axes[axis, to] * toward
+                    spread[k, to] += axes[axis, to] ** 2 * square
+        else:
+            if relation[k] == LEFT or relation[k] == FRONT:
+                scenes[k] = NOTHING
+            mean[k, 2], spread[k, 2] = offset[k, 2], offset[k, 5] ** 2
+            for axis in range(2):
+                square = (offset[k, axis] ** 2 + offset[k, 3 + axis] ** 2) / 2
+                spread[k, 0] += square
+                spread[k, 1] += square
+        for axis in range(3):
+            value = mean[k, axis] if outgoing[k] else -mean[k, axis]
+            # Adding zero makes 0 of -0.
+            mean[k, axis] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
+            spread[k, axis] = (
+                max(np.rint(math.sqrt(spread[k, axis]) * _PER_METRE), 1.0) / _PER_METRE
+            )
+    return mean, spread, scenes

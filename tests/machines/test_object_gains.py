@@ -1,0 +1,97 @@
+"""The scorer against softplus differences in float64, for ordinary and for absurd weights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.inference.objects import ContextScorer
+from training.machines import MachineSpec, build
+from training.machines.log_odds import object_log_odds
+from training.machines.mean_field import Evidence, mean_field
+
+SIZES = st.integers(1, 40)
+SEEDS = st.integers(0, 2**32)
+# The largest |W| decides how many factors share a log: 1, some, all of them, or no products at all.
+WEIGHTS = st.sampled_from([0.0, 1e-3, 1.0, 5.0, 12.0, 40.0, 63.9, 64.1, 90.0, 1e4])
+LOGITS = st.sampled_from([0.0, 1.0, 10.0, 60.0, 85.0, 95.0, 110.0, 1e4])
+
+
+def gains(W, x):
+    """Of rows x (B, H1), (B, V)."""
+    scorer = ContextScorer(W.numpy())
+    return torch.from_numpy(scorer.gain(x.numpy()))
+
+
+def uniform(shape, largest, generator):
+    return (2 * torch.rand(shape, generator=generator) - 1) * largest
+
+
+def exact_gain(x, W):
+    """Softplus differences in float64, (B, V)."""
+    x, W = x.double().unsqueeze(1), W.double()
+    zero = torch.zeros((), dtype=torch.float64)
+    return (torch.logaddexp(zero, x + W) - torch.logaddexp(zero, x)).sum(-1)
+
+
+def close_to_exact(gain, x, W):
+    # Each factor is good to some float32 roundings, and there are H1 of them.
+    torch.testing.assert_close(gain.double(), exact_gain(x, W), rtol=1e-5, atol=4e-7 * W.shape[1])
+
+
+@given(V=SIZES, H1=SIZES, rows=st.integers(1, 5), weight=WEIGHTS, logit=LOGITS, seed=SEEDS)
+def test_gain_is_exact_to_float32_rounding(V, H1, rows, weight, logit, seed):
+    generator = torch.Generator().manual_seed(seed)
+    W, x = uniform((V, H1), weight, generator), uniform((rows, H1), logit, generator)
+    close_to_exact(gains(W, x), x, W)
+
+
+@given(
+    V=SIZES,
+    H1=SIZES,
+    weight=st.sampled_from([17.0, 20.0, 64.0, 80.0, 88.0, 200.0]),
+    logit=st.sampled_from([17.0, 88.0, 89.0, 104.0, 200.0]),
+    seed=SEEDS,
+)
+def test_gain_neither_overflows_nor_cancels_at_the_corners(V, H1, weight, logit, seed):
+    """Every weight ±weight, every logit ±logit: whole groups of factors are extreme at once."""
+    generator = torch.Generator().manual_seed(seed)
+    W = weight * torch.randint(0, 2, (V, H1), generator=generator).mul(2).sub(1.0)
+    x = logit * torch.randint(0, 2, (2, H1), generator=generator).mul(2).sub(1.0)
+    for signs in (W, W.abs(), -W.abs()):
+        for logits in (x, x.abs(), -x.abs()):
+            close_to_exact(gains(signs, logits), logits, signs)
+
+
+def test_an_object_with_no_weight_gains_nothing():
+    """0 up to the rounding of sigmoid(-x) + sigmoid(x), whatever the padding of the last group."""
+    gain = gains(torch.zeros(3, 17), torch.randn(4, 17))
+    torch.testing.assert_close(gain, torch.zeros(4, 3), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("layers", [0, 5])
+def test_scores_equal_the_log_odds_of_the_machine(layers):
+    spec = MachineSpec("triway", V=30, A=2, H1=21, H2=layers, K=2, form="local")
+    generator = torch.Generator().manual_seed(1)
+    machine = build(spec).initialise(generator, scale=1.0).requires_grad_(False)
+    machine.b.normal_(generator=generator)
+    evidence = Evidence((torch.rand(3, 30, generator=generator) < 0.2).float())
+    scores = machine.b + gains(machine.W, mean_field(machine, evidence).y)
+    torch.testing.assert_close(scores, object_log_odds(machine, evidence), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_weights_that_are_not_finite_are_refused(value):
+    W = torch.zeros(2, 3)
+    W[1, 2] = value
+    with pytest.raises(ValueError, match="W must be finite"):
+        ContextScorer(W.numpy())
+
+
+@pytest.mark.parametrize("shape", [(4,), (3, 1), ()])
+def test_logits_of_another_shape_are_refused(shape):
+    with pytest.raises(ValueError, match=r"x must be \(\.\.\., 3\)"):
+        ContextScorer(np.ones((2, 3), np.float32)).gain(np.zeros(shape))

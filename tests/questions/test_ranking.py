@@ -1,0 +1,27 @@
+"""The best of many against sorting them all."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from app.questions.ranking import best
+
+# Few different values, so that ties are the rule.
+VALUES = st.lists(st.tuples(st.integers(-3, 3), st.booleans()), max_size=60)
+
+
+@given(VALUES, st.integers(1, 70))
+@settings(max_examples=300)
+def test_largest_first_and_ties_by_position(entries, count):
+    values = np.array([value for value, _ in entries], dtype=np.float32)
+    usable = np.array([choice for _, choice in entries], dtype=np.bool_)
+    expected = [k for k in np.argsort(-values, kind="stable").tolist() if usable[k]]
+    assert best(values, usable, count).tolist() == expected[:count]
+
+
+def test_a_whole_sort_of_many():
+    values = np.random.default_rng(0).integers(0, 500, 20_000).astype(np.float32)
+    found = best(values, np.ones(len(values), dtype=np.bool_), len(values))
+    assert found.tolist() == np.argsort(-values, kind="stable").tolist()
