@@ -2,8 +2,8 @@
 
 Compiled code must never be older than its sources. numba checks the file of a loop before it uses
 the loop's code, but functions and constants of other files are compiled in too. So the code lies in
-a directory that is named by a digest of every file that can be compiled in, of the Python, numba,
-llvmlite and numpy versions, and of the CPU. `python -m app.compile` fills it ahead of the first
+a directory named by a digest: of all files that can be compiled in, of the versions of Python,
+numba, llvmlite and numpy, and of the CPU. `python -m app.compile` fills it ahead of the first
 start.
 
 The directory holds pickled code: a user who writes to it runs code in the service. It is made for
@@ -37,7 +37,7 @@ _PACKAGE: Final = Path(__file__).parent
 
 _NAMES: Final = "loops-" + 16 * "[0-9a-f]"
 
-# Packages whose files are compiled in, whatever they hold.
+# All files of these packages belong to the digest.
 _KERNELS: Final = ("inference", "scene")
 
 # Directories of other versions that stay, so that going back to one compiles nothing.

@@ -1,10 +1,10 @@
 """Scenes drawn by Gibbs chains, each with a random stream of its own.
 
-For machines in the local form. A chain starts at a stored scene that suits what is given, makes
-its sweeps over h1, h2 and v (with relations given, h1 by Metropolis–Hastings), and draws relations
-once, at the end, since in the local form they do not act on the rest.
+For machines in the local form. A chain starts at a stored scene and makes its sweeps over h1, h2
+and v. With relations given, h1 is drawn by Metropolis–Hastings. Relations are drawn once, at the
+end: in the local form they do not act on the other units.
 
-Stored scenes are weighed by what they make of the evidence before one is drawn,
+The stored scene is drawn with weights given the evidence,
 
     log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
             - 6 [drawn under another room type than t],

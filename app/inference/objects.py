@@ -59,8 +59,8 @@ def halves(x: Singles) -> tuple[Singles, Singles]:
 class ContextScorer:
     """The gain of every object from hidden logits, for a machine whose weights do not change.
 
-    Every row is computed by itself with the same operations, so a row's result does not depend, to
-    the bit, on what it is batched with.
+    Every row is computed by itself with the same operations, so a row's bits do not depend on the
+    other rows.
 
     Args:
         W: (V, H1).

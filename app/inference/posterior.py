@@ -1,4 +1,4 @@
-"""What a machine says of a scene: the context given what was observed, and the classes beyond it.
+"""What a machine says of a scene: its context given the observations, and its unlisted classes.
 
 For machines in the local form. Without given relations p(h1 | v) is factorial, with means
 
@@ -337,7 +337,7 @@ class Completions:
         return found
 
     def _resample(self, base: Floats, classes: Places, presence: Floats, coverage: float) -> Places:
-        """Systematic resampling of the samples by what they make of a scene, (M,) ascending."""
+        """Systematic resampling of the samples by their weights given a scene, (M,) ascending."""
         weighed = self._things[classes]
         # log σ(l) - log(1 - c σ(l)) = -log(1 - c + e^-l)
         against = self._odds_against[:, classes[weighed]]

@@ -44,7 +44,7 @@ def pair_terms(w, first, ends, z, base):
         first: the first of the R relations.
         ends: `relations.Ends`, (B, P) each.
     """
-    # By name: to take an array from the tuple again and again is to count references to it.
+    # By name: each access through the tuple would count a reference.
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
     subjects, objects, log_i, log_j = ends.i, ends.j, ends.log_i, ends.log_j
     for b in range(len(z)):
@@ -89,7 +89,7 @@ def spreads(C, q, spread):
     """√3 σ of logits (B, R, P): the root of 3 q'C q.
 
     Args:
-        C: (B, R, r (r + 1) / 2) the lower half, twice what is off the diagonal.
+        C: (B, R, r (r + 1) / 2) its lower half; entries off the diagonal are doubled.
         q: (B, R r, P).
     """
     (B, R, P), r = spread.shape, q.shape[1] // spread.shape[1]
@@ -310,7 +310,7 @@ def _no_steps(relations, n):
 @compiled
 def _hold(known, weight, a, i, j):
     """Relation a holds between two different classes: count its two steps, and new paths."""
-    # Arrays whole and by index: a slice of one costs more than what is done with it.
+    # By index: a slice of an array costs more than the few numbers read from it.
     degree, near, seen, paths = known
     steps = len(degree)
     both = (a, i, j), (steps // 2 + a, j, i)

@@ -1,6 +1,6 @@
 """Probabilities of relations: p(r_e = 1) = E[sigmoid(ℓ_e(h1))] with ℓ_e(h1) = base_e + U_e·h1.
 
-The logit is a sum of many small independent terms, so it is taken as normal, with
+The logit is a sum of many small independent terms and is approximated by a normal variable with
 
     mean base_e + U_e·m   and variance   σ_e² = sum_k U_ek² m_k (1 - m_k)
 
@@ -94,7 +94,7 @@ class Units(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """The context of a scene, given what was observed.
+    """The context of a scene, given its observations.
 
     Attributes:
         classes: (n,) int64, distinct.
@@ -143,7 +143,8 @@ class Between(NamedTuple):
 
     Attributes:
         mean, spread: (A, n, n) of the logits, see `RelationUnits.normal`.
-        slopes: (A, n, n), 0 where nothing is given; these three are empty where nothing is.
+        slopes: (A, n, n), 0 for relations that are not given. Without any given relation, slopes,
+            shift and apart are empty.
         shift: (A, n, n) what the given relations imply for each.
         apart: the same without those of the pair itself.
     """
@@ -196,7 +197,7 @@ class RelationUnits(ABC):
     ) -> tuple[Floats, Floats]:
         """Mean and √3 σ of logits between pairs (B, P), both (B, R, P), for means of h1 (B, H1).
 
-        R is 1 where one relation is asked for, else A. The mean of what has no unit is `NEVER`.
+        R is 1 where one relation is asked for, else A. A relation without a unit has mean `NEVER`.
 
         Args:
             known: the means are 0 or 1, so nothing varies.

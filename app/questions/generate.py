@@ -7,7 +7,7 @@ neither. A drawn scene is drawn again where
 - it suits its room type less than 85 % of the real rooms of that type (`Calibration.room_fit`), or
 - one of its classes raises an alarm of `/outliers` at the default sensitivity.
 
-What a request gives is never a reason. The last of `ATTEMPTS` draws stands whatever it is.
+What a request gives is never a reason. The last of `ATTEMPTS` draws is always taken.
 """
 
 from __future__ import annotations
