@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from app.inference.variants import Form, Variant
+from app.inference.variants import VARIANTS, Form, Variant
 from training.machines import MachineSpec, build
 
 DATA = Path("../shared/data")
@@ -183,10 +183,11 @@ class Config(_Section):
                     f"machine.without: a {self.machine.variant} has no weights "
                     f"{', '.join(unknown)}, only {', '.join(names)}"
                 )
-        if self.machine.variant in ("rbm", "product_rbm") and self.machine.H2:
+        kind = VARIANTS[self.machine.variant]
+        if self.machine.H2 and not kind.two_layers:
             raise ValueError("an RBM has one hidden layer: machine.H2 must be 0")
         local = self.machine.form == "local"
-        if self.machine.G and not (local and self.machine.variant == "triway"):
+        if self.machine.G and not (local and kind.implications):
             raise ValueError("machine.G is defined for the local form of the Triway only")
         if self.machine.N and not local:
             raise ValueError("machine.N is defined for the local form only")
@@ -198,8 +199,8 @@ class Config(_Section):
             raise ValueError("objects.epochs is defined for the local form only")
         if self.objective.name == "relations" and not self.objects.epochs:
             raise ValueError("the objective relations needs objects.epochs: it trains no objects")
-        if (self.polish.updates or self.machine.N) and self.machine.form != "local":
-            raise ValueError("polish.updates and machine.N are defined for the local form only")
+        if self.polish.updates and not local:
+            raise ValueError("polish.updates is defined for the local form only")
         return self
 
     @property

@@ -19,8 +19,7 @@ from torch import Tensor
 from training.batches import SceneTensors
 from training.evaluation.intervals import Figure
 from training.evaluation.metrics import Macro, Ratio
-from training.machines import BoltzmannMachine, Triway
-from training.machines.edges import Edges
+from training.machines import BoltzmannMachine
 from training.machines.log_odds import object_log_odds
 from training.machines.mean_field import Evidence
 
@@ -107,23 +106,13 @@ class MachineScore:
 
     def __call__(self, v: Tensor, room: Tensor | None = None) -> Tensor:
         """Scores (B, V) of presence (B, V), room types (B,) withheld unless they are given."""
-        evidence = Evidence(v, _open_units(self.machine, v), room=room)
+        evidence = Evidence(v, self.machine.acting_units(v), room=room)
         return object_log_odds(self.machine, evidence)
 
 
 def machine_score(machine: BoltzmannMachine) -> MachineScore:
     """A machine's score; it takes room types too."""
     return MachineScore(machine)
-
-
-def _open_units(machine: BoltzmannMachine, v: Tensor) -> Edges | None:
-    """The relation units that an unobserved relation acts by: none in the local form."""
-    if machine.spec.form == "local":
-        return None
-    if not isinstance(machine, Triway):
-        return machine.edges(torch.zeros(1, 0, dtype=torch.int64))
-    value, index = v.topk(int(v.sum(1).max()), dim=1)
-    return machine.edges(torch.where(value > 0, index, -1))
 
 
 def removed_objects(

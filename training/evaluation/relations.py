@@ -18,8 +18,8 @@ from torch import Tensor
 
 from training.batches import Batch, SceneTensors
 from training.evaluation.metrics import Ratio
-from training.machines import BoltzmannMachine, Triway
-from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
+from training.machines import BoltzmannMachine
+from training.machines.edges import triple_keys
 from training.machines.log_odds import relation_log_odds
 from training.machines.mean_field import Evidence
 
@@ -31,25 +31,11 @@ def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScor
     """Log-odds of every relation with all relations unobserved, whatever the batch says of them."""
 
     def score(batch: Batch) -> Tensor:
-        n, A = batch.classes.shape[1], machine.spec.A
-        edges: Edges = machine.edges(batch.classes, batch.counts)
+        edges = machine.edges(batch.classes, batch.counts)
         values, _ = relation_log_odds(machine, edges, Evidence(batch.v, edges), count=draws)
-        if isinstance(machine, Triway):
-            return values.unflatten(1, (A, n, n))
-        return spread_units(machine, batch.classes, values)
+        return machine.between(edges, values, batch.classes)
 
     return score
-
-
-def spread_units(machine: BoltzmannMachine, classes: Tensor, values: Tensor) -> Tensor:
-    """Values (B, T) of an ungated machine's units on (B, A, n, n); -inf where there is no unit."""
-    pairs = pair_edges(classes, machine.spec.A)
-    keys = triple_keys(pairs.relation, pairs.subject, pairs.object, machine.spec.V)
-    position, found = find_triples(machine.triple_keys, keys)
-    if not machine.spec.T:
-        return pairs.unflatten(torch.full(keys.shape, -torch.inf))
-    spread = values.gather(1, position)
-    return pairs.unflatten(torch.where(found & pairs.valid, spread, -torch.inf))
 
 
 @dataclass(frozen=True, eq=False)

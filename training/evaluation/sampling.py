@@ -7,9 +7,7 @@ from torch import Tensor
 
 from app.questions.generate import STEPS
 from training.evaluation.generation import Contradictions, Drawn, Sampler
-from training.evaluation.relations import spread_units
-from training.machines import BoltzmannMachine, Triway
-from training.machines.edges import PairEdges
+from training.machines import BoltzmannMachine
 from training.machines.fantasies import Fantasies
 from training.machines.gibbs import Clamp, State, gibbs_step, present_classes, run
 
@@ -51,6 +49,5 @@ def _sweep(
 
 def _grid(machine: BoltzmannMachine, state: State) -> Tensor:
     """Relations between present classes, (B, A, n, n)."""
-    if isinstance(machine, Triway) and isinstance(state.edges, PairEdges):
-        return state.edges.unflatten(state.r * state.edges.ends_present(state.v))
-    return spread_units(machine, present_classes(state.v), state.r).clamp(min=0)
+    r = state.r * state.edges.ends_present(state.v)
+    return machine.between(state.edges, r, present_classes(state.v)).clamp(min=0)

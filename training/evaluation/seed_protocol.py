@@ -32,11 +32,10 @@ from training.evaluation.contenders import Contender
 from training.evaluation.intervals import Metric
 from training.evaluation.metrics import Ratio
 from training.evaluation.outliers import draw_intruders
-from training.evaluation.relations import spread_units
 from training.evaluation.tasks import Outcome, Setting, Task
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
-from training.machines.edges import Edges, PairEdges
+from training.machines.edges import Edges
 from training.machines.mean_field import Evidence, mean_field
 
 PAPER: dict[str, dict[str, float]] = {
@@ -151,9 +150,7 @@ def draw_relations(
     edges = machine.edges(batch.classes, batch.counts)
     p = machine.relation_logits(edges, batch.v, h1).sigmoid() * machine.gate(edges, batch.v)
     r = bernoulli(p, generator)
-    if isinstance(edges, PairEdges):
-        return r.sum(1), edges.unflatten(r)
-    return r.sum(1), spread_units(machine, batch.classes, r).clamp(min=0)
+    return r.sum(1), machine.between(edges, r, batch.classes).clamp(min=0)
 
 
 @torch.no_grad()

@@ -156,6 +156,25 @@ class BoltzmannMachine(nn.Module, ABC):
         """
 
     @abstractmethod
+    def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
+        """Values (B, E) of units as relations between classes, (B, A, n, n); -inf without a unit.
+
+        Args:
+            classes: (B, n) int64, -1 where padded; `edges` are their units.
+        """
+
+    @abstractmethod
+    def acting_units(self, v: Tensor) -> Edges | None:
+        """Units that act on objects while they are unobserved; None in the local form."""
+
+    def begin_independent(self, machine: BoltzmannMachine) -> None:
+        """Set this machine's relation weights to those of `machine` at beta = 0, see `scaled`."""
+
+    def relation_log_partition(self) -> float:
+        """What the relation units of independent objects add to log Z."""
+        return 0.0
+
+    @abstractmethod
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
         """The machine on the path from `base` (independent objects) at beta = 0 to this one at 1.
 

@@ -25,8 +25,6 @@ from training.machines import build
 from training.machines.bernoulli import bernoulli
 from training.machines.gibbs import State, gibbs_step, initial_state
 from training.machines.machine import BoltzmannMachine
-from training.machines.rbm import RBM
-from training.machines.triway import Triway
 
 
 @dataclass(frozen=True)
@@ -68,19 +66,14 @@ def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> Bolt
     with torch.no_grad():
         base.set_triples(machine.triples)
         base.b.copy_(machine.b if b is None else b)
-        if isinstance(machine, RBM) and isinstance(base, RBM):
-            base.d.copy_(machine.d)
-        elif isinstance(base, Triway) and base.spec.form == "seed":
-            base.kappa.fill_(-math.log(2))
+        base.begin_independent(machine)
     return base
 
 
 def base_log_partition(machine: BoltzmannMachine, base: BoltzmannMachine) -> float:
     """Exact log Z of `base`."""
     log_z = float(softplus(base.b).sum()) + (machine.spec.H1 + machine.spec.H2) * math.log(2)
-    if isinstance(base, RBM) and base.spec.form == "seed":
-        log_z += float(softplus(base.d).sum())
-    return log_z
+    return log_z + base.relation_log_partition()
 
 
 @torch.no_grad()

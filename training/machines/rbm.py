@@ -13,9 +13,16 @@ from typing import Self, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
-from training.machines.edges import Edges, triple_edges
+from training.machines.edges import (
+    Edges,
+    find_triples,
+    pair_edges,
+    triple_edges,
+    triple_keys,
+)
 from training.machines.machine import BoltzmannMachine
 
 
@@ -58,6 +65,29 @@ class RBM(BoltzmannMachine):
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
         """Zero: given the context, relations do not touch objects."""
         return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
+
+    def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
+        """Each unit at its triple; most relations have none."""
+        pairs = pair_edges(classes, self.spec.A)
+        keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
+        position, found = find_triples(self.triple_keys, keys)
+        if not self.spec.T:
+            return pairs.unflatten(torch.full(keys.shape, -torch.inf))
+        spread = values.gather(1, position)
+        return pairs.unflatten(torch.where(found & pairs.valid, spread, -torch.inf))
+
+    def acting_units(self, v: Tensor) -> Edges | None:
+        """All T units."""
+        return None if self.spec.is_local else triple_edges(self.triples)
+
+    @torch.no_grad()
+    def begin_independent(self, machine: BoltzmannMachine) -> None:
+        """Units keep their bias d."""
+        self.d.copy_(machine.get_parameter("d"))
+
+    def relation_log_partition(self) -> float:
+        """sum_t softplus(d_t) in the seed form."""
+        return 0.0 if self.spec.is_local else float(softplus(self.d).sum())
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:

@@ -21,6 +21,7 @@ Forms: `seed` is the energy above (with a compensating offset κ_a per active un
 
 from __future__ import annotations
 
+import math
 from typing import Self
 
 import torch
@@ -224,6 +225,23 @@ class Triway(BoltzmannMachine):
             return super().pair_offset(edges, v)
         gate = self.gate(edges, v)
         return _pairs(edges).unflatten(gate).sum((-1, -2)) @ self.kappa
+
+    def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
+        """The units as they are laid out."""
+        return _pairs(edges).unflatten(values)
+
+    def acting_units(self, v: Tensor) -> Edges | None:
+        """The units between the classes present in v (B, V)."""
+        if self.spec.is_local:
+            return None
+        value, index = v.topk(int(v.sum(1).max()), dim=1)
+        return self.edges(torch.where(value > 0, index, -1))
+
+    @torch.no_grad()
+    def begin_independent(self, machine: BoltzmannMachine) -> None:
+        """In the seed form κ is -log 2."""
+        if not self.spec.is_local:
+            self.kappa.fill_(-math.log(2))
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
