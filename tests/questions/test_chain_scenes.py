@@ -49,29 +49,6 @@ def single(name):
     return made, enumerate_joint(copy.deepcopy(machine_of(made.weights)).double())
 
 
-@pytest.mark.parametrize("name", ["triway-local", "triway-implications"])
-@pytest.mark.parametrize("given_classes", [[], [0]])
-def test_objects_are_drawn_from_the_model(name, given_classes):
-    """Frequencies of every set of classes within five standard errors of the joint, over 4,096
-    chains; each of at most 8 sets fails by chance with probability 6e-7."""
-    artifact, joint = single(name)
-    scene = scene_of(given_classes)
-    drawn = [
-        frozenset(LABELS.index(label) for label in one.objects)
-        for one in generate(artifact, scene, count=4096, seed=0, steps=40)
-    ]
-    where = (joint.v[:, given_classes] > 0).all(1)
-    p = torch.where(where, joint.p, 0.0)
-    p = p / p.sum()
-    codes = (joint.v.long() << torch.arange(3)).sum(1)
-    for code in range(8):
-        classes = frozenset(i for i in range(3) if code >> i & 1)
-        expected = float(p[codes == code].sum())
-        error = math.sqrt(expected * (1 - expected) / len(drawn))
-        frequency = sum(one == classes for one in drawn) / len(drawn)
-        assert abs(frequency - expected) <= 5 * error + 1e-6
-
-
 def test_stated_relations_tell_of_the_objects():
     """Of four units seen between two classes: how often the third class is there, within five
     standard errors of the joint, over 4,096 chains; other relations make for another share."""
