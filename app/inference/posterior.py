@@ -167,13 +167,9 @@ class ClosedForm:
         pulled = (x - bases).astype(np.float32)
         return x[0].astype(np.float32), pulled[0] - pulled[1:]
 
-    def between(self, context: Context) -> Between:
-        """What `relation_log_odds` and `log_odds_apart` need."""
-        return self.units.between(context)
-
     def relation_log_odds(self, context: Context, between: Between | None = None) -> Floats:
         """Log-odds of all relations between the classes, each without itself, (A, n, n)."""
-        between = self.between(context) if between is None else between
+        between = self.units.between(context) if between is None else between
         found = self.units.log_odds(between)
         given, units = context.given, context.units
         if given is not None and units is not None:
@@ -186,38 +182,16 @@ class ClosedForm:
                 )
         return found
 
-    def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
-        """The same of pairs of classes, without all that is given of the pair, (2, A, P).
-
-        Args:
-            i, j: (P,) places; the relations from i to j come first, then those back.
-        """
-        return self.units.log_odds_apart(context, between, i, j)
-
     def unit_log_odds(self, context: Context, a: Places, i: Places, j: Places) -> Floats:
         """The same of some units (E,), relations a from places i to places j."""
         given, shift, _ = self.units.said(context)
         slopes = given[a, i, j] if len(given) else np.zeros(len(a), dtype=np.float32)
         return self.units.without_itself(context, a, i, j, slopes, shift)
 
-    def placement_log_odds(
-        self, context: Context, candidates: Places, anchors: Places
-    ) -> tuple[Floats, Floats]:
-        """The same of each absent candidate, were it there: to the anchors and from them.
-
-        Args:
-            candidates: (N,) absent classes.
-            anchors: (m,) places of present ones.
-
-        Returns:
-            (N, A, m) of relations from the candidate to an anchor, and of those back.
-        """
-        return self.units.placement_log_odds(context, candidates, anchors)
-
     def placed_log_odds(
         self, context: Context, candidates: Places, relation: int, anchor: int, outgoing: bool
     ) -> Floats:
-        """One relation of many absent candidates, were they there, to one class, (N,).
+        """The same of many absent candidates (N,), were they there, to one class.
 
         Args:
             anchor: place of the class.

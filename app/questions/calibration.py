@@ -1,4 +1,4 @@
-"""From a machine's log-odds to the probabilities that the answers promise, and the best of them."""
+"""From a machine's log-odds to the probabilities that the answers promise."""
 
 from __future__ import annotations
 
@@ -10,13 +10,9 @@ from numpy.typing import NDArray
 
 from app.compiling import compiled, inlined
 from app.inference.elementary import logistic
-from app.inference.mean_field import sigmoid
 from app.registry.description import Calibration
 
 Floats = NDArray[np.floating[Any]]
-Places = NDArray[np.int64]
-
-__all__ = ["sigmoid"]
 
 
 @compiled

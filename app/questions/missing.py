@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
+from app.inference.mean_field import sigmoid
 from app.inference.relations import NO_UNIT
 from app.questions.answers import (
     EXPLAINED,
@@ -24,7 +25,6 @@ from app.questions.calibration import (
     missing_logits,
     placed_logits,
     placement_log_p,
-    sigmoid,
 )
 from app.questions.posterior import Posterior, posterior
 from app.questions.ranking import best, likeliest_places

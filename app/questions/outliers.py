@@ -22,6 +22,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from app.inference.mean_field import sigmoid
 from app.questions.answers import (
     EXPLAINED,
     Because,
@@ -31,7 +32,7 @@ from app.questions.answers import (
     entries,
     strongest_reasons,
 )
-from app.questions.calibration import false_log_odds, intruder_line, sigmoid
+from app.questions.calibration import false_log_odds, intruder_line
 from app.questions.posterior import Posterior, posterior
 from app.questions.ranking import best
 from app.registry.artifact import Artifact

@@ -149,7 +149,9 @@ class Posterior:
         Returns:
             (A, P) of the one to the other, and of the other to the one.
         """
-        forward, backward = self._closed.log_odds_apart(self._context, self._between, one, other)
+        forward, backward = self._closed.units.log_odds_apart(
+            self._context, self._between, one, other
+        )
         return forward, backward
 
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
@@ -160,7 +162,7 @@ class Posterior:
         Returns:
             (N, A, m) of the candidate to an anchor, and of the anchor to the candidate.
         """
-        return self._closed.placement_log_odds(self._context, candidates, anchors)
+        return self._closed.units.placement_log_odds(self._context, candidates, anchors)
 
     def placed_log_p(
         self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
@@ -200,7 +202,7 @@ class Posterior:
 
     @cached_property
     def _between(self) -> Between:
-        return self._closed.between(self._context)
+        return self._closed.units.between(self._context)
 
     @cached_property
     def _shares(self) -> NDArray[np.float32]:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 
+from app.inference.mean_field import sigmoid
 from app.inference.posterior import ClosedForm
 from app.questions.calibration import (
     exclusive,
@@ -25,7 +26,6 @@ from app.questions.calibration import (
     missing_logits,
     placed_logits,
     relation_probability,
-    sigmoid,
 )
 from app.registry import Calibration
 from app.registry.description import CountSlope
