@@ -487,4 +487,6 @@ def test_sizes_that_nobody_knows_are_noticed() -> None:
     bed = {"id": "b", "label": "bed", "position": at(2, 1, 0.3)}
     bare = [{key: value for key, value in one.items() if key != "size"} for one in LAMP_ON_DESK]
     assert warned(objects=[*bare, bed]) == [("unknown-sizes", ["b"])]
+    assert warned(objects=[bare[0], bed]) == [("unknown-sizes", ["b"])]
+    assert warned(objects=[bed]) == []
     assert warned(objects=[*bare, bed], relations=[]) == []
