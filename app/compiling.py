@@ -116,7 +116,7 @@ def _make_private(folder: Path) -> None:
     if not stat.S_ISDIR(own.st_mode):
         raise NotADirectoryError(f"{folder} is a link")
     if own.st_uid != os.geteuid() or root.st_uid not in {os.geteuid(), 0}:
-        raise PermissionError(f"{folder} belongs to another user")
+        raise PermissionError(f"{folder} or its parent belongs to another user")
     # Others may add files to a sticky directory such as /tmp; they cannot replace ours.
     is_open = root.st_mode & stat.S_IWOTH and not root.st_mode & stat.S_ISVTX
     if is_open or own.st_mode & (stat.S_IWGRP | stat.S_IWOTH):

@@ -6,10 +6,10 @@
     placement  the same for a pair of which one was taken away
     misplaced  the relation is false, where one triple in half of the scenes was altered
 
-All are logistic regressions (Platt scaling) on what each source says holds or does not hold; what
-it leaves unsaid is left out. Which relation is likelier is decided with the examples of large
-sources weighted down, since one procedural source says more than all others together; how likely
-relations are on the whole, with every example alike.
+All are logistic regressions (Platt scaling) on relations that a source states as true or false;
+unstated ones are left out. The ranking of relations is fitted with large sources weighted down,
+because one procedural source has more examples than all others together. The overall level is
+fitted with equal weights.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """

@@ -134,7 +134,7 @@ class ClosedForm:
         given: Given | None = None,
         pull: Pull = FULL,
     ) -> Context:
-        """The context of a scene.
+        """Logits of h1 given the objects, the room type and the given relations.
 
         Args:
             room: index of the room type; None where it is not known.

@@ -221,15 +221,15 @@ class Metrics:
             self._serialisation.observe(serialised)
 
     def entry_answered(self, question: str, outcome: str) -> None:
-        """One scene of a batch has been answered, or refused by the named problem."""
+        """Count one scene of a batch: answered, or refused with the problem `outcome`."""
         self._entries.labels(question, outcome).inc()
 
     def streams(self, count: int) -> None:
-        """So many streams are open now."""
+        """Set the number of open streams."""
         self._streams.set(count)
 
     def stream_message(self, kind: str, outcome: str) -> None:
-        """A stream's message has been taken, or refused by the named problem.
+        """Count one stream message: accepted, or refused with the problem `outcome`.
 
         Args:
             kind: its type, "-" if there is no such type.

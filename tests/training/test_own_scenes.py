@@ -191,7 +191,7 @@ def test_a_grown_data_set_is_compared_on_what_the_older_version_never_saw(workpl
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("compare", "nowhere"), "no finished run and no model"),
+        (("compare", "nowhere"), "must be a finished run or a model"),
         (("compare", "baselines"), "name a model or a run"),
         (("train", "nowhere"), "no configuration"),
     ],

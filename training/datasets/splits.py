@@ -122,11 +122,11 @@ def _connected(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, 
 def _assign(
     rooms_of: Mapping[str, Counter[str]], shares: Mapping[Part, float], seed: int
 ) -> dict[str, Part]:
-    """Give every unit to the part that lacks most, stratum by stratum.
+    """Assign each unit to the part furthest below its target share, one stratum at a time.
 
     The stratum of a unit is its most common room type. Units come in the order of a hash, large
-    strata first; what a part lacks is counted both in the stratum and over all, so that strata of a
-    few units do not all end in training.
+    strata first. The distance is counted in the stratum and over all, so that strata of a few units
+    do not all end in training.
     """
     strata: dict[str, list[str]] = defaultdict(list)
     for unit, rooms in rooms_of.items():

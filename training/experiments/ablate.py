@@ -217,7 +217,7 @@ def shipped_ablations() -> dict[str, Path]:
 
 
 def load_rows(path: Path, full: Config) -> list[Config]:
-    """The configurations of a file, on the scenes of the full model, which is not among them.
+    """The ablation configurations of a file, with the scenes of the full model.
 
     The name of each is its row's, the description says what it changes.
 

@@ -125,7 +125,7 @@ def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
         if folder.is_dir():
             raise RunError(f"{reference} holds no finished run") from error
         raise ConfigError(
-            f"{reference!r} is no finished run and no model in {store.root}: {error}"
+            f"{reference!r} must be a finished run or a model in {store.root}: {error}"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""What given relations imply for the others, beyond what they say of the context.
+"""Direct effect of observed relations on the log-odds of others, beside that through h1.
 
 What stands left of the chair that stands left of the bed stands left of the bed. Units that are
 independent given h1 cannot know it. So relations that are given shift the log-odds of the others,

@@ -12,8 +12,8 @@ Two forms of the relation part, for every variant:
     local   - r_e ℓ_e + log(1 + exp ℓ_e)
 
 The local form leaves p(r | v, h1) as it is and makes unobserved relations drop out of everything
-else. The seed form keeps the paper's energy; its κ (0 in the paper) compensates the attraction that
-a summed-out relation exerts on its two ends.
+else. The seed form keeps the paper's energy; its κ (0 in the paper) compensates for the attraction
+that a summed-out relation exerts on its two ends.
 
 Shapes: leading sample dimensions first, then scenes B, then units. Energies have the leading shape.
 """

@@ -12,7 +12,7 @@ of its own, which the prior holds small,
 
     S = X A_S + S',   O = X A_O + O',   s = (X B_s)' + s',   o = (X B_o)' + o'
 
-so that a class seen rarely behaves like its neighbours.
+so that a rare class behaves like classes with similar word vectors.
 
 A robot has seldom seen a whole scene, so the context sees a random share of the objects: of each
 scene a uniform one. What holds of a pair in rich scenes of one source would else be left to the
