@@ -145,6 +145,9 @@ if _FOLDER is not None:
     os.environ["NUMBA_CACHE_DIR"] = str(_FOLDER)
 
 from numba import njit  # noqa: E402
+from numba.core import event  # noqa: E402
+
+_LOOPS: Final[list[Any]] = []
 
 
 def _compile(function: Function, **options: Any) -> Function:
@@ -152,6 +155,7 @@ def _compile(function: Function, **options: Any) -> Function:
     # No caller is written in C.
     options["no_cfunc_wrapper"] = True
     found: Function = njit(**options)(function)
+    _LOOPS.append(found)
     return found
 
 
@@ -194,10 +198,33 @@ def progress() -> Iterator[None]:
         _wait(descriptor)
         if not (_FOLDER / "complete").exists():
             _logger.info("compiling loops, once for these sources: this takes a minute")
-        yield
+        with event.install_listener("numba:compile", _Progress()):
+            yield
         (_FOLDER / "complete").touch()
     finally:
         os.close(descriptor)
+
+
+class _Progress(event.Listener):
+    """Logs a line a second while loops are compiled."""
+
+    def __init__(self) -> None:
+        self._begun: set[int] = set()
+        self._logged = float("-inf")
+
+    def on_start(self, event: Any) -> None:
+        """A function is about to be compiled; numba compiles some of its own."""
+        loop = event.data["dispatcher"]
+        if not any(loop is known for known in _LOOPS):
+            return
+        self._begun.add(id(loop))
+        if time.monotonic() - self._logged >= 1:
+            done = sum(bool(one.signatures) or id(one) in self._begun for one in _LOOPS)
+            _logger.info("compiling loop %d of %d", done, len(_LOOPS))
+            self._logged = time.monotonic()
+
+    def on_end(self, event: Any) -> None:
+        """The function is compiled."""
 
 
 def _wait(descriptor: int) -> None:

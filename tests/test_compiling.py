@@ -101,6 +101,7 @@ def test_a_second_start_compiles_nothing(package: Path) -> None:
     answer, log = start(package)
     assert (answer["result"], answer["compiled"]) == (EXPECTED, [1, 1])
     assert "compiling loops" in log
+    assert "compiling loop 1 of 2" in log
     (folder,) = (package.parent / ".numba_cache").glob("loops-*")
     assert Path(answer["path"]).is_relative_to(folder)
     assert folder.stat().st_mode & 0o777 == 0o700
