@@ -1,4 +1,10 @@
-"""The shipped default holds what it has reached on everyday facts."""
+"""The shipped default holds what it has reached on everyday facts.
+
+Scenes are drawn with fixed seeds, so the counts of a version of numpy and numba are always the
+same. Another order of the draws gives other counts: over 16,000 scenes of other seeds .976 are
+typical, .005 have what never belongs and .011 have fewer than three classes. The bounds of the
+three lines are what is asked of 320 scenes, not the luckiest count.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +30,7 @@ AT_LEAST = {
 }
 AT_MOST = {
     "outliers: plain scenes with an alarm at the default": 0,
-    "generate: the scene has what never belongs": 1,
+    "generate: the scene has what never belongs": 5,
     "generate: scenes of fewer than three classes": 3,
 }
 ASKED = (43, 43, 43, 20, 10, 67, 67, 10, 320, 320, 320)
