@@ -360,19 +360,15 @@ def _room_weights(weights: Weights, contexts: Floats) -> Floats:
     pull = np.concatenate([pull, np.zeros((len(pull), 1))], 1)
     rooms = weights["fantasy_rooms"]
     drawn, sizes = np.unique(np.where(rooms < 0, spec.C, rooms), return_counts=True)
-    under, log_z = pull[:, drawn], np.zeros(len(drawn))
-    mixture = np.zeros(len(pull))
+    # Both sums of the iteration as products: p(n | room) up to a factor of each sample.
+    top = pull[:, drawn].max(1)
+    share, log_z = np.exp(pull[:, drawn] - top[:, None]), np.zeros(len(drawn))
+    mixture = np.ones(len(pull))
     for _ in range(_ROOM_SWEEPS):
-        mixture = _log_sum_exp(under - log_z + np.log(sizes), axis=1)
-        before, log_z = log_z, _log_sum_exp(under - mixture[:, None], axis=0)
+        mixture = share @ (sizes * np.exp(-log_z))
+        before, log_z = log_z, np.log((1 / mixture) @ share)
         log_z -= log_z[0]
         if np.abs(log_z - before).max() < _SETTLED:
             break
-    return np.ascontiguousarray((pull[:, : spec.C] - mixture[:, None]).T.astype(np.float32))
-
-
-def _log_sum_exp(terms: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """As `np.logaddexp.reduce`, in a tenth of its time."""
-    top = terms.max(axis)
-    found: NDArray[np.float64] = top + np.log(np.exp(terms - np.expand_dims(top, axis)).sum(axis))
-    return found
+    log_mixture = top + np.log(mixture)
+    return np.ascontiguousarray((pull[:, : spec.C] - log_mixture[:, None]).T.astype(np.float32))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from functools import lru_cache
 from typing import Final
 
 _SEPARATORS: Final = re.compile(r"[\s_\-./'’‐-―]+")
@@ -113,6 +114,8 @@ def singular(word: str) -> str:
     return singular(stem)  # "childrens" is a double plural
 
 
+# The models of a store name mostly the same classes.
+@lru_cache(maxsize=16_384)
 def label_key(label: str) -> str:
     """The key under which every spelling of ``label`` is found; idempotent.
 

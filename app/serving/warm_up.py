@@ -31,9 +31,8 @@ def warm_up(artifact: Artifact) -> None:
     stand = [questions.relations(artifact, one) for one in scenes]
     missing = [entry for one in scenes for entry in questions.missing(artifact, one)]
     if len(scene.objects) > 1:
-        for one in (scene, bare):
-            questions.missing(artifact, one, at=("on-top", 0))
-            questions.missing(artifact, one, at=("under", 0))
+        questions.missing(artifact, bare, at=("on-top", 0))
+        questions.missing(artifact, scene, at=("under", 0))
     # With threshold 0 every object is an outlier: reasons and companions are asked for, too.
     _, outliers, misplaced = questions.outliers(artifact, scene, threshold=0.0)
     for one in scenes[1:]:
