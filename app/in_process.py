@@ -42,10 +42,10 @@ class InProcess(httpx.BaseTransport):
         store: directory of published models.
 
     Attributes:
-        admin_key: of this application, drawn anew.
+        admin_key: of this application; a new random key.
 
     Raises:
-        InvalidRequestError: the store is no directory.
+        InvalidRequestError: the store is not a directory.
     """
 
     def __init__(self, store: Path) -> None:

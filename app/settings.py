@@ -320,7 +320,7 @@ class Settings(BaseSettings):
     ) -> SecretStr | None:
         if value is not None and value == info.data.get("admin_key"):
             raise ValueError(
-                "SCENE_API_KEY must differ from SCENE_ADMIN_KEY: clients are no administrators"
+                "SCENE_API_KEY must differ from SCENE_ADMIN_KEY: clients are not administrators"
             )
         return value
 

@@ -20,11 +20,13 @@ from app.settings import Settings
 from scene_client.schemas import FieldError
 
 MAX_MEMBERS: Final = 32
-"""No object of any request has as many fields, and every field that is unknown is a fault to tell:
-a hundred times the memory of the request."""
+"""Most members of a JSON object; no request needs as many.
+
+Each unknown member is reported, which takes a hundred times its memory.
+"""
 
 SMALL: Final = 64 * 1024
-"""Bytes of a body that is accepted whatever else is held, if it has arrived when it is read.
+"""Bytes of a body that is always accepted, if it has arrived when it is read.
 
 Unfinished bodies of one client do not refuse the usual requests of the others.
 """

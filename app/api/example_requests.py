@@ -15,12 +15,12 @@ from app.api.catalogue import ProblemType
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A request and what comes of it.
+    """A request and its outcome.
 
     Attributes:
         summary: what it shows, for a list of them.
         value: the body.
-        problem: what it is refused with; None where it is answered.
+        problem: why it is refused; None where it is answered.
     """
 
     summary: str

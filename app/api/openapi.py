@@ -144,7 +144,7 @@ def _timeout_parameter(most: int) -> dict[str, Any]:
         "name": TIMEOUT_HEADER,
         "in": "header",
         "required": False,
-        "description": "milliseconds after which nobody waits for the answer: work that has not "
+        "description": "milliseconds that the client waits for the answer: work that has not "
         "begun by then is dropped (504)",
         "schema": {"type": "integer", "minimum": 1, "maximum": most},
         "examples": {"second": {"summary": "a second", "value": min(1000, most)}},

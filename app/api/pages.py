@@ -107,7 +107,7 @@ class Assets(StaticFiles):
     """Files with entity tags; those of a library, whose folder names its version, never change."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """A file, or 304 for who has it."""
+        """A file, or 304 where the browser has it."""
         response = await super().get_response(path, scope)
         if response.status_code in {200, 304}:
             # A browser that guesses how long to keep a module would mix those of two releases.

@@ -1,7 +1,7 @@
 """Traces for OpenTelemetry: the framework's own spans, off unless an operator asks for them.
 
 Traces alone: metrics are Prometheus' (`app/serving/metrics.py`), and log records would carry
-messages of exceptions out of the house.
+messages of exceptions to another system.
 """
 
 from __future__ import annotations

@@ -180,7 +180,7 @@ class GeneratedScene:
 
 @dataclass(frozen=True, slots=True)
 class ContextUnit:
-    """A hidden unit by what it stands for.
+    """A hidden unit by the classes that it favours.
 
     Attributes:
         unit: its number in the layer.
@@ -210,7 +210,7 @@ def strongest_reasons(
     Args:
         first: (n,) the first object of each class present.
         change: (N, n) by each class present.
-        rows: (N,) places of what is explained among the n; None where it is absent.
+        rows: (N,) places of the explained classes among the n; None for absent classes.
     """
     rows = np.zeros(0, np.int64) if rows is None else rows
     places, values = strongest(change, rows, REASONS)

@@ -1,4 +1,4 @@
-"""What each hidden unit stands for."""
+"""The classes that each hidden unit favours."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def missing(
             *and* stands so to that object.
         coverage: from 0 to 1; by default the model's. At 1 unlisted classes count as absent.
         axes: the viewer's, in the frame that offsets are answered in (`viewer_axes`); None where
-            nobody knows where the viewer looks.
+            the viewing direction is unknown.
         details: also say where each would stand, and what speaks for it.
 
     Raises:
@@ -153,7 +153,7 @@ def _at_place(
 
 
 def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, ...]]:
-    """The classes that are there and change the log-odds of what was found most."""
+    """The present classes that change the log-odds of each found class most."""
     if not len(given.present.classes):
         return [()] * len(found)
     explained = found[:EXPLAINED]
@@ -219,7 +219,7 @@ def placements(
     at: tuple[int, int, bool] | None = None,
     stated: Collection[tuple[int, int, int]] = (),
 ) -> list[tuple[Placement, ...]]:
-    """The likeliest relations of each candidate to what is present, best first.
+    """The likeliest relations of each candidate to the present objects, best first.
 
     All relations in both directions, to all but structure; instances of a class are spoken of by
     the first. No placement puts a candidate under an object that stands on another.
@@ -228,7 +228,7 @@ def placements(
         candidates: (N,) absent classes.
         axes: what offsets are answered in, see `offsets_of`.
         at: canonical relation, object, and whether the missing thing is its subject: the place that
-            was asked about comes first, spoken of by that object. Structure is no place of its own.
+            was asked about comes first, named by that object. Structure is never an anchor.
         stated: canonical relations between the objects of the scene.
     """
     present = given.present

@@ -1,4 +1,4 @@
-"""What a model believes about the rest of a scene, given what is known of it."""
+"""A model's probabilities for the rest of a scene, given its observed part."""
 
 from __future__ import annotations
 

@@ -218,7 +218,7 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
         log_counts: (P,) log of the instance pairs of both classes.
         classes: how many distinct ones the scene has.
         holds, of_classes: (P,) see `observed_pairs`; what either has is not expected.
-        least: leave out what is expected with less.
+        least: relations of a lower probability are left out.
 
     Returns:
         (k,) places, numbers of the expected relations, their probabilities, and those of the

@@ -1,8 +1,9 @@
-"""How do these objects stand to each other? And where does that differ from what is expected?
+"""How do these objects stand to each other? Which observed relations does the model not expect?
 
 Disagreements: a pair of objects of which some relation holds is judged once more as if nothing were
 known of how the two stand: with every relation between their classes unobserved, on or off, in both
-directions. Otherwise the observation would speak for itself: left holds, so front was seen not to.
+directions. Otherwise an observation would be evidence for itself: left holds, so front was seen
+not to.
 If the likeliest of the eight relations is then none of the observed ones, and likelier than not,
 the two disagree.
 
@@ -127,7 +128,7 @@ def _disagreements(
         given: the posterior of the scene.
         asked: (N, N) ordered pairs; a pair asked either way counts.
         top_k: at most so many.
-        min_probability: leave out what is expected with less.
+        min_probability: relations of a lower probability are left out.
     """
     A = artifact.spec.A
     stated = [triple for triple in scene.relations or () if triple[0] < A]

@@ -22,7 +22,7 @@ _TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
 
 
 def read_aliases(path: Path) -> dict[str, AliasTarget]:
-    """What each alias points at; nothing where there is no file.
+    """The target of each alias; empty without a file.
 
     Raises:
         StoreError: `invalid_aliases` where the file is not what `write_aliases` writes.

@@ -1,7 +1,7 @@
 """Writing files so that a crash leaves either the old state or the new one.
 
 A rename is atomic for readers at once, but survives a power cut only when the file's bytes were on
-disk before it and the directory's entry is on disk after it: hence every fsync here.
+disk before it and the directory's entry is on disk after it. Each fsync here serves this.
 """
 
 from __future__ import annotations

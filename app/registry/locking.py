@@ -16,7 +16,7 @@ from app.registry.errors import StoreError
 def exclusive(path: Path, timeout: float) -> Iterator[None]:
     """Hold the lock of a file, created where it is missing and left in place afterwards.
 
-    The kernel releases the lock when its holder ends, however it ends: nobody waits for the dead.
+    The kernel releases the lock when its holder ends, however it ends.
 
     Args:
         path: the lock file.

@@ -25,7 +25,7 @@ PREFIX: Final = "offsets."
 """Of the names of their tensors, which lie among the machine's."""
 
 NOTHING: Final = -1
-"""In place of a number of scenes: nothing is known of the relation."""
+"""In place of a number of scenes: training saw none of the relation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

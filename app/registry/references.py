@@ -45,7 +45,7 @@ Version = Annotated[str, AfterValidator(_require_version)]
 
 
 class AliasTarget(BaseModel):
-    """What an alias stands for: one version, or whatever is the latest (`version` null)."""
+    """The target of an alias: one version, or the latest (`version` null)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -87,7 +87,7 @@ def resolve_reference(
     Args:
         reference: alias, `name`, or `name@version`.
         aliases: by alias; an alias goes before a model of the same name.
-        versions: of a model, ascending; none where there is no such model.
+        versions: of a model, ascending; empty for an unknown model.
 
     Raises:
         StoreError: `invalid_reference`, `unknown_model`, `unknown_version` or `dangling_alias`.

@@ -80,7 +80,7 @@ class Store:
         return tuple(name for name in self._folders() if self._may_hold_versions(name))
 
     def versions(self, name: str) -> tuple[str, ...]:
-        """Published versions of a model, ascending; none where there is no such model.
+        """Published versions of a model, ascending; empty for an unknown model.
 
         A folder without a manifest is unfinished and does not count: the manifest is written last.
         Anything else under a version's name counts, so that a broken one is seen and reported.
@@ -212,7 +212,7 @@ class Store:
         *,
         expected: AliasTarget | Literal["any"] | None = "any",
     ) -> None:
-        """Point an alias at a version, or at whatever is the latest.
+        """Point an alias at a version, or at the latest.
 
         Args:
             alias: created where there is none.
@@ -307,7 +307,7 @@ class Store:
 
 
 def _appearance(path: Path) -> tuple[int, ...]:
-    """Inode, size and time of the last change; nothing where there is no such file."""
+    """Inode, size and time of the last change; () for a missing file."""
     try:
         status = path.lstat()
     except OSError:

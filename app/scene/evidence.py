@@ -1,7 +1,8 @@
 """What a scene tells a model of classes.
 
 Models speak of classes, scenes of instances: r[a, x, y] says that *some* instance of class x stands
-in relation a to some instance of class y. A pair of instances nobody listed never makes it false.
+in relation a to some instance of class y. A pair of instances that is not listed never makes it
+false.
 """
 
 from __future__ import annotations

@@ -21,12 +21,12 @@ def is_optical(frame_id: str) -> bool:
 
 
 def is_world_fixed(frame_id: str) -> bool:
-    """Whether a frame is fixed to the world ("map", "robot_1/odom"): its origin is no viewer."""
+    """Whether a frame is fixed to the world ("map", "robot_1/odom"): its origin is not a viewer."""
     return _plain(frame_id).rpartition("/")[2] in WORLD_FRAMES
 
 
 def _plain(frame_id: str) -> str:
-    # "MAP" or "map " is nobody's body frame: to take it for one would answer wrongly in silence.
+    # "MAP" and "map " are not body frames: read as such they would give wrong answers silently.
     return frame_id.strip().casefold()
 
 
@@ -79,7 +79,7 @@ def viewer_axes(frame_id: str | None = None, yaw: float | None = None) -> Axes |
         yaw: where the viewer looks; None = along x.
 
     Returns:
-        None in a frame fixed to the world where nobody said where the viewer looks.
+        None in a frame fixed to the world without a viewing direction.
     """
     if frame_id is not None and yaw is None and is_world_fixed(frame_id):
         return None

@@ -99,7 +99,7 @@ def derive_relations(
             nothing about it is observed.
         sizes: (n, 3) extents before the yaw; a row with NaN is a thing without a size.
         yaws: (n,) turn of each box about z; all zero by default.
-        horizontal: False where nobody knows the viewer: left and front stay unobserved.
+        horizontal: False where the viewer is unknown: left and front stay unobserved.
 
     Raises:
         ValueError: wrong shapes, infinite values, or sizes that are not positive.

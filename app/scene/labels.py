@@ -89,7 +89,7 @@ def head_of(label: str) -> str | None:
 
 
 def singular(word: str) -> str:
-    """The singular of a folded English noun; whatever is no plural is returned as it is.
+    """The singular of a folded English noun; a word that is not a plural is returned as it is.
 
     Regular endings (-ies, -ches, -shes, -xes, -sses, -oes, -s) and a short list of irregular ones.
     Compared with a general inflection library in docs/decisions/data.md.

@@ -33,7 +33,7 @@ class has a name half as long, and the cost of a comparison grows with the lengt
 
 _LEAST: Final = 0.6  # "asdf" is not a misspelt "scarf"
 _BY_KIND: Final = 0.95  # of a name without its words for looks
-_BY_REST: Final = 0.9  # people rarely mistype the first letter: a pocket is no socket
+_BY_REST: Final = 0.9  # people rarely mistype the first letter: a pocket is not a socket
 _FARTHER: Final = 0.1  # a suggestion this much less similar than the best one is noise
 
 

@@ -58,8 +58,8 @@ class Scene:
 
     Attributes:
         objects: the things; their positions in this tuple name them in ``relations``.
-        relations: canonical triples (relation, subject, object) that hold; None = nobody gave any.
-        relations_complete: whatever is not listed in ``relations`` does not hold.
+        relations: canonical triples (relation, subject, object) that hold; None: not given.
+        relations_complete: relations missing from ``relations`` do not hold.
         room_type: index of the room type in the model's vocabulary; None if unknown.
         poses: relations derived from poses (see `app.scene.observe`), which also say what was seen
             *not* to hold. They take the place of ``relations`` as evidence, and ``relations`` are

@@ -138,7 +138,7 @@ class Vocabulary:
     def index(self, label: str) -> int | None:
         """The class a label names under any accepted spelling; None if there is none.
 
-        A phrase that is no name itself means its head: "bottle of milk" is a bottle (`head_of`).
+        A phrase that is not a name itself means its head: "bottle of milk" is a bottle (`head_of`).
         """
         found = self._by_spelling.get(label)
         if found is None:

@@ -155,7 +155,7 @@ def generate(envelope: Answer, seed: int, drawn: Sequence[questions.GeneratedSce
 
 
 def written(answer: Any) -> bytes:
-    """An answer, or whatever holds some, as JSON.
+    """An answer, or a container of answers, as JSON.
 
     Raises:
         ValueError: a number in it is not finite.

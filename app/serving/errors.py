@@ -70,7 +70,7 @@ class DeadlinePassedError(ServingError):
 
 
 class DisconnectedError(ServingError):
-    """Nobody waits for the answer any more."""
+    """The client has left."""
 
 
 class DrainingError(ServingError):

@@ -195,7 +195,7 @@ class Request(Ticket):
 
 
 def _kind_of_cost(name: str, scene: Scene, parameters: Mapping[str, object]) -> str:
-    """The same for questions that cost alike, whatever the number of objects.
+    """The same for questions of about one cost for any number of objects.
 
     The cost also depends on the number of classes, of related classes and of related pairs: one
     class is cheap and thirty are not, and so are relations of one pair and of all.

@@ -171,7 +171,7 @@ class Runtime:
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
         check_cache()
-        # Nobody waits yet, and a thread of its own costs time and memory.
+        # No request waits yet, and another thread would cost time and memory.
         self._serve(self._load(None))
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
@@ -341,12 +341,12 @@ def _names(keys: Iterable[Key]) -> list[str]:
 
 
 def _settle_memory() -> None:
-    """Take what is long-lived out of the collector's sight.
+    """Exclude long-lived objects from garbage collection.
 
-    A full collection stops the world for tens of milliseconds. What a replaced snapshot
-    left frozen must be thawed first, or its cycles would never be freed. At the start, which the
-    collector sits out, there is none. Pages that loading has left empty go back to the system,
-    where the C library can do that: some 30 MB.
+    A full collection stops every thread for tens of milliseconds. Frozen objects of a replaced
+    snapshot are unfrozen first, or their cycles would never be freed; at the start there are none.
+    Pages that loading has left empty go back to the system, where the C library can do that: some
+    30 MB.
     """
     gc.unfreeze()
     if gc.isenabled():

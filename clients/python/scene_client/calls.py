@@ -183,7 +183,7 @@ def _segment(name: str) -> str:
 
 
 def _json(request: BaseModel) -> str:
-    # What was not said is left out: an older service may not know the field.
+    # Fields that were not set are left out: an older service may not know them.
     return request.model_dump_json(exclude_unset=True)
 
 

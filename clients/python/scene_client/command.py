@@ -90,7 +90,7 @@ class Asked:
         """A client of whatever shall answer."""
         if self.store is not None:
             return OfflineClient(self.store, timeout=self.timeout, model=self.model)
-        # Keys are no options: other users of a machine see those.
+        # Keys are not options: other users of a machine can read the options of a process.
         key = os.environ.get("SCENE_API_KEY") or None
         return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
 
@@ -134,7 +134,7 @@ def main(
         typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
-    """Keep what holds for every question."""
+    """Keep the options that hold for every question."""
     context.obj = Asked(url, model, offline, timeout, json)
 
 
@@ -351,7 +351,7 @@ def _request(
     from_nothing: bool = False,
     **options: Any,
 ) -> dict[str, Any]:
-    """The body of a request; options beside a file take the place of what stands there."""
+    """The body of a request; options override the fields of a file."""
     files = [thing for thing in things or () if _is_file(thing)]
     if files and things != files[:1]:
         _fail(f"{files[0]} must stand alone: it is a whole scene", MEANINGLESS)

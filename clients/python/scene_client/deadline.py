@@ -20,7 +20,7 @@ import httpcore
 import httpx
 
 MAX_CONNECTIONS: Final = 100
-"""At once; who asks beyond that waits for one, within the call's time."""
+"""At once; further calls wait for a free connection, within their own time."""
 
 KEEP_ALIVE: Final = 4.0
 """Seconds that an idle connection is kept: uvicorn closes it after five, and a request that crosses

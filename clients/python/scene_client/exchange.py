@@ -169,7 +169,7 @@ def problem_of(outcome: Received) -> ProblemError:
             request_id=problem.request_id,
             retry_after=retry_after,
         )
-    # Of a proxy, or of something else altogether: its words are nobody's contract.
+    # Of a proxy or another server: the wording of such an answer may change at any time.
     try:
         title = HTTPStatus(outcome.status).phrase
     except ValueError:

@@ -15,7 +15,7 @@ import math
 from typing import Final, Literal, TypeAlias
 
 Box: TypeAlias = tuple[float, float, float, float]
-"""(xmin, ymin, xmax, ymax), y downwards; one with NaN is unseen, and nobody's neighbour."""
+"""(xmin, ymin, xmax, ymax), y downwards; one with NaN is unseen and has no neighbour."""
 
 MIN_OFFSET: Final = 0.10  # of the mean diagonal
 

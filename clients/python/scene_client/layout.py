@@ -15,7 +15,7 @@ from scene_client.schemas import Relation
 
 HEIGHT: Final = 1.0
 GAP: Final = 0.6
-"""Between what stands side by side, and between what hovers and what is below it."""
+"""Between objects side by side, and between a hovering object and the one below it."""
 
 # Each opposite as the relation that is drawn, whose subject and object change places.
 _OPPOSITES: Final = {"right": "left", "behind": "front", "under": "on-top", "below": "above"}
@@ -39,13 +39,13 @@ def extent(boxes: Sequence[Box]) -> tuple[float, float]:
 
 
 class _Order:
-    """Who comes before whom, free of circles."""
+    """The order of the objects along one axis, without cycles."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._before: dict[str, list[str]] = {name: [] for name in names}
 
     def add(self, first: str, second: str) -> None:
-        """``first`` comes before ``second``, unless that closes a circle."""
+        """``first`` comes before ``second``, unless that closes a cycle."""
         if not self._comes_before(second, first):
             self._before[second].append(first)
 
@@ -117,7 +117,7 @@ def _drawn(relation: Relation) -> tuple[str, str, str]:
 
 
 def _supporters(stated: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
-    """What each object stands on or hovers above, each on one thing and none on itself."""
+    """The object that each object stands on or hovers above; none stands on itself."""
     below: dict[str, tuple[str, str]] = {}
     for wanted in ("on-top", "above"):
         for subject, relation, object in stated:

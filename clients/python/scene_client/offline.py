@@ -21,7 +21,7 @@ class OfflineClient(Client):
 
     Raises:
         ImportError: the service's packages are not installed.
-        InvalidRequestError: the store is no directory.
+        InvalidRequestError: the store is not a directory.
     """
 
     def __init__(

@@ -58,14 +58,14 @@ class Options:
         return seconds
 
     def ssl_context(self) -> ssl.SSLContext:
-        """Whom to trust: those the system's bundle names, and nobody where nothing is encrypted."""
+        """Trusted certificates: the system's bundle; none without encryption."""
         if urlsplit(self.url).scheme == "https":
             return httpx.create_ssl_context()
         # Reading the bundle takes longer than a question.
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 
     def named(self, model: str | None) -> str:
-        """The model that is meant where one is named or none."""
+        """The named model, else that of the options, else the default."""
         return model or self.model or "default"
 
     def address(self, call: Call[T]) -> str:
@@ -85,11 +85,11 @@ class Options:
 
     def headers(self, call: Call[T]) -> dict[str, str]:
         """The headers of a call."""
-        # As it is: what is unpacked could be of any size.
+        # Not compressed: a small compressed body could unpack to any size.
         headers = {"Accept": "application/json", "Accept-Encoding": "identity"}
         if call.body is not None:
             headers["Content-Type"] = "application/json"
-        # The admin key goes where it is needed and nowhere else.
+        # The admin key is sent to administrative routes only.
         if call.administers and self.admin_key is not None:
             headers["X-Admin-Key"] = self.admin_key
         elif self.api_key is not None:

@@ -1,4 +1,4 @@
-"""Reading ROS messages in whatever form they come: as JSON by rosbridge, or as Python objects.
+"""Reading ROS messages in either form: as JSON by rosbridge, or as Python objects.
 
 rclpy and the readers of bags give objects with attributes, rosbridge gives dictionaries in which
 NaN and infinity are null. A field that is not there, or not of its kind, is None here: what
@@ -39,7 +39,7 @@ def items(field: Any, name: str) -> Sequence[Any]:
     """The entries of a list of messages; none where the list was left out.
 
     Raises:
-        MessageError: it is no list.
+        MessageError: it is not a list.
     """
     if field is None:
         return ()
@@ -73,7 +73,7 @@ def numbers(message: Any, names: str) -> tuple[float, ...] | None:
 
 
 def text(field: Any) -> str:
-    """Text without surrounding blanks; numbers as they are written, whatever else is empty."""
+    """Text without surrounding blanks; numbers as they are written; other values are empty."""
     if isinstance(field, str):
         return field.strip()
     whole = integer(field)

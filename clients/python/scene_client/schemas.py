@@ -189,7 +189,7 @@ class SceneRequest(Request):
             # Of so many, each wrong in many ways: a list of all faults would take a hundred times
             # the memory of the request.
             fail_fast=True,
-            description="relations that hold; whatever is not listed is unobserved, unless "
+            description="relations that hold; relations not listed are unobserved, unless "
             "`relations_complete`. Left out, they are derived from positions; an empty list says "
             "that none is known and derives none",
         ),
@@ -413,7 +413,7 @@ class Answer(Reply):
         ),
     ] = []
     warnings: Annotated[
-        list[SceneWarning], Field(description="what is probably a mistake in the scene")
+        list[SceneWarning], Field(description="probable mistakes in the scene")
     ] = []
     observed_relations: Annotated[
         list[ObservedRelation] | None,
@@ -660,7 +660,7 @@ AnswerT = TypeVar("AnswerT", bound=Answer)
 
 
 class BatchEntry(Reply, Generic[AnswerT]):
-    """What became of one scene: a `result`, or the `problem` it would have met alone."""
+    """The outcome of one scene: a `result`, or the `problem` it would have met alone."""
 
     status: int
     result: AnswerT | None = None

@@ -27,7 +27,7 @@ MOST_MISPLACED: Final = 10
 
 
 def relations(answer: RelationsAnswer) -> RenderableType:
-    """Relations, best first, and what was stated and is not believed."""
+    """Relations, best first, and stated relations that the model does not expect."""
     rows = [
         (
             entry.subject,
@@ -72,7 +72,7 @@ def missing(answer: MissingAnswer) -> RenderableType:
 
 
 def outliers(answer: OutliersAnswer) -> RenderableType:
-    """Every object, least fitting first, with why, and what was given likely wrongly."""
+    """Every object, least fitting first, with reasons, and the likely wrong relations."""
     rows = [
         (
             entry.object,
@@ -154,7 +154,7 @@ def models(answer: ModelList) -> RenderableType:
 
 
 def contexts(answer: ContextsAnswer) -> RenderableType:
-    """Hidden units by what they go with."""
+    """Hidden units by the classes that they favour."""
     rows = [
         (layer, str(unit.unit), _weighted(unit.objects), _weighted(unit.room_types))
         for layer, units in answer.layers.items()

@@ -54,7 +54,7 @@ Reason = Literal[
 
 
 class Note(NamedTuple):
-    """What became of a detection that did not go into the request as it is.
+    """A detection that was left out or changed, and why.
 
     Attributes:
         detection: its place in the message; None for what is said of the whole.
@@ -100,8 +100,8 @@ def from_detection3d_array(
     Args:
         message: a vision_msgs/Detection3DArray.
         label_map: what the class ids mean, see `read_label_map`; text that it lacks is a label.
-        min_score: leave out whatever its detector is less sure of.
-        boxes: False for detectors whose boxes are no boxes in space, but pixels: positions are then
+        min_score: detections of a lower score are left out.
+        boxes: False for detectors whose boxes are pixels, not boxes in space: positions are then
             those of the hypotheses, and extents unknown.
         viewpoint: where the robot stands in the frame of the detections, (x, y, yaw). Needed for
             left and front in map, odom or world; else the origin of the frame, looking along x.
@@ -338,7 +338,7 @@ class _Reader:
         return found
 
     def image_relations(self, ids: list[str]) -> list[dict[str, str]]:
-        """What stands left of what, among neighbours in the image."""
+        """Left and right between neighbours in the image."""
         boxes = [self._image_box(seen) for seen in self.sightings]
         # Where there are more than a request holds, those of the surest things.
         order = sorted(range(len(ids)), key=lambda i: -self.sightings[i].confidence)
@@ -381,7 +381,7 @@ class _Reader:
         return middle[0] - across, middle[1] - down, middle[0] + across, middle[1] + down
 
     def finish(self, fields: dict[str, Any], unknown_labels: str) -> SceneFields:
-        """Add what stands in the header."""
+        """Add frame and time of the header."""
         if unknown_labels not in ("error", "ignore", "nearest"):
             raise MessageError("unknown_labels must be 'error', 'ignore' or 'nearest'")
         fields["unknown_labels"] = unknown_labels
