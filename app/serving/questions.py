@@ -9,7 +9,7 @@ from dataclasses import replace
 from app import questions
 from app.scene.frames import viewer_axes
 from app.scene.relations import opposite
-from app.serving import answer_size, answers
+from app.serving import answers
 from app.serving.answers import Answer
 from app.serving.errors import Location, Reason
 from app.serving.models import ServedModel
@@ -39,8 +39,8 @@ async def relations(request: Request, asked: RelationsRequest) -> Answer:
         pairs=None if asked.pairs is None else _pairs(asked, reading),
         include_opposites=asked.include_opposites,
     )
-    size = answer_size.of_relations(found, disagreements)
-    answer_size.require(size, reading, request.limits.answer_bytes, "top_k")
+    size = answers.size_of_relations(found, disagreements)
+    answers.require_size(size, reading, request.limits.answer_bytes, "top_k")
     envelope = answers.envelope(asked, request.id, model.reference, reading)
     return answers.relations(
         envelope, found, disagreements, reading, min_probability=asked.min_probability
@@ -74,8 +74,8 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
         axes=viewer_axes(asked.frame_id, None if viewpoint is None else viewpoint.yaw),
         coverage=asked.coverage,
     )
-    size = answer_size.of_missing(found)
-    answer_size.require(size, reading, request.limits.answer_bytes, "top_k")
+    size = answers.size_of_missing(found)
+    answers.require_size(size, reading, request.limits.answer_bytes, "top_k")
     coverage = asked.coverage
     if coverage is None:
         coverage = model.artifact.calibration.coverage
@@ -93,8 +93,8 @@ async def outliers(request: Request, asked: OutliersRequest) -> Answer:
         sensitivity=asked.sensitivity,
         threshold=asked.threshold,
     )
-    size = answer_size.of_outliers(found)
-    answer_size.require(size, reading, request.limits.answer_bytes, "objects")
+    size = answers.size_of_outliers(found)
+    answers.require_size(size, reading, request.limits.answer_bytes, "objects")
     envelope = answers.envelope(asked, request.id, model.reference, reading)
     return answers.outliers(envelope, found, reading)
 
@@ -118,8 +118,8 @@ async def generate(request: Request, asked: GenerateRequest) -> Answer:
         )
 
     drawn = await request.draw(asked.count, model, "generate", draw)
-    size = answer_size.of_generated(drawn)
-    answer_size.require(size, reading, request.limits.answer_bytes, "count")
+    size = answers.size_of_generated(drawn)
+    answers.require_size(size, reading, request.limits.answer_bytes, "count")
     envelope = answers.envelope(asked, request.id, model.reference, reading)
     return answers.generate(envelope, seed, drawn)
 

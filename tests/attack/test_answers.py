@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from app.serving import answer_size
+from app.serving import answers
 from scene_client.schemas import MAX_BATCH
 from tests.http.stores import VOCABULARY
 from tests.services import launch, serve
@@ -100,9 +100,9 @@ async def test_no_answer_is_larger_than_estimated(
     sizes: list[int] = []
 
     def note(size: Any, reading: Any, *_: Any) -> None:
-        sizes.append(answer_size.estimate(size, reading, reading.longest_name()))
+        sizes.append(answers.estimated_size(size, reading, reading.longest_name()))
 
-    monkeypatch.setattr(answer_size, "require", note)
+    monkeypatch.setattr(answers, "require_size", note)
     for variant in ("", "plain", "deep"):
         asked = {**body, **({"model": variant} if variant else {}), "frame_id": "f" * 256}
         answer = await client.post(f"/{question}", json=asked)
