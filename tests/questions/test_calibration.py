@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.questions import missing, outliers, relations
-from app.questions.calibration import exclusive, relation_probability
+from app.questions.calibration import relation_probability
 from app.registry.description import Calibration, CountSlope, PairSlope, Slope
 from app.registry.slopes import RelationSlopes
 from tests.questions.artifacts import larger_artifact, scene_of
@@ -18,23 +18,6 @@ from tests.questions.artifacts import larger_artifact, scene_of
 
 def sigmoid(x: float) -> float:
     return 1 / (1 + math.exp(-x))
-
-
-def test_relations_have_a_calibration_each():
-    entries = tuple(
-        PairSlope(intercept=a, slope=1 + a, log_count=-a, log_classes=0.5 * a) for a in range(4)
-    )
-    log_odds = np.arange(16.0).reshape(4, 2, 2) / 8 - 1
-    log_count = np.array([[0.0, 0.5], [1.0, 2.0]])
-    slopes = RelationSlopes.of(Calibration(relation=entries)).alone
-    p = relation_probability(slopes, log_odds.reshape(1, 4, 4), log_count.reshape(4), 7)
-    p = p.reshape(4, 2, 2)
-    for a in range(4):
-        for x in range(2):
-            for y in range(2):
-                z = a + (1 + a) * float(log_odds[a, x, y]) - a * float(log_count[x, y])
-                z += 0.5 * a * math.log(7)
-                assert float(p[a, x, y]) == pytest.approx(sigmoid(z), abs=1e-6)
 
 
 @given(
@@ -74,12 +57,6 @@ def test_placements_have_entries_of_their_own(own):
     assert list(p) == [pytest.approx(sigmoid(-1 - 0.5 * math.log(4)), abs=1e-6)]
 
 
-def test_exclusive_scales_only_where_it_must():
-    forward, backward = exclusive(np.array([0.9, 0.2, 1.0]), np.array([0.6, 0.3, 1.0]))
-    assert forward.tolist() == pytest.approx([0.6, 0.2, 0.5])
-    assert backward.tolist() == pytest.approx([0.4, 0.3, 0.5])
-
-
 def test_instances_count_in_relations():
     """Three chairs and two lamps: log 6 a pair of classes, log 9 among the chairs."""
     entry = PairSlope(intercept=-2.0, slope=0.0, log_count=-0.5)
@@ -88,14 +65,6 @@ def test_instances_count_in_relations():
     p = {(a.subject, a.object): a.probability for a in answers}
     assert p[0, 3] == pytest.approx(sigmoid(-2 - 0.5 * math.log(6)), abs=1e-6)
     assert p[0, 1] == pytest.approx(sigmoid(-2 - 0.5 * math.log(9)), abs=1e-6)
-
-
-def test_placements_use_the_calibration_of_relations():
-    entry = PairSlope(intercept=-1.0, slope=0.0, log_count=0.25)
-    artifact = larger_artifact("triway-local", relation=(entry,) * 4)
-    for answer in missing(artifact, scene_of([3, 3])):
-        for place in answer.placements:
-            assert place.probability == pytest.approx(sigmoid(-1 + 0.25 * math.log(2)), abs=1e-6)
 
 
 def test_intruders_by_log_odds_and_size():

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import copy
 import math
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -96,27 +94,6 @@ def test_scenes_are_the_same_in_any_company(artifact, name):
     )
 
 
-PROGRAM = """
-from app.questions import generate
-from tests.questions.artifacts import larger_artifact
-from tests.questions.test_chain_scenes import SCENES
-for scene, options in SCENES.values():
-    artifact = larger_artifact("triway-wide", scale=0.3)
-    print(generate(artifact, scene, count=3, seed=5, steps=6, **options))
-"""
-
-
-def test_scenes_are_the_same_in_another_process(artifact, repository):
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], cwd=repository, capture_output=True, text=True, check=True
-    )
-    expected = [
-        str(generate(artifact, scene, count=3, seed=5, steps=6, **options))
-        for scene, options in SCENES.values()
-    ]
-    assert done.stdout.splitlines() == expected
-
-
 @pytest.mark.parametrize("name", SCENES)
 def test_the_score_is_that_of_the_tensors(artifact, name):
     scene, options = SCENES[name]
@@ -179,35 +156,3 @@ def test_other_threads_go_on_while_a_chain_runs(artifact):
         turns += thread.is_alive()
     thread.join()
     assert turns > 5
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_fewer_sweeps_are_the_beginning_of_more(artifact, monkeypatch, name):
-    """Whoever asks with a growing number of sweeps and the same seed sees one chain at work."""
-    scene, options = SCENES[name]
-    states = []
-    sweeps = chain_kernels.sweeps
-
-    def one_by_one(*arguments):
-        *fixed, uniform, on, h1, h2 = arguments
-        for row in uniform:
-            sweeps(*fixed, row[None], on, h1, h2)
-            states.append((on.copy(), h1.copy()))
-
-    with monkeypatch.context() as patched:
-        patched.setattr(chain_kernels, "sweeps", one_by_one)
-        generate(artifact, scene, seed=5, steps=6, **options)
-    assert len(states) == 6
-    assert len({h1.tobytes() for _, h1 in states}) > 1
-    evidence = {thing.label for thing in scene.objects}
-    words = artifact.vocabulary
-    for steps, (on, h1) in enumerate(states, start=1):
-        (drawn,) = generate(artifact, scene, seed=5, steps=steps, **options)
-        present = {words.labels[index] for index in np.flatnonzero(on)}
-        shown = {label for label in present if label in evidence or not is_structure(words, label)}
-        assert set(drawn.objects) == shown
-        assert drawn.context == {"h1": tuple(np.flatnonzero(h1).tolist())}
-
-
-def is_structure(words, label):
-    return bool(words.structure[words.labels.index(label)])

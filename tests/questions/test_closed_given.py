@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from app.inference.relations import Given
-from app.questions import misplaced, missing, outliers, relations
 from app.questions.posterior import Posterior, posterior
 from app.scene import Scene, SceneObject, derive_relations
 from tests.questions.artifacts import larger_artifact, scene_of
@@ -194,45 +193,3 @@ def test_what_relations_imply_is_that_of_the_machine():
         np.testing.assert_allclose(shift.ravel(), expected, rtol=1e-4, atol=1e-4)
         expected = machine.implied(edges, told, mean, apart=True)[0].numpy()
         np.testing.assert_allclose(apart.ravel(), expected, rtol=1e-4, atol=1e-4)
-
-
-def test_the_same_scene_gets_the_same_bits(scene):
-    def ask():
-        return (
-            relations(ARTIFACT, scene),
-            missing(ARTIFACT, scene),
-            missing(ARTIFACT, scene, at=("on-top", 0)),
-            outliers(ARTIFACT, scene),
-            misplaced(ARTIFACT, scene),
-        )
-
-    first = ask()
-    missing(ARTIFACT, SCENES["several"])
-    assert ask() == first
-
-
-def test_reasons_cost_what_the_posterior_says():
-    """Complete relations count, though none is listed; so do those that the seed form sums out."""
-    bare, complete = scene_of([0, 5, 6]), SCENES["nothing holds"]
-    assert posterior(ARTIFACT, bare).unit_count == 0
-    assert posterior(ARTIFACT, complete).unit_count == 4 * 3 * 2
-    assert posterior(larger_artifact("triway-seed"), bare).unit_count == 36
-
-
-def test_what_a_given_relation_says_of_itself_is_taken_out_to_first_order(pair, monkeypatch):
-    """Where it says little: against taking it out of every hidden unit."""
-    closed = pair[0]
-    found = sigmoid(closed.relation_log_odds())
-    monkeypatch.setattr("app.inference.posterior._GENTLE", 0.0)
-    exact = sigmoid(closed.relation_log_odds())
-    assert np.abs(found - exact).max() < 0.001
-    # Left in, it would be seen.
-    monkeypatch.setattr("app.inference.posterior._GENTLE", np.inf)
-    slopes = closed._context.slopes
-    object.__setattr__(closed._context, "slopes", np.zeros_like(slopes))
-    del closed._between
-    left_in = sigmoid(closed.relation_log_odds())
-    gentle = np.zeros_like(exact, dtype=bool)
-    given = closed._context.given
-    gentle[given.a, given.i, given.j] = (np.abs(slopes) > 0.1) & (np.abs(slopes) < 0.5)
-    assert not gentle.any() or np.abs(left_in - exact)[gentle].max() > 0.002

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from app.scene import Scene, SceneObject, derive_relations
-from tests.questions.artifacts import LARGER, exact_artifact, larger_artifact, scene_of
+from tests.questions.artifacts import LARGER, larger_artifact, scene_of
 from training.machines.arrays import machine_of
 from training.oracle.evidence import draw_context, observe
-from training.oracle.units import NO_UNIT, mean_log_p, units_between
+from training.oracle.units import units_between
 
 
 def triples_of(edges, values):
@@ -18,17 +18,6 @@ def triples_of(edges, values):
     return {
         (int(edges.relation[0, e]), int(edges.subject[0, e]), int(edges.object[0, e])) for e in on
     }
-
-
-@pytest.mark.parametrize("name", LARGER)
-def test_classes_counts_and_positions(name):
-    found = observe(machine_of(larger_artifact(name).weights), scene_of([5, 0, 5, 3, 5]))
-    assert found.classes.tolist() == [0, 3, 5]
-    assert found.counts.tolist() == [1, 1, 3]
-    assert found.row.tolist() == [2, 0, 2, 1, 2]
-    assert found.first.tolist() == [1, 3, 0]
-    assert found.evidence.v.nonzero()[:, 1].tolist() == [0, 3, 5]
-    assert found.present.nonzero().flatten().tolist() == [0, 3, 5]
 
 
 @pytest.mark.parametrize("name", LARGER)
@@ -87,11 +76,6 @@ def test_taking_classes_out_takes_their_relations_out(name):
         assert kept == {t for t in whole if not gone & set(t[1:])}
 
 
-def test_a_machine_of_fewer_relations_passes_over_the_others():
-    machine = machine_of(exact_artifact("triway-local").weights)
-    assert observe(machine, scene_of([0, 1], [(2, 0, 1)])).units is None
-
-
 @pytest.mark.parametrize("name", LARGER)
 def test_units_between_any_classes(name):
     """The grid and the flat layout name the same units."""
@@ -113,23 +97,6 @@ def test_units_between_any_classes(name):
     there = torch.zeros(len(names), dtype=torch.bool)
     there[units.place[units.exists]] = True
     assert torch.equal(flat, torch.where(there, names.double(), 0.0))
-
-
-def test_a_machine_without_any_unit():
-    machine = machine_of(larger_artifact("rbm").weights)
-    empty = type(machine)(type(machine.spec)("rbm", V=9, A=4, H1=6))
-    units = units_between(empty, torch.arange(3), torch.arange(2))
-    assert torch.equal(units.grid(torch.zeros(5, 0), NO_UNIT), torch.full((5, 4, 3, 2), NO_UNIT))
-
-
-def test_both_tails_of_a_probability_keep_their_digits():
-    weight = torch.full((2, 1), 0.5)
-    logits = torch.tensor([[-80.0, 20.0, 0.0], [-80.0, 22.0, 0.0]])
-    on, off = mean_log_p(weight, logits)
-    exact = logits.double().sigmoid().mean(0).log()
-    rest = logits.double().neg().sigmoid().mean(0).log()
-    torch.testing.assert_close(on.double(), exact, atol=1e-4, rtol=1e-6)
-    torch.testing.assert_close(off.double(), rest, atol=1e-4, rtol=1e-6)
 
 
 def test_many_relations_get_fewer_draws(monkeypatch):

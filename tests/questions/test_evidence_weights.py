@@ -69,13 +69,6 @@ def test_without_weight_objects_are_judged_as_without_relations(name, kind):
         assert np.abs(with_all - other).max() > 1e-3
 
 
-def test_in_closed_form_to_the_bit(kind):
-    found = about_objects(asked("triway-wide", kind, 0.0))
-    bare = about_objects(asked("triway-wide", kind, scene=BARE))
-    for one, other in zip(found, bare, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_each_weight_is_for_its_own_questions(name, kind):
     full = asked(name, kind)
     objects, relations = (asked(name, kind, *weights) for weights in ((0.3, 1.0), (1.0, 0.3)))

@@ -199,21 +199,6 @@ def machine_rows(joint):
     return joint.machine.edges(torch.arange(3).expand(len(joint.v), -1))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", DRAWN)
-def test_a_hot_chain_wanders_and_a_cold_one_settles(name):
-    """At a high temperature every set of three classes is as likely as any other; near zero the
-    chains end in few of them."""
-    artifact, _ = drawable(name)
-    hot = label_sets(
-        generate(artifact, scene_of([]), count=2048, seed=1, steps=10, temperature=1e6)
-    )
-    cold = label_sets(
-        generate(artifact, scene_of([]), count=2048, seed=1, steps=60, temperature=0.05)
-    )
-    assert len(set(cold)) < len(set(hot)) == 8
-
-
 @pytest.mark.parametrize("name", EXACT)
 def test_the_log_score_is_the_log_probability_up_to_a_constant(name):
     """One layer, so exact: seed form against log p(v, r), local form against log p(v) and
@@ -271,8 +256,3 @@ def test_two_layers_score_below_their_sum():
 def test_bad_input_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         generate(ARTIFACTS["triway-local"], scene_of([0]), **({"seed": 0} | options))
-
-
-def test_a_machine_without_a_second_layer_has_none_to_hold():
-    with pytest.raises(ValueError, match="h2"):
-        generate(ARTIFACTS["rbm"], scene_of([0]), seed=0, context={"h2": []})

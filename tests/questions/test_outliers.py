@@ -33,17 +33,6 @@ def test_popularity_counts_by_its_weight():
         assert probabilities == sorted(probabilities, reverse=True)
 
 
-def test_popular_classes_are_suspected_first_where_all_else_is_alike():
-    """At a large popularity of one class and alpha = 1 that class comes first."""
-    scene = scene_of([0, 1, 2, 3])
-    for popular in (0, 1, 2, 3):
-        popularity = tuple(50.0 * (k == popular) for k in range(len(LABELS)))
-        artifact = larger_artifact(
-            "triway-local", outlier=LINE, popularity=popularity, popularity_weight=1.0
-        )
-        assert outliers(artifact, scene).outliers[0].object == popular
-
-
 @pytest.mark.parametrize("name", VARIANTS)
 def test_a_higher_sensitivity_raises_every_alarm_of_a_lower_one(name):
     artifact = larger_artifact(

@@ -19,9 +19,3 @@ def test_largest_first_and_ties_by_position(entries, count):
     usable = np.array([choice for _, choice in entries], dtype=np.bool_)
     expected = [k for k in np.argsort(-values, kind="stable").tolist() if usable[k]]
     assert best(values, usable, count).tolist() == expected[:count]
-
-
-def test_a_whole_sort_of_many():
-    values = np.random.default_rng(0).integers(0, 500, 20_000).astype(np.float32)
-    found = best(values, np.ones(len(values), dtype=np.bool_), len(values))
-    assert found.tolist() == np.argsort(-values, kind="stable").tolist()

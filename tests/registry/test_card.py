@@ -70,10 +70,6 @@ def test_a_source_is_a_column_and_a_figure_stands_once() -> None:
     assert "- misplaced: the relation is false" in page
 
 
-def test_says_so_where_nothing_was_measured() -> None:
-    assert "nothing is known of how well" in card(metrics=[])
-
-
 def test_text_stays_in_its_cell() -> None:
     hostile = source("a|b\n\n# Heading", research_only=True)
     page = card(data=[hostile])

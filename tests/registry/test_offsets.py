@@ -59,12 +59,6 @@ def test_a_relation_that_no_scene_showed_means_nothing() -> None:
     assert found(1, 1, 0)[1] == found(3, 0, 2)[1] == -1
 
 
-def test_many_are_looked_up_at_once() -> None:
-    values, scenes = offsets().find(np.array([2, 0, 1]), np.array([1, 1, 0]), np.array([0, 0, 1]))
-    assert scenes.tolist() == [12, 1, -1]
-    assert values[1].tolist() == list(BESIDE)
-
-
 def test_without_a_pair_there_is_still_the_relation() -> None:
     nothing = np.zeros(0, np.int64)
     bare = offsets(pair=nothing, pair_offset=np.zeros((0, 6), "f4"), pair_scenes=nothing)
@@ -81,15 +75,6 @@ def test_they_come_back_with_the_artifact(tmp_path: Path) -> None:
         assert name not in artifact.manifest.weights
     assert artifact.manifest.weights.keys() == state().keys()
     assert "| Offsets | in metres, of 2 pairs of classes |" in artifact.card
-
-
-def test_they_are_no_weights(tmp_path: Path) -> None:
-    write_artifact(tmp_path / "b", description(), state(), storage_dtype="float16")
-    cards = written(tmp_path / "a").card, load_artifact(tmp_path / "b").card
-    lines = [line for card in cards for line in card.splitlines()]
-    weights = [line for line in lines if line.startswith("| Weights |")]
-    assert len(weights) == 2
-    assert weights[0] == weights[1]
 
 
 def test_an_artifact_without_them_loads_in_either_format(tmp_path: Path) -> None:

@@ -64,10 +64,6 @@ def test_complete_relations_observe_every_pair_of_instances() -> None:
     assert not found.observed[:, 1, 1].any()
 
 
-def test_no_relations_observe_nothing() -> None:
-    assert not class_evidence(Scene(things(0, 1))).observed.any()
-
-
 def test_poses_observe_off_where_an_instance_pair_was_in_range() -> None:
     holds, observed = np.zeros((A, 3, 3), bool), np.zeros((A, 3, 3), bool)
     observed[:, 0, 1] = observed[:, 1, 0] = True  # the second instance of class 2 is far away
@@ -86,11 +82,6 @@ def test_things_outside_the_vocabulary_are_left_out() -> None:
     assert found.classes.tolist() == [1, 4]
     assert np.argwhere(found.holds).tolist() == [[LEFT, 0, 1]]
     assert class_evidence(Scene(things(None))).classes.shape == (0,)
-
-
-def test_detections_of_one_class_support_each_other() -> None:
-    found = class_evidence(Scene(things(3, 3, confidence=0.5)))
-    assert found.confidence.tolist() == [0.75]
 
 
 def test_shapes_are_checked() -> None:

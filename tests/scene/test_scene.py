@@ -54,10 +54,6 @@ def test_bad_scenes_are_refused(change: dict[str, Any], message: str) -> None:
         Scene(**{"objects": (DESK, MONITOR)} | change)
 
 
-def test_an_empty_scene_is_a_scene() -> None:
-    assert Scene(()).relations is None
-
-
 def test_poses_become_relations() -> None:
     seen = observe(Scene((DESK, MONITOR, CHAIR)))
     assert set(seen.relations or ()) == {(ON_TOP, 1, 0), (FRONT, 2, 0), (FRONT, 2, 1)}
