@@ -14,7 +14,7 @@ from tests.services import LiveService, launch
 
 pytestmark = pytest.mark.system
 
-api = documented(examples=10)
+api = documented(examples=5)
 
 
 @pytest.fixture(scope="module")

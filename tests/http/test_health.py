@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import httpx
@@ -99,15 +98,3 @@ async def test_an_empty_store_is_not_ready(tmp_path: Path, admin: dict[str, str]
         problem(await client.get("/health/ready"), 503, "not-ready")
         assert (await client.get("/models")).json()["models"] == []
         problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
-
-
-async def test_a_repaired_store_is_taken_over_by_a_refresh(
-    store: Path, tmp_path: Path, admin: dict[str, str]
-) -> None:
-    folder = store / "home" / "1.0.0"
-    shutil.move(folder, tmp_path / "aside")
-    async with serve(store) as client:
-        problem(await client.get("/health/ready"), 503, "not-ready")
-        shutil.move(tmp_path / "aside", folder)
-        assert (await client.post("/models/refresh", headers=admin)).status_code == 200
-        assert (await client.get("/health/ready")).status_code == 200

@@ -12,7 +12,7 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from app.api import catalogue, examples
+from app.api import examples
 from app.serving.logs import JSONFormatter
 from tests.http.stores import corrupt, publish
 from tests.http.test_problems import problem
@@ -126,19 +126,6 @@ async def test_a_defect_is_told(shared_store: Path, monkeypatch: pytest.MonkeyPa
         problem(await client.post("/missing", json=SCENE), 500, "internal-error")
         found = await told(client)
     assert requests(found) == {("POST", "internal-error", "/missing"): 1}
-
-
-async def test_every_outcome_is_a_problem_of_the_catalogue(client: httpx.AsyncClient) -> None:
-    found = {outcome for _, outcome, _ in requests(await told(client))}
-    assert found <= {"success", "other", *catalogue.PROBLEM_TYPES}
-
-
-async def test_a_range_that_cannot_be_is_a_failure(shared_store: Path) -> None:
-    async with serve(shared_store) as client:
-        response = await client.get("/static/icon.svg", headers={"Range": "bytes=10000000-"})
-        assert response.status_code == 416
-        found = await told(client)
-    assert requests(found) == {("GET", "other", "-"): 1}
 
 
 async def test_work_is_told_by_model_and_question(shared_store: Path) -> None:
@@ -268,15 +255,3 @@ async def test_lines_hold_nothing_a_client_made_up(
         await client.request(marker, f"/{marker}")
     assert len(lines(caplog)) == 2
     assert marker not in json.dumps(lines(caplog))
-
-
-async def test_no_line_is_made_that_nobody_reads(
-    client: httpx.AsyncClient, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def make(*_: Any) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr("app.serving.request.Record.known", make)
-    with caplog.at_level(logging.WARNING, "app.access"):
-        assert (await client.post("/missing", json=SCENE)).status_code == 200
-    assert lines(caplog) == []

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.serving.errors import Reason, RequestError
-from app.serving.reading import MAX_SUGGESTED, Limits, Reading, read_scene
+from app.serving.reading import Limits, Reading, read_scene
 from scene_client.schemas import SceneRequest
 from tests.http.stores import VOCABULARY
 
@@ -93,52 +93,7 @@ def test_an_unambiguous_label_names_its_object_in_any_spelling() -> None:
     assert reading.scene.relations == ((1, 1, 0),)
 
 
-def test_an_ambiguous_label_is_refused() -> None:
-    reason, where = faults(
-        objects=["chair", "chair", "bed"],
-        relations=[{"subject": "chair", "relation": "left", "object": "bed"}],
-    )
-    assert (reason, where) == (Reason.INVALID, [("relations", 0, "subject")])
-
-
-def test_a_name_of_nothing_is_refused() -> None:
-    reason, where = faults(
-        objects=["chair", "bed"],
-        relations=[{"subject": "chair", "relation": "left", "object": "sofa"}],
-    )
-    assert (reason, where) == (Reason.INVALID, [("relations", 0, "object")])
-
-
-def test_repeated_ids_are_refused() -> None:
-    objects = [{"id": "a", "label": "bed"}, {"id": "a", "label": "lamp"}]
-    assert faults(objects=objects) == (Reason.INVALID, [("objects", 1, "id")])
-
-
 # ------------------------------------------------------------------------------------ labels
-
-
-@pytest.mark.parametrize("label", ["trash can", "Garbage_Bins", "WASTE-BASKET", "garbagebin"])
-def test_spellings_and_aliases_name_one_class(label: str) -> None:
-    scene = read(objects=[label]).scene
-    assert scene.objects[0].class_index == VOCABULARY.index("garbage bin")
-
-
-def test_every_unknown_label_is_reported_with_the_nearest_known_ones() -> None:
-    with pytest.raises(RequestError) as error:
-        read(objects=["nigthstand", "bed", {"id": "q", "label": "zzzz"}])
-    assert error.value.reason is Reason.UNKNOWN_LABELS
-    first, second = error.value.faults
-    assert first.location == ("objects", 0)
-    assert first.suggestions[0] == "nightstand"
-    assert second.location == ("objects", 2, "label")
-    assert second.suggestions == ()
-
-
-def test_only_the_first_unknown_labels_are_looked_up() -> None:
-    with pytest.raises(RequestError) as error:
-        read(objects=["nigthstand"] * (MAX_SUGGESTED + 8))
-    suggested = [bool(fault.suggestions) for fault in error.value.faults]
-    assert suggested == [True] * MAX_SUGGESTED + [False] * 8
 
 
 def test_unknown_labels_can_be_left_out_with_all_that_hangs_on_them() -> None:
@@ -162,43 +117,11 @@ def test_a_scene_of_unknown_labels_alone_is_refused() -> None:
     assert faults(objects=["droid"], unknown_labels="ignore") == (Reason.INVALID, [("objects",)])
 
 
-def test_room_types_match_in_any_spelling() -> None:
-    assert read(objects=["bed"], room_type="Bed_Room").scene.room_type == 0
-    with pytest.raises(RequestError) as error:
-        read(objects=["bed"], room_type="bedrom")
-    assert error.value.faults[0].suggestions == ("bedroom",)
-
-
 # --------------------------------------------------------------------------------- relations
 
 
 def relation(subject: str, name: str, other: str) -> dict[str, str]:
     return {"subject": subject, "relation": name, "object": other}
-
-
-@pytest.mark.parametrize(
-    ("first", "second"),
-    [
-        (("bed", "left", "lamp"), ("bed", "right", "lamp")),
-        (("bed", "left", "lamp"), ("lamp", "left", "bed")),
-        (("bed", "on-top", "lamp"), ("bed", "under", "lamp")),
-        (("bed", "behind", "lamp"), ("lamp", "behind", "bed")),
-        (("bed", "above", "lamp"), ("lamp", "above", "bed")),
-    ],
-)
-def test_a_relation_and_its_opposite_contradict_each_other(
-    first: tuple[str, str, str], second: tuple[str, str, str]
-) -> None:
-    given = [relation(*first), relation(*second)]
-    assert faults(objects=["bed", "lamp"], relations=given) == (
-        Reason.CONTRADICTION,
-        [("relations", 1)],
-    )
-
-
-def test_nothing_is_related_to_itself() -> None:
-    given = [relation("bed", "left", "bed")]
-    assert faults(objects=["bed", "lamp"], relations=given)[0] is Reason.CONTRADICTION
 
 
 def test_saying_one_thing_twice_is_no_contradiction() -> None:
@@ -209,14 +132,6 @@ def test_saying_one_thing_twice_is_no_contradiction() -> None:
 def test_different_relations_of_one_pair_may_hold_together() -> None:
     given = [relation("bed", "left", "lamp"), relation("bed", "front", "lamp")]
     assert len(read(objects=["bed", "lamp"], relations=given).scene.relations or ()) == 2
-
-
-def test_complete_relations_need_relations() -> None:
-    assert faults(objects=["bed"], relations_complete=True) == (
-        Reason.INVALID,
-        [("relations_complete",)],
-    )
-    assert read(objects=["bed"], relations=[], relations_complete=True).scene.relations_complete
 
 
 def test_an_operator_may_lower_the_limits() -> None:
@@ -241,71 +156,6 @@ def observed(reading: Reading) -> set[tuple[str, str, str]] | None:
     if reading.observed is None:
         return None
     return {(entry.subject, entry.relation, entry.object) for entry in reading.observed}
-
-
-def test_relations_are_derived_from_positions() -> None:
-    assert observed(read(objects=LAMP_ON_DESK)) == {("l", "on-top", "d")}
-
-
-@pytest.mark.parametrize("relations", [[], [relation("d", "left", "l")]])
-def test_given_relations_are_never_overruled_by_positions(relations: list[Any]) -> None:
-    reading = read(objects=LAMP_ON_DESK, relations=relations)
-    assert reading.observed is None
-    assert len(reading.scene.relations or ()) == len(relations)
-
-
-def test_nothing_is_observed_without_positions() -> None:
-    reading = read(objects=["bed", "lamp"])
-    assert reading.observed is None
-    assert reading.scene.relations is None
-
-
-def test_typical_sizes_stand_in_for_missing_ones() -> None:
-    without = [{key: value for key, value in o.items() if key != "size"} for o in LAMP_ON_DESK]
-    assert observed(read(objects=without)) == {("l", "on-top", "d")}
-
-
-BESIDE = [
-    {"id": "b", "label": "bed", "position": at(2, 0.6, 0.3), "size": at(0.4, 0.4, 0.6)},
-    {"id": "c", "label": "chair", "position": at(2, -0.6, 0.3), "size": at(0.4, 0.4, 0.6)},
-]
-
-
-def test_left_is_left_of_the_robot() -> None:
-    assert observed(read(objects=BESIDE, frame_id="base_link")) == {("b", "left", "c")}
-
-
-def test_a_viewpoint_on_the_other_side_exchanges_left_and_right() -> None:
-    viewpoint = {"x": 4.0, "y": 0.0, "yaw": math.pi}
-    assert observed(read(objects=BESIDE, frame_id="map", viewpoint=viewpoint)) == {
-        ("c", "left", "b")
-    }
-
-
-def test_in_a_world_frame_only_vertical_relations_are_derived_without_a_viewpoint() -> None:
-    assert observed(read(objects=BESIDE, frame_id="map")) == set()
-    assert observed(read(objects=LAMP_ON_DESK, frame_id="odom")) == {("l", "on-top", "d")}
-
-
-def test_optical_frames_look_along_z() -> None:
-    # x right, y down, z forward: the lamp stands on the desk, 2 m ahead.
-    optical = [
-        {"id": "d", "label": "desk", "position": at(0, 0.6, 2), "size": at(1.4, 0.8, 0.7)},
-        {"id": "l", "label": "lamp", "position": at(-0.5, 0, 2), "size": at(0.2, 0.4, 0.2)},
-    ]
-    reading = read(objects=optical, frame_id="camera_optical_frame")
-    assert observed(reading) == {("l", "on-top", "d")}
-
-
-def test_orientation_turns_the_footprint() -> None:
-    # A board 2 m long and 0.2 m wide reaches under the book only once it is turned by 90°.
-    quarter = {"x": 0.0, "y": 0.0, "z": math.sqrt(0.5), "w": math.sqrt(0.5)}
-    board = {"id": "t", "label": "table", "position": at(2, 0, 0.35), "size": at(2, 0.2, 0.7)}
-    book = {"id": "k", "label": "book", "position": at(2, 0.8, 0.72), "size": at(0.1, 0.1, 0.04)}
-    assert ("k", "on-top", "t") not in (observed(read(objects=[board, book])) or ())
-    assert ("k", "on-top", "t") in (
-        observed(read(objects=[{**board, "orientation": quarter}, book])) or ()
-    )
 
 
 Turn = tuple[float, float, float, float]
@@ -416,15 +266,6 @@ def test_unknown_labels_can_be_taken_for_the_nearest_class() -> None:
 def test_a_label_that_is_like_none_is_refused_all_the_same() -> None:
     reason, where = faults(objects=["bed", "droid", "big lamp"], unknown_labels="nearest")
     assert (reason, where) == (Reason.UNKNOWN_LABELS, [("objects", 1)])
-
-
-def test_so_many_labels_are_looked_up_and_no_more() -> None:
-    many = [f"big{'g' * k} lamp" for k in range(MAX_SUGGESTED + 5)]
-    with pytest.raises(RequestError) as error:
-        read(objects=many, unknown_labels="nearest")
-    assert [fault.location for fault in error.value.faults] == [
-        ("objects", MAX_SUGGESTED + k) for k in range(5)
-    ]
 
 
 # ---------------------------------------------------------------------------------- spelling

@@ -38,9 +38,9 @@ sys.exit(main())
 """
 
 
-@pytest.fixture(scope="module", params=["json", "plain"])
+@pytest.fixture(scope="module")
 def defective(
-    request: pytest.FixtureRequest, shared_store: Path, tmp_path_factory: pytest.TempPathFactory
+    shared_store: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[LiveService]:
     """A service that tells as much as it can be made to, and cannot say what is missing."""
     with launch(
@@ -49,7 +49,6 @@ def defective(
         program=("-c", DEFECTIVE),
         SCENE_API_KEY=API_KEY,
         SCENE_LOG_LEVEL="debug",
-        SCENE_LOG_FORMAT=request.param,
     ) as service:
         yield service
 

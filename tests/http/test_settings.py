@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from app.serving.logs import JSONFormatter, PlainFormatter, log_config
+from app.serving.logs import JSONFormatter, PlainFormatter
 from app.settings import Settings
 
 
@@ -149,22 +149,6 @@ def test_log_lines_are_json() -> None:
     entry = json.loads(line)
     assert entry["message"] == "a line\n"
     assert (entry["level"], entry["logger"], entry["request_id"]) == ("error", "app.api", "abc")
-
-
-@pytest.mark.parametrize("style", ["json", "plain"])
-def test_the_log_configuration_is_one(style: str) -> None:
-    config = log_config("info", style)  # type: ignore[arg-type]
-    assert config["handlers"]["stderr"]["formatter"] == style
-    assert logging.getLevelName(config["root"]["level"]) == "INFO"
-
-
-@pytest.mark.parametrize(
-    ("level", "of_libraries"), [("debug", "INFO"), ("info", "INFO"), ("error", "ERROR")]
-)
-def test_libraries_tell_nothing_below_info(level: str, of_libraries: str) -> None:
-    config = log_config(level, "json")
-    assert config["loggers"]["app"]["level"] == level.upper()
-    assert logging.getLevelName(config["root"]["level"]) == of_libraries
 
 
 @pytest.mark.parametrize("secret", ["0123456789abcdef", 'quote"and\\backslash'])

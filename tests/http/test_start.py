@@ -14,8 +14,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.http.stores import corrupt, make_store
-from tests.services import LiveService, begin, launch
+from tests.services import LiveService, begin
 
 pytestmark = pytest.mark.system
 
@@ -125,11 +124,3 @@ def test_it_says_where_its_page_is(live: LiveService, shared_store: Path, tmp_pa
     assert not any("compil" in line for line in messages(log))
     assert any("SCENE_API_KEY is not set" in line for line in messages(log))
     assert not any("SCENE_API_KEY is not set" in line for line in messages(live.log))
-
-
-def test_a_start_without_a_usable_default_says_so(tmp_path: Path) -> None:
-    store = make_store(tmp_path / "store")
-    corrupt(store, "home", "1.0.0")
-    with launch(store, tmp_path / "log") as service:
-        wait_for("not ready: http://", service.log, service.process)
-        assert not any(line.startswith("ready: ") for line in messages(service.log))

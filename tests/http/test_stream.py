@@ -29,7 +29,6 @@ from scene_client import (
     StreamProblemError,
     UnreachableError,
 )
-from scene_client.stream_messages import AnswerMessage
 from tests.http.stores import make_store
 from tests.http.streams import ASK, answered, hear, opened, posted, say, talk, updates
 from tests.http.test_problems import problem
@@ -65,16 +64,15 @@ def closed(stream: Any) -> tuple[int, str]:
 # --------------------------------------------------------------------------- the same answers
 
 
-@pytest.mark.parametrize("poses", [True, False], ids=["poses", "labels"])
 @pytest.mark.anyio
-async def test_many_updates_come_to_the_answers_of_requests(live: LiveService, poses: bool) -> None:
-    """Sometimes one at a time, sometimes many."""
+async def test_many_updates_come_to_the_answers_of_requests(live: LiveService) -> None:
+    """Sometimes one at a time, sometimes many; without poses: tests/serving/test_stream.py."""
     url = f"http://127.0.0.1:{live.port}"
     scene: dict[str, Any] = {}
     pauses = {0, 1, 2, 3, 399, *random.Random(1).sample(range(400), 40)}
     covered = 0
     async with StreamClient(url, ask=ASK) as stream:
-        for number, (update, scene) in enumerate(updates(400, 7, poses=poses)):  # noqa: B007
+        for number, (update, scene) in enumerate(updates(400, 7)):  # noqa: B007
             sent = await stream.update(**update)
             while number in pauses:
                 answer = await anext(stream)
@@ -88,7 +86,7 @@ async def test_many_updates_come_to_the_answers_of_requests(live: LiveService, p
             found = getattr(answer, question)
             form = type(found)
             assert found.model_copy(update={"request_id": ""}) == form.model_validate(own)
-        assert bool(expected["missing"].get("observed_relations")) == poses
+        assert expected["missing"]["observed_relations"]
 
 
 def test_a_flood_is_answered_about_its_newest_state_only(live: LiveService) -> None:
@@ -136,29 +134,6 @@ def test_a_fast_stream_is_slowed_down_and_others_are_not(live: LiveService) -> N
             time.sleep(0.01)
         assert time.monotonic() - began > 400 * LEAST_COST / READING_SHARE
         assert sorted(waits)[len(waits) // 2] < 0.05
-
-
-def test_each_answer_is_that_of_its_route(live: LiveService) -> None:
-    with opened(live) as stream:
-        talk(stream, "open", frame_id="base_link", unknown_labels="ignore", model="plain")
-        stamp = {"sec": 3, "nanosec": 4}
-        answer = talk(stream, "update", seq=5, objects=["bed", "gizmo"], stamp=stamp)
-        scene = {"objects": ["bed", "gizmo"], "unknown_labels": "ignore", "model": "plain"}
-        scene |= {"frame_id": "base_link", "stamp": stamp}
-        assert answered(answer) == posted(live.client, scene, {"missing": {}, "outliers": {}})
-        assert answer["missing"]["ignored"] == ["gizmo"]
-        # A scene of unknown objects alone is empty, and valid.
-        answer = talk(stream, "update", seq=6, remove=["bed"])
-        assert answer["missing"]["missing"] == []
-        assert answer["outliers"]["outliers"] == answer["outliers"]["misplaced"] == []
-        assert AnswerMessage.model_validate(answer).missing is not None
-
-
-def test_an_opening_may_bring_the_scene(live: LiveService) -> None:
-    with opened(live) as stream:
-        assert talk(stream, "open", objects=["bed"], room_type="bedroom")["type"] == "opened"
-        answer = hear(stream)
-        assert (answer["type"], answer["seq"], answer["superseded"]) == ("answer", 0, 0)
 
 
 def test_the_server_limits_the_deadlines_of_streams(live: LiveService) -> None:
@@ -452,8 +427,8 @@ def test_who_is_silent_loses_the_place(guarded: LiveService) -> None:
     with opened(guarded, additional_headers=KEY) as stream:
         talk(stream, "open", objects=["bed"])
         hear(stream)
-        for _ in range(4):
-            time.sleep(0.7)
+        for _ in range(2):
+            time.sleep(1)
             assert talk(stream, "ping") == {"type": "pong"}
         assert closed(stream) == (1008, "stream-idle")
 
@@ -466,20 +441,6 @@ def test_a_message_may_be_as_large_as_a_body(guarded: LiveService) -> None:
         assert hear(stream)["seq"] == 1
         stream.send(" " * 20_001)
         assert closed(stream)[0] == 1009
-
-
-def test_a_message_may_come_in_pieces(guarded: LiveService) -> None:
-    with opened(guarded, additional_headers=KEY) as stream:
-        talk(stream, "open")
-        stream.send(part for part in ('{"type"', ': "ping', '"}'))
-        assert hear(stream) == {"type": "pong"}
-
-
-def test_a_text_frame_that_is_no_text_ends_the_stream(guarded: LiveService) -> None:
-    with opened(guarded, additional_headers=KEY) as stream:
-        talk(stream, "open")
-        stream.send(b'{"type": "\xff"}', text=True)
-        assert closed(stream)[0] == 1007
 
 
 @pytest.mark.anyio
@@ -523,18 +484,14 @@ def _end_of_stream(service: LiveService) -> dict[str, Any] | None:
 # ---------------------------------------------------------------------------------- the end
 
 
-@pytest.mark.parametrize("seconds", ["0", "1"])
-def test_a_service_that_ends_takes_its_leave(tmp_path: Path, seconds: str) -> None:
-    service = launch(make_store(tmp_path / "store"), tmp_path / "log", SCENE_DRAIN_SECONDS=seconds)
+def test_a_service_that_ends_takes_its_leave(tmp_path: Path) -> None:
+    service = launch(make_store(tmp_path / "store"), tmp_path / "log", SCENE_DRAIN_SECONDS="1")
     with opened(service) as stream, opened(service) as unopened:
         talk(stream, "open")
         talk(stream, "update", seq=1, objects=["bed"])
         began = time.monotonic()
         service.process.send_signal(signal.SIGTERM)
-        # Without a pause for load balancers the server may close the connections itself.
-        ends = {(1001, "draining"), *([(1012, "")] if seconds == "0" else [])}
-        assert closed(stream) in ends
-        assert closed(unopened) in ends
+        assert closed(stream) == closed(unopened) == (1001, "draining")
     service.client.close()
     service.process.wait(timeout=30)
     assert service.process.returncode == -signal.SIGTERM

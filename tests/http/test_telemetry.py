@@ -6,7 +6,6 @@ here and never a skip.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -122,25 +121,6 @@ def test_nowhere_to_send_is_refused(shared_store: Path, monkeypatch: pytest.Monk
     monkeypatch.delenv("OTEL_EXPORTER_OTLP_ENDPOINT", raising=False)
     with pytest.raises(ValidationError, match=r"SCENE_OPENTELEMETRY needs OTEL_EXPORTER_OTLP"):
         Settings(store=shared_store, opentelemetry=True)
-
-
-@pytest.mark.system
-def test_the_service_starts_without_the_packages_unless_they_are_wanted(
-    shared_store: Path, repository: Path
-) -> None:
-    code = (
-        "import sys; sys.modules['opentelemetry.sdk'] = None; "
-        "from app.main import create_app; from app.settings import Settings; "
-        "from pathlib import Path; create_app(Settings(store=Path(sys.argv[1]))); print('made')"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", code, str(shared_store)],
-        cwd=repository,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert run.stdout == "made\n"
 
 
 # ------------------------------------------------------------------------- a live collector

@@ -9,7 +9,8 @@ from tests.services import launch
 
 _WITHOUT = """
 import runpy, sys
-sys.modules["torch"] = sys.modules["training"] = None  # importing them fails
+for name in ("torch", "training", "opentelemetry.sdk"):
+    sys.modules[name] = None  # importing them fails
 runpy.run_module("app", run_name="__main__")
 """
 

@@ -49,7 +49,7 @@ def single(name):
 
 def test_stated_relations_tell_of_the_objects():
     """Of four units seen between two classes: how often the third class is there, within five
-    standard errors of the joint, over 4,096 chains; other relations make for another share."""
+    standard errors of the joint, over 2,048 chains; other relations make for another share."""
     artifact, joint = single("triway-local")
     e = joint.edges
 
@@ -64,11 +64,11 @@ def test_stated_relations_tell_of_the_objects():
     shares = []
     for relations in ([(0, 0, 1)], [(0, 1, 0)]):
         scene = scene_of([0, 1], relations, complete=True)
-        drawn = generate(artifact, scene, count=4096, seed=1, steps=40)
+        drawn = generate(artifact, scene, count=2048, seed=1, steps=40)
         frequency = sum(LABELS[2] in one.objects for one in drawn) / len(drawn)
         _, i, j = relations[0]
         expected = share([(i, j, True), (j, i, False)])
-        assert abs(frequency - expected) <= 5 * math.sqrt(expected * (1 - expected) / 4096)
+        assert abs(frequency - expected) <= 5 * math.sqrt(expected * (1 - expected) / 2048)
         shares.append(expected)
     assert abs(shares[0] - shares[1]) > 0.05
 

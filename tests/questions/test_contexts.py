@@ -52,6 +52,11 @@ def test_a_unit_is_named_by_its_first_objects_and_relation(name):
     assert len(set(names)) > 0.9 * len(names)
 
 
+def test_a_unit_that_favours_nothing_has_its_number():
+    artifact = larger_artifact("triway-local", scale=0.0)
+    assert [unit.name for unit in contexts(artifact)["h2"]] == ["unit 0", "unit 1", "unit 2"]
+
+
 @pytest.mark.parametrize("name", LARGER)
 def test_every_unit_by_its_largest_positive_weights(name):
     artifact = larger_artifact(name)

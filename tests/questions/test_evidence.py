@@ -9,7 +9,7 @@ from app.scene import Scene, SceneObject, derive_relations
 from tests.questions.artifacts import LARGER, larger_artifact, scene_of
 from training.machines.arrays import machine_of
 from training.oracle.evidence import draw_context, observe
-from training.oracle.units import units_between
+from training.oracle.units import mean_log_p, units_between
 
 
 def triples_of(edges, values):
@@ -97,6 +97,16 @@ def test_units_between_any_classes(name):
     there = torch.zeros(len(names), dtype=torch.bool)
     there[units.place[units.exists]] = True
     assert torch.equal(flat, torch.where(there, names.double(), 0.0))
+
+
+def test_both_tails_of_a_probability_keep_their_digits():
+    weight = torch.full((2, 1), 0.5)
+    logits = torch.tensor([[-80.0, 20.0, 0.0], [-80.0, 22.0, 0.0]])
+    on, off = mean_log_p(weight, logits)
+    exact = logits.double().sigmoid().mean(0).log()
+    rest = logits.double().neg().sigmoid().mean(0).log()
+    torch.testing.assert_close(on.double(), exact, atol=1e-4, rtol=1e-6)
+    torch.testing.assert_close(off.double(), rest, atol=1e-4, rtol=1e-6)
 
 
 def test_many_relations_get_fewer_draws(monkeypatch):

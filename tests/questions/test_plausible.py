@@ -29,6 +29,17 @@ def test_scenes_that_are_too_small_are_drawn_again(name):
     assert sum(size < least for size in free) > sum(size < least for size in large)
 
 
+@pytest.mark.parametrize("name", LOCAL)
+def test_the_last_attempt_stands(name):
+    """Where every scene is refused, as many come back as where none is."""
+    refused = drawn(larger_artifact(name, outlier_thresholds=ALL), scene_of([0]))
+    assert len(refused) == 24
+    assert all("bed" in one.objects for one in refused)
+    again = drawn(larger_artifact(name, outlier_thresholds=ALL), scene_of([0]))
+    assert refused == again
+    assert refused != drawn(larger_artifact(name, outlier_thresholds=NONE), scene_of([0]))
+
+
 def test_given_objects_are_never_a_reason():
     """All classes are given: whatever they are, nothing is drawn again."""
     scene = scene_of(list(range(9)))

@@ -73,6 +73,22 @@ def test_candidates_and_top_k_choose_but_do_not_rescale(name, scene, candidates,
 
 @few
 @given(names, scenes())
+def test_placements(name, scene):
+    """At most three, best first, never at structure, each relation and anchor once."""
+    artifact = ARTIFACTS[name]
+    things = [t for t in scene.objects if t.label not in STRUCTURE]
+    for answer in missing(artifact, scene, top_k=3):
+        places = answer.placements
+        assert len(places) == (3 if things else 0)
+        probabilities = [place.probability for place in places]
+        assert probabilities == sorted(probabilities, reverse=True)
+        assert len({(place.relation, place.object) for place in places}) == len(places)
+        for place in places:
+            assert scene.objects[place.object].label not in STRUCTURE
+
+
+@few
+@given(names, scenes())
 def test_reasons_for_what_is_missing(name, scene):
     """The strongest three first; one object speaks for its class."""
     first = {thing.label: k for k, thing in reversed(list(enumerate(scene.objects)))}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from app.questions import missing
 from app.questions.posterior import FULL, posterior
-from tests.questions.artifacts import LABELS, artifact_of, scene_of
+from tests.questions.artifacts import LABELS, artifact_of, larger_artifact, scene_of
 from training.machines import MachineSpec, build
 from training.machines.fantasies import pack_scenes
 
@@ -86,6 +86,15 @@ def test_the_coverage_is_the_model_s_unless_a_request_says(name):
     assert log_odds(artifact, scene) == log_odds(artifact, scene, coverage=0.25)
     assert log_odds(artifact, scene) != log_odds(artifact, scene, coverage=0.5)
     assert log_odds(artifact, scene, coverage=0.0) != log_odds(artifact, scene, coverage=0.5)
+
+
+@pytest.mark.parametrize("coverage", [0.0, 0.5, 0.9])
+def test_machines_without_samples_count_other_unlisted_classes_as_absent(coverage):
+    artifact, scene = larger_artifact("triway-wide"), scene_of([0, 1])
+    assert artifact.completions is None
+    full = log_odds(artifact, scene, coverage=1.0)
+    for label, z in log_odds(artifact, scene, coverage=coverage).items():
+        assert z == pytest.approx(full[label] - UNLISTED + math.log1p(-coverage), abs=1e-4)
 
 
 def test_the_lower_the_coverage_the_likelier_an_unlisted_class(name):

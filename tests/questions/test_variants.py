@@ -86,6 +86,14 @@ def test_placements(case):
         np.testing.assert_allclose(found, expected, atol=probability)
 
 
+def test_some_units_are_asked_as_all_are(case):
+    closed, _, _, _ = case
+    n = len(closed.present.classes)
+    units = tuple(part.reshape(-1) for part in np.indices((4, n, n)))
+    found = closed.unit_log_odds(*units).reshape(4, n, n)
+    np.testing.assert_allclose(sigmoid(found), sigmoid(closed.relation_log_odds()), atol=5e-3)
+
+
 def test_reasons_have_the_sign_and_size_of_the_mean_field_s(case):
     closed, drawn, nats, _ = case
     rows = np.arange(len(closed.present.classes))

@@ -98,6 +98,17 @@ def test_half_precision_keeps_biases_and_integers_whole(tmp_path: Path) -> None:
             assert np.array_equal(loaded[name], array), name
 
 
+def test_scalars_and_views_are_stored_as_they_are() -> None:
+    from app.registry.tensors import pack, unpack
+
+    matrix = np.arange(6.0, dtype=np.float32).reshape(2, 3)
+    given = {"scalar": np.float32(2.5), "transposed": matrix.T, "flag": np.array([True])}
+    data, entries = pack(given, "float32")
+    assert entries["scalar"].shape == ()
+    found = unpack(data, entries)
+    assert all(np.array_equal(found[name], given[name]) for name in given)
+
+
 def test_the_same_content_is_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_artifact(tmp_path / name, description(), dict(reversed(state().items())))

@@ -78,6 +78,12 @@ def test_never_overwrites_a_version(store: Store) -> None:
     assert tree(store.root) == before
 
 
+def test_does_not_even_overwrite_what_is_broken(store: Store) -> None:
+    (store.root / "tiny" / "1.0.0").mkdir(parents=True)
+    with refused("version_exists"):
+        publish(store)
+
+
 def test_publishes_nothing_that_would_be_refused(store: Store) -> None:
     weights = state()
     weights["triples"][1] = (3, 99, 0)
@@ -173,6 +179,12 @@ def test_an_alias_follows_the_latest_or_stays(store: Store) -> None:
         store.resolve("stable")
     with refused("unknown_model"):
         store.remove_alias("stable")
+
+
+def test_publishing_moves_the_alias_to_that_very_version(store: Store) -> None:
+    store.publish(description(version="2.0.0"), state(), alias="default")
+    store.publish(description(version="1.5.0"), state(), alias="default")
+    assert store.resolve("default") == ("tiny", "1.5.0")
 
 
 def test_an_alias_moves_only_from_where_it_was_expected(store: Store) -> None:

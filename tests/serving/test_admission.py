@@ -91,19 +91,6 @@ async def test_jobs_run_in_order_each_with_its_result(queue: WorkQueue) -> None:
     assert order == list(range(20))
 
 
-async def test_what_arrives_in_one_tick_is_computed_in_the_next(queue: WorkQueue) -> None:
-    """Nothing runs before all that came with it has been queued, and no timer is waited for."""
-    order: list[str] = []
-
-    async def ask(name: str) -> None:
-        order.append(f"{name} queued")
-        computed = partial(order.append, f"{name} computed")
-        await queue.run(computed, ENDLESS, kind="cheap", size=1)
-
-    await asyncio.gather(ask("first"), ask("second"))
-    assert order == ["first queued", "second queued", "first computed", "second computed"]
-
-
 @pytest.mark.parametrize("ask", WAYS)
 async def test_one_failure_is_one_request_s(queue: WorkQueue, ask: Any) -> None:
     def broken() -> None:
@@ -145,22 +132,6 @@ async def test_a_failure_keeps_nothing_of_its_request(queue: WorkQueue, ask: Any
         assert found() is None
     finally:
         gc.enable()
-
-
-async def test_questions_are_counted_until_they_are_answered_and_drawings_are_not(
-    queue: WorkQueue,
-) -> None:
-    release = threading.Event()
-    waiting = [
-        asyncio.ensure_future(ask(queue, lambda: release.wait(30)))
-        for ask in IN_THREADS
-        for _ in "ab"
-    ]
-    await asyncio.sleep(0)
-    assert queue.backlog.pending == 2
-    release.set()
-    await asyncio.gather(*waiting)
-    assert queue.backlog.pending == 0
 
 
 async def test_questions_of_streams_give_way_and_hold_up_no_request(queue: WorkQueue) -> None:
@@ -362,19 +333,6 @@ async def test_clients_cannot_fill_the_memory_with_kinds(took: Any, queue: WorkQ
     for number in range(5_000):
         await took(0, size=1, kind=str(number))
     assert len(queue._costs._per_unit) <= 4096
-
-
-async def test_no_model_waits_for_the_costly_work_of_another(
-    queue: WorkQueue, threads: Threads
-) -> None:
-    release = threading.Event()
-    costly = [asyncio.ensure_future(in_thread(queue, lambda: release.wait(30))) for _ in range(8)]
-    other = WorkQueue(8, threads, Backlog(8))
-    # Only its answer lets them end.
-    assert (await in_thread(other, lambda: "fine")).result == "fine"
-    assert not any(job.done() for job in costly)
-    release.set()
-    await asyncio.gather(*costly)
 
 
 async def test_a_long_queue_lets_others_have_their_turn(queue: WorkQueue) -> None:

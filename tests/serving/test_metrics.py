@@ -61,22 +61,6 @@ def described(metrics: Metrics) -> dict[str, set[str]]:
     return found
 
 
-def test_requests_are_counted_by_route_method_and_outcome() -> None:
-    metrics = Metrics()
-    metrics.answered("/missing", "POST", "success", 0.003)
-    metrics.answered("/missing", "POST", "success", 0.2)
-    metrics.answered("/missing", "POST", "unknown-labels", 0.0002)
-    found = samples(metrics)
-    assert found["scene_requests_total", "POST", "success", "/missing"] == 2
-    assert found["scene_requests_total", "POST", "unknown-labels", "/missing"] == 1
-    assert found["scene_request_duration_seconds_count", "/missing"] == 3
-    assert found["scene_request_duration_seconds_sum", "/missing"] == pytest.approx(0.2032)
-    bucket = "scene_request_duration_seconds_bucket"
-    buckets = {key[1]: value for key, value in found.items() if key[0] == bucket}
-    assert (buckets["0.0001"], buckets["0.00025"], buckets["0.005"]) == (0, 1, 2)
-    assert buckets["+Inf"] == 3
-
-
 def test_models_are_told_with_every_alias(models: ServedModels) -> None:
     metrics = Metrics()
     metrics.serving(models.with_alias("night", AliasTarget(name="home", version=None)))
@@ -92,14 +76,6 @@ def test_models_are_told_with_every_alias(models: ServedModels) -> None:
             ("", "deep", "gbm", "0.1.0"),
         )
     }
-
-
-def test_a_moved_alias_leaves_no_trace(models: ServedModels) -> None:
-    metrics = Metrics()
-    metrics.serving(models)
-    metrics.serving(models.with_alias("default", AliasTarget(name="home", version="1.1.0")))
-    led = [key[5] for key in samples(metrics) if key[:2] == ("scene_model_info", "default")]
-    assert led == ["1.1.0"]
 
 
 def test_series_of_a_removed_model_go_away_and_stay_away(models: ServedModels) -> None:
@@ -127,25 +103,6 @@ def test_series_of_a_removed_model_go_away_and_stay_away(models: ServedModels) -
     assert samples(metrics)["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
 
 
-def test_what_a_model_did_is_told_by_question(models: ServedModels) -> None:
-    metrics = Metrics()
-    metrics.serving(models)
-    key = "home", "1.0.0"
-    metrics.computed(key, "relations", 8, 0.0, 0.25)
-    metrics.computed(key, "relations", 2, 0.001, 0.05)
-    models.served[key].queue.take(7)
-    metrics.answered("/relations", "POST", "success", 1.0, 0.5)
-    found = samples(metrics)
-    label = ("home", "relations", "1.0.0")
-    assert found["scene_compute_duration_seconds_sum", *label] == pytest.approx(0.3)
-    assert found["scene_batch_rows_sum", *label] == 10
-    assert found["scene_batch_rows_count", *label] == 2
-    assert found["scene_queue_duration_seconds_sum", "home", "1.0.0"] == pytest.approx(0.001)
-    assert found["scene_pending_rows", "home", "1.0.0"] == 7
-    models.served[key].queue.give_back(7)
-    assert found["scene_serialisation_duration_seconds_sum",] == 0.5
-
-
 def test_a_process_without_a_default_is_not_ready(models: ServedModels) -> None:
     metrics = Metrics()
     metrics.started()
@@ -158,12 +115,6 @@ def test_a_process_without_a_default_is_not_ready(models: ServedModels) -> None:
     assert ready >= found["scene_start_time_seconds",]
     metrics.serving(models)
     assert samples(metrics)["scene_ready_time_seconds",] == ready
-
-
-def test_applications_do_not_share_what_they_count() -> None:
-    first, second = Metrics(), Metrics()
-    first.answered("/missing", "POST", "success", 0.1)
-    assert not any(key[0] == "scene_requests_total" for key in samples(second))
 
 
 def test_the_documentation_lists_every_metric(repository: Path) -> None:

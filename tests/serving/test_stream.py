@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic
@@ -256,23 +255,6 @@ def test_a_label_that_another_model_lacks_is_a_problem_of_each_question(service:
     for error in errors.values():
         assert isinstance(error, RequestError)
         assert error.faults[0].location == ("scene", "objects", "no such class")
-
-
-def test_an_answer_with_a_number_that_is_not_finite_is_not_written(
-    service: Service, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = questions.questions.outliers
-
-    def broken(artifact: Any, scene: Any, **parameters: Any) -> Any:
-        found = real(artifact, scene, **parameters)
-        first, *others = found.outliers
-        return found._replace(outliers=(first._replace(probability=math.nan), *others))
-
-    stream = StreamScene()
-    service.take(stream, type="open", objects=["desk", "bed"], ask=ASK)
-    monkeypatch.setattr(questions.questions, "outliers", broken)
-    with pytest.raises(ValueError, match="not finite"):
-        service.answer(stream)
 
 
 def test_another_model_answers_from_the_next_message_on(service: Service) -> None:
