@@ -131,15 +131,6 @@ def test_a_change_of_another_file_is_compiled_in(package: Path) -> None:
         assert (answer["result"], answer["compiled"]) == (expected, [1, 1]), (file, new)
 
 
-def test_the_operator_chooses_the_root(package: Path, tmp_path: Path) -> None:
-    answer, _ = start(package, NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
-    assert Path(answer["path"]).is_relative_to(tmp_path / "chosen")
-    assert not (package.parent / ".numba_cache").exists()
-    # A child process with the same variable finds the same folder.
-    answer, _ = start(package, NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
-    assert answer["compiled"] == [0, 0]
-
-
 def test_a_folder_that_others_can_change_is_refused(package: Path, tmp_path: Path) -> None:
     root = tmp_path / "root"
     start(package, NUMBA_CACHE_DIR=str(root))

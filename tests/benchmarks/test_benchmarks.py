@@ -10,7 +10,6 @@ import json
 import math
 
 import pytest
-import torch
 import typer
 from rich.console import Console
 from typer.testing import CliRunner
@@ -18,12 +17,11 @@ from typer.testing import CliRunner
 from benchmarks.__main__ import main
 from benchmarks.gibbs import gibbs
 from benchmarks.log_odds import log_odds
-from benchmarks.report import Result, describe_machine, document, duration
+from benchmarks.report import Result, describe_machine, document
 from benchmarks.scaling import scaling
 from benchmarks.service import MISSING, NoModelError, service
 from benchmarks.timing import Timings, interleave
 from benchmarks.training import training_step
-from benchmarks.yardsticks import frequencies, random_scenes
 from tests.http.stores import make_store, publish
 
 
@@ -136,18 +134,3 @@ def test_a_ratio_is_taken_within_each_round():
     ratio = timings.ratio("ours", "other")
     assert (ratio.low, ratio.median, ratio.high) == (3, 3, 3)
     assert timings.ratio("other", "ours").median == pytest.approx(1 / 3)
-
-
-def test_no_round_is_refused():
-    with pytest.raises(ValueError, match="rounds must be at least 1, not 0"):
-        interleave({"a": list}, rounds=0)
-
-
-def test_durations_read_well():
-    assert [duration(s) for s in (2.0, 0.0123, 4.5e-5, 7e-9)] == ["2 s", "12.3 ms", "45 µs", "7 ns"]
-
-
-def test_scenes_have_as_many_objects_as_asked_for():
-    assert float(frequencies(417, 12).sum()) == pytest.approx(12)
-    scenes = random_scenes(50, 417, 12, torch.Generator().manual_seed(0))
-    assert all(len(set(scene.tolist())) == 12 for scene in scenes)

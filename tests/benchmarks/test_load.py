@@ -14,9 +14,9 @@ import pytest
 from benchmarks.load import plain
 from benchmarks.load.connections import prepared
 from benchmarks.load.measure import is_steady
-from benchmarks.load.questions import KINDS, SCENES, bodies, drawings
+from benchmarks.load.questions import KINDS, SCENES, bodies
 from benchmarks.load.windows import Window, at_concurrency, at_rate, joined
-from scene_client.schemas import GenerateRequest, MissingRequest, OutliersRequest, RelationsRequest
+from scene_client.schemas import MissingRequest, OutliersRequest, RelationsRequest
 
 LABELS = [f"thing {number}" for number in range(40)]
 REQUESTS = [prepared("/missing", {"objects": [label]}) for label in LABELS]
@@ -125,12 +125,6 @@ def test_scenes_fit_every_question_and_are_all_different(kind: str) -> None:
     for scene in scenes:
         for question in (MissingRequest, OutliersRequest, RelationsRequest):
             assert len(question.model_validate(scene).objects) == 12
-
-
-def test_drawings_are_requests_too() -> None:
-    for request in drawings(LABELS, 8):
-        body = request.split(b"\r\n\r\n", 1)[1]
-        assert GenerateRequest.model_validate_json(body).count == 8
 
 
 @pytest.mark.anyio

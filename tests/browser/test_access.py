@@ -174,17 +174,6 @@ def test_colours_follow_the_system_unless_somebody_chooses(open_board: OpenBoard
     assert board.page.evaluate(background) == dark
 
 
-def test_it_fits_a_telephone(open_board: OpenBoard) -> None:
-    board = open_board(scene=None, width=375, has_touch=True)
-    for tab in ("Missing", "Wrong", "Relations", "Imagine"):
-        board.tab(tab)
-        wide = board.page.evaluate("document.documentElement.scrollWidth")
-        assert wide <= 375, tab
-    board.page.locator("#list .name").first.tap()
-    board.settle()
-    assert board.page.evaluate("document.documentElement.scrollWidth") <= 375
-
-
 def test_nothing_moves_for_who_wants_no_motion(open_board: OpenBoard) -> None:
     moving = "getComputedStyle(document.querySelector('.bar rect')).transitionDuration"
     assert open_board(reduced_motion="no-preference").page.evaluate(moving) != "0s"

@@ -24,14 +24,6 @@ def place(board: Board, name: str, question: str = "missing") -> tuple[float, fl
     return tuple(found["position"][axis] for axis in "xyz")
 
 
-def test_it_opens_with_a_scene_that_is_answered(open_board: OpenBoard) -> None:
-    board = open_board(scene=None)
-    assert "bed" in board.things
-    assert board.rows("missing")
-    assert board.ghosts
-    assert board.said.startswith("Most likely missing: ")
-
-
 @pytest.mark.parametrize("example", ["bedroom", "kitchen", "desk"])
 def test_every_example_is_answered(open_board: OpenBoard, api: httpx.Client, example: str) -> None:
     board = open_board(scene=None)
@@ -197,21 +189,6 @@ def test_the_robot_can_stand_elsewhere(open_board: OpenBoard) -> None:
     assert viewpoint["yaw"] == pytest.approx(0.5236, abs=1e-3)
 
 
-def test_a_scene_leaves_and_comes_back_as_the_api_takes_it(
-    open_board: OpenBoard, api: httpx.Client
-) -> None:
-    board = open_board()
-    board.add("monitor")
-    scene = board.exported()
-    answer = api.post("/missing", json=scene)
-    assert answer.status_code == 200
-    board.page.get_by_role("button", name="Clear").click()
-    board.settle()
-    assert board.things == []
-    board.put(json.dumps(scene))
-    assert board.exported() == scene
-
-
 def test_labels_and_relations_alone_are_laid_out(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board()
     given = [
@@ -329,9 +306,8 @@ def test_new_objects_leave_room_for_the_robot(open_board: OpenBoard) -> None:
         assert found["position"]["x"] > 0
 
 
-@pytest.mark.parametrize("width", [1300, 600])
-def test_long_names_leave_room_for_the_buttons(open_board: OpenBoard, width: int) -> None:
-    board = open_board({"objects": [{"id": "b" * 120, "label": "bed"}]}, width=width)
+def test_long_names_leave_room_for_the_buttons(open_board: OpenBoard) -> None:
+    board = open_board({"objects": [{"id": "b" * 120, "label": "bed"}]}, width=600)
     section = board.page.locator("#things").bounding_box()
     remove = board.page.locator("#list").get_by_role("button", name="Remove").bounding_box()
     assert section is not None

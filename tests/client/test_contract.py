@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -101,11 +100,6 @@ def test_models_are_listed(caller: Caller, live: LiveService) -> None:
 
 
 @every_client
-def test_readiness_is_told(caller: Caller) -> None:
-    assert caller("is_ready") is True
-
-
-@every_client
 def test_an_unknown_label_is_a_problem_with_suggestions(caller: Caller) -> None:
     with pytest.raises(ProblemError) as raised:
         caller("missing", {"objects": ["bed", "nightstnad"]})
@@ -118,23 +112,6 @@ def test_an_unknown_label_is_a_problem_with_suggestions(caller: Caller) -> None:
     assert problem.title
     assert "1 fault" in problem.detail
     assert problem.retry_after is None
-
-
-@every_client
-def test_an_unknown_model_is_a_problem(caller: Caller) -> None:
-    for reference in ("nonsuch", "home@9.9.9"):
-        with pytest.raises(ProblemError) as raised:
-            caller("outliers", {"objects": ["bed"], "model": reference})
-        assert (raised.value.type, raised.value.status) == ("/problems/model-not-found", 404)
-
-
-@every_client
-def test_a_contradiction_is_a_problem(caller: Caller) -> None:
-    relation = {"subject": "bed", "relation": "left", "object": "bed"}
-    with pytest.raises(ProblemError) as raised:
-        caller("relations", {"objects": ["bed"], "relations": [relation]})
-    assert raised.value.type == "/problems/contradictory-evidence"
-    assert raised.value.errors[0].pointer.startswith("#/relations/0")
 
 
 @every_client
@@ -225,15 +202,3 @@ def change(scene: Client) -> None:
     assert scene.refresh().default.version == "1.1.0"
     scene.promote("default", "home@1.0.0")
     assert scene.missing(["bed"]).model.version == "1.0.0"
-
-
-def test_answers_read_as_their_classes(url: str) -> None:
-    with Client(url) as client:
-        answer = client.relations(
-            ["bed", {"label": "lamp", "id": "l"}],
-            relations=[("l", "on-top", "bed")],
-            room_type="bedroom",
-        )
-        assert answer.model.name == "home"
-        assert 0 <= answer.relations[0].probability <= 1
-        assert json.loads(answer.model_dump_json(exclude_none=True))["ignored"] == []

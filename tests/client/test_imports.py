@@ -24,7 +24,7 @@ PROGRAM = f"""
 import sys
 for module in {HEAVY!r}:
     sys.modules[module] = None  # importing it raises ImportError
-import scene_client, scene_client.command, scene_client.schemas
+import scene_client, scene_client.command, scene_client.schemas, scene_client.vision_msgs
 with scene_client.Client("http://127.0.0.1:9", retries=0) as scene:
     assert not scene.is_ready()
     try:

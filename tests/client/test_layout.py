@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scene_client.layout import HEIGHT, Box, arrange, extent
+from scene_client.layout import HEIGHT, Box, arrange
 from scene_client.schemas import GenerateAnswer, GeneratedScene, ModelReference, Relation
 
 NAMES = ["bed", "desk", "lamp", "book", "a rather long name", "x", "chair", "mug"]
@@ -83,10 +83,6 @@ def test_of_what_contradicts_itself_the_first_said_is_drawn() -> None:
     assert found["bed"].x < found["desk"].x
     found = boxes(["bed", "desk"], ("bed", "on-top", "desk"), ("desk", "on-top", "bed"))
     assert found["bed"].y > found["desk"].y
-
-
-def test_nothing_takes_no_room() -> None:
-    assert extent(arrange([], [])) == (0.0, 0.0)
 
 
 def answer(*scenes: GeneratedScene) -> GenerateAnswer:

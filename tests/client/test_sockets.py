@@ -19,7 +19,6 @@ from scene_client import (
     AsyncClient,
     Client,
     DeadlineError,
-    ProblemError,
     UnreachableError,
     asynchronous,
     deadline,
@@ -148,38 +147,6 @@ def test_nobody_listening_is_unreachable_and_not_ready(open_caller: Any) -> None
         assert call("is_ready") is False
         with pytest.raises(UnreachableError, match=f"http://127.0.0.1:{port}: "):
             call("models")
-
-
-@every_client
-def test_a_busy_service_is_asked_again(peer: Any, open_caller: Any) -> None:
-    statuses = iter([b"503 No", b"429 No", b"200 OK"])
-
-    def busy_at_first(connection: socket.socket) -> None:
-        while True:
-            read_head(connection)
-            answer(connection, b'{"models":[],"aliases":{}}', next(statuses))
-
-    with open_caller(peer(busy_at_first).url) as call:
-        assert call("models")["aliases"] == {}
-    assert next(statuses, None) is None
-
-
-@every_client
-def test_who_asks_for_more_time_than_there_is_is_not_waited_for(
-    peer: Any, open_caller: Any
-) -> None:
-    asked = []
-
-    def busy(connection: socket.socket) -> None:
-        while True:
-            asked.append(read_head(connection))
-            answer(connection, b"{}", b"503 No", retry_after=b"60")
-
-    started = peer(busy)
-    with open_caller(started.url, timeout=30.0) as call, pytest.raises(ProblemError) as raised:
-        call("models")
-    assert (raised.value.status, raised.value.retry_after) == (503, 60.0)
-    assert len(asked) == 1
 
 
 @every_client

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -319,10 +317,6 @@ def test_what_is_no_message_is_refused(message: Any) -> None:
         from_message(message)
 
 
-def test_a_view_of_nothing_is_an_empty_scene() -> None:
-    assert from_detection3d_array(array())["objects"] == []
-
-
 # --------------------------------------------------------------------------------- label maps
 
 
@@ -618,13 +612,3 @@ def test_the_command_takes_a_recorded_message_for_a_scene(repository: Path, tmp_
     done = runner.invoke(app, ["missing", str(numbers)])
     assert done.exit_code == 2
     assert "the class ids are numbers" in done.stderr
-
-
-def test_a_robot_needs_neither_arrays_nor_ros_for_it() -> None:
-    program = (
-        "import sys, scene_client.vision_msgs\n"
-        "heavy = {'torch', 'numpy', 'numba', 'fastapi', 'rclpy'} & set(sys.modules)\n"
-        "assert not heavy, heavy"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr

@@ -34,7 +34,6 @@ from tests.docs.blocks import (
     check_output,
     filled,
     rewrite,
-    text_agrees,
 )
 from tests.docs.conftest import Workplace
 
@@ -184,12 +183,6 @@ def test_a_comment_marks_the_next_block_alone(tmp_path: Path) -> None:
 )
 def test_answers_agree_but_for_elisions(expected: object, actual: object, same: bool) -> None:
     assert agrees(expected, actual) == same
-
-
-def test_texts_agree_but_for_elisions() -> None:
-    assert text_agrees("ready in ... s\n", "ready in 3.4 s  \n")
-    assert text_agrees("first\n...\nlast", "first\na\nb\nlast\n")
-    assert not text_agrees("ready", "not ready")
 
 
 def test_another_answer_is_noticed(tmp_path: Path) -> None:

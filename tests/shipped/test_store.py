@@ -46,10 +46,6 @@ def test_the_default_is_the_indoor_triway(models):
     assert models.resolve("default").manifest.name == "indoor-triway"
 
 
-def test_only_the_current_version_of_each_is_shipped(models):
-    assert len(models.entries) == len(SHIPPED)
-
-
 def test_the_terms_of_each_model_are_those_of_its_data(artifact):
     text = (STORE.root / "TERMS.md").read_text()
     rows = dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|", text, re.MULTILINE))
