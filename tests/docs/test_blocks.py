@@ -153,20 +153,6 @@ def page_of(tmp_path: Path, text: str) -> list[Block]:
     return list(blocks(page))
 
 
-def test_a_block_right_below_an_executed_one_is_its_output(tmp_path: Path) -> None:
-    text = "```sh\necho 1\n```\n\n```text\n1\n```\n\nProse.\n\n```json\n{}\n```\n"
-    first, second = page_of(tmp_path, text)
-    assert first.output is not None
-    assert (first.line, first.output.source) == (2, "1\n")
-    assert (second.language, second.output) == ("json", None)
-
-
-def test_a_comment_marks_the_next_block_alone(tmp_path: Path) -> None:
-    text = "<!-- not run: takes a minute -->\n```sh\na\n```\n\n```sh\nb\n```\n"
-    first, second = page_of(tmp_path, text)
-    assert (first.mark, first.reason, second.mark) == ("not run", "takes a minute", "")
-
-
 @pytest.mark.parametrize(
     ("expected", "actual", "same"),
     [
@@ -190,21 +176,3 @@ def test_another_answer_is_noticed(tmp_path: Path) -> None:
     check_output(block, '{"p": 1.0, "request_id": "a"}')
     with pytest.raises(AssertionError, match=r"page\.md:2 answers"):
         check_output(block, '{"p": 2.0}')
-
-
-def test_outputs_are_written_anew_and_elisions_stay(tmp_path: Path) -> None:
-    text = (
-        "Top\n```sh\na\n```\n```json\n{}\n```\n\n```sh\nb\n```\n\n```text\nold\nlines\n```\n"
-        "```sh\nc\n```\n```text\nat ...\n```\nEnd\n"
-    )
-    first, second, third = page_of(tmp_path, text)
-    answer = '{"request_id": "x", "found": [{"p": 1}, {"p": 2}], "n": 3}'
-    json_text, lines = filled(first, answer), filled(second, "new\n\n")
-    assert json_text is not None
-    assert lines is not None
-    assert filled(third, "at noon") is None
-    page = tmp_path / "page.md"
-    rewrite(page, [(first, json_text), (second, lines)])
-    expected = text.replace("{}\n", '{"found": [\n  {"p": 1},\n  {"p": 2}],\n "n": 3}\n')
-    assert page.read_text() == expected.replace("old\nlines\n", "new\n")
-    assert [str(block) for block in blocks(page)] == ["page.md:3", "page.md:13", "page.md:20"]

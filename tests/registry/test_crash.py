@@ -22,8 +22,8 @@ from tests.registry.small_artifacts import description, state
 
 pytestmark = pytest.mark.system
 
-KILLS = 20
-PUBLICATIONS = 5  # the kills are spread over the time that so many take
+KILLS = 10
+PUBLICATIONS = 4  # the kills are spread over the time that so many take
 
 
 class Publishers:
