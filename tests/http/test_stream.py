@@ -29,6 +29,7 @@ from scene_client import (
     StreamProblemError,
     UnreachableError,
 )
+from tests.chaos.wire import Wire, exchange
 from tests.http.stores import make_store
 from tests.http.streams import ASK, answered, hear, opened, posted, say, talk, updates
 from tests.http.test_problems import problem
@@ -502,36 +503,64 @@ def test_a_service_that_ends_takes_its_leave(tmp_path: Path) -> None:
     assert "timeout graceful shutdown" not in log
 
 
+# `python -c` in place of `python -m app`. Not in the module itself, or the models would be refused
+# when they are warmed up.
 DEFECTIVE = """
 import sys
+from types import SimpleNamespace
 from app.__main__ import main
 from app.serving import questions
 
 def fail(*_, **__):
     raise ZeroDivisionError("of course")
 
-questions.missing = fail
+questions.questions = SimpleNamespace(**{**vars(questions.questions), "missing": fail})
 sys.exit(main())
 """
 
 
-def test_a_defect_ends_its_stream_alone(shared_store: Path, tmp_path: Path) -> None:
-    with launch(shared_store, tmp_path / "log", program=("-c", DEFECTIVE)) as service:
-        with opened(service) as other, opened(service) as stream:
-            talk(other, "open", ask={"outliers": {}})
-            request = stream.response.headers["x-request-id"]  # type: ignore[union-attr]
-            talk(stream, "open")
-            say(stream, "update", seq=1, objects=["bed"])
-            assert closed(stream) == (1011, "")
-            assert talk(other, "update", seq=1, objects=["bed"])["type"] == "answer"
-        log = service.log.read_text()
-        assert log.count("of course") == 1
-        (line,) = [
-            entry
-            for entry in map(json.loads, log.splitlines())
-            if entry.get("request_id") == request and entry.get("route") == "/stream"
-        ]
-        assert line["outcome"] == "internal-error"
+@pytest.fixture(scope="module")
+def defective(
+    shared_store: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[LiveService]:
+    """A service that has a defect in one question."""
+    log = tmp_path_factory.mktemp("defective") / "log"
+    with launch(shared_store, log, program=("-c", DEFECTIVE)) as service:
+        yield service
+
+
+def test_a_defect_ends_its_stream_alone(defective: LiveService) -> None:
+    before = defective.log.read_text().count("of course")
+    with opened(defective) as other, opened(defective) as stream:
+        talk(other, "open", ask={"outliers": {}})
+        request = stream.response.headers["x-request-id"]  # type: ignore[union-attr]
+        talk(stream, "open")
+        say(stream, "update", seq=1, objects=["bed"])
+        assert closed(stream) == (1011, "")
+        assert talk(other, "update", seq=1, objects=["bed"])["type"] == "answer"
+    log = defective.log.read_text()
+    assert log.count("of course") == before + 1
+    (line,) = [
+        entry
+        for entry in map(json.loads, log.splitlines())
+        if entry.get("request_id") == request and entry.get("route") == "/stream"
+    ]
+    assert line["outcome"] == "internal-error"
+
+
+def test_a_connection_outlives_a_defect(defective: LiveService) -> None:
+    before = defective.log.read_text().count("ZeroDivisionError")
+    body = b'{"objects": ["bed", "chair", "lamp"]}'
+    request = (
+        b"POST /missing HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+        b"Content-Length: " + str(len(body)).encode() + b"\r\n\r\n" + body
+    )
+    answers, is_closed = exchange(defective.port, Wire("", [request] * 3, (500,) * 3))
+    assert not is_closed
+    assert [answer.status for answer in answers] == [500] * 3
+    assert all(b"/problems/internal-error" in answer.body for answer in answers)
+    # Each is in the log once, under its id.
+    assert defective.log.read_text().count("ZeroDivisionError") == before + 3
 
 
 # ----------------------------------------------------------------------------------- HTTP
