@@ -1,10 +1,10 @@
 """A small procedural generator of furnished rooms.
 
 For tests, examples and machines without data: real sources are read from files. Rooms are drawn
-from the tables of `training.datasets.furniture` or of another domain; furniture stands at walls
-without overlapping, small things stand on it, and relations follow from the boxes by the rules of
-`app.scene.geometry`. Every room is seen one to three times, from different sides and with some
-small things gone: those views share a group, as frames of one place do.
+from the tables of `vocabularies/rooms.toml`; furniture stands at walls without overlapping, small
+things stand on it, and relations follow from the boxes by the rules of `app.scene.geometry`. Every
+room is seen one to three times, from different sides and with some small things gone: those views
+share a group, as frames of one place do.
 """
 
 from __future__ import annotations

@@ -9,13 +9,10 @@ import typer
 from rich.console import Console
 
 from training.datasets import generate_rooms
-from training.datasets.furniture import ROOMS
+from training.datasets.furniture import DOMAINS
 from training.datasets.jsonl import write_jsonl
-from training.datasets.workplaces import WORKPLACES
 
 console = Console()
-
-_DOMAINS = {"homes": ROOMS, "workplaces": WORKPLACES}
 
 
 def example(
@@ -35,5 +32,5 @@ def example(
         console.print(f"[red]error:[/red] {file} is there already", soft_wrap=True)
         raise typer.Exit(1)
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_jsonl(generate_rooms(scenes, seed, _DOMAINS[domain]), file)
+    write_jsonl(generate_rooms(scenes, seed, DOMAINS[domain]), file)
     console.print(f"{scenes} generated scenes of {domain}: {file}", soft_wrap=True)

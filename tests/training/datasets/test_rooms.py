@@ -8,8 +8,7 @@ import pytest
 from app.scene import CANONICAL
 from app.scene.footprints import overlap_and_gap
 from training.datasets import AnnotatedScene, encode, generate_rooms, rooms_vocabulary, split
-from training.datasets.furniture import ROOMS
-from training.datasets.workplaces import WORKPLACES
+from training.datasets.furniture import ROOMS, WORKPLACES
 
 
 @pytest.fixture(scope="module")
