@@ -3,7 +3,7 @@
 from training.datasets.encoding import EncodedScene, annotated_classes, encode
 from training.datasets.meanings import MEANINGS, Meaning, meaning_of
 from training.datasets.names import Names, curated_names
-from training.datasets.readers import READERS, Reader, read_all, read_scenes
+from training.datasets.readers import READERS, Reader, read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.rooms import generate_rooms, rooms_vocabulary
 from training.datasets.shuffling import shuffle_objects
@@ -38,7 +38,6 @@ __all__ = [
     "generate_rooms",
     "indoor_vocabulary",
     "meaning_of",
-    "read_all",
     "read_scenes",
     "read_vocabulary",
     "rooms_vocabulary",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -52,12 +52,3 @@ def read_scenes(path: Path) -> list[AnnotatedScene]:
         DatasetError: the name fits no format, or the file is malformed.
     """
     return READERS[guess_format(path)](path)
-
-
-def read_all(paths: Iterable[Path]) -> list[AnnotatedScene]:
-    """The scenes of several files, in order.
-
-    Raises:
-        DatasetError: see `read_scenes`.
-    """
-    return [scene for path in paths for scene in read_scenes(path)]

@@ -1,27 +1,12 @@
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 
 import pytest
 
-from app.scene import ObjectClass, Vocabulary
-from app.scene.relations import ABOVE, ON_TOP
-from training.datasets import DatasetError, indoor_vocabulary
-from training.datasets.priors import (
-    COLUMNS,
-    MAX_LINE,
-    PERMISSIVE,
-    PRIOR_SOURCES,
-    Prior,
-    read_priors,
-)
+from training.datasets import DatasetError
+from training.datasets.priors import COLUMNS, MAX_LINE, SOURCE, read_prior_scenes
 
-VOCABULARY = Vocabulary(
-    [ObjectClass("cup"), ObjectClass("table", ("desk",)), ObjectClass("bread")],
-    ["kitchen", "living room"],
-)
-CUP, TABLE, BREAD = range(3)
 HEAD = "\t".join(COLUMNS)
 
 
@@ -31,81 +16,52 @@ def table(folder: Path, *rows: str, head: str = HEAD) -> Path:
     return path
 
 
-def test_rows_become_canonical_relations_of_classes(tmp_path: Path) -> None:
+def test_rows_of_placements_become_scenes_of_two_things(tmp_path: Path) -> None:
     path = table(
         tmp_path,
-        "housekeep_votes\tcups\ton-top\tdesk\t5\tkitchen",
-        "vg80k_partof_counts\ttable\tbelow\tcup\t2.5\t",
         "virtualhome_placing\tfood bread\ton-top\ttable\t1\tattic",
         "virtualhome_placing\tcup\tinside\ttable\t1\t",
-        "tidybot\tgoblet\ton-top\ttable\t1\t",
-        "tidybot\ttable\ton-top\tdesk\t1\ttelevision_room",
+        "tidybot\tcups\ton-top\tcup\t1\t",
+        "tidybot\tbread\tbelow\ttable\t2\t",
+        "housekeep_votes\tcup\ton-top\tdesk\t5\tkitchen",
     )
-    assert read_priors(path, VOCABULARY) == [
-        Prior("housekeep_votes", ON_TOP, CUP, TABLE, 5.0, 0),
-        Prior("vg80k_partof_counts", ABOVE, CUP, TABLE, 2.5, -1),
-        Prior("virtualhome_placing", ON_TOP, BREAD, TABLE, 1.0, -1),
-    ]
-    (only,) = read_priors(path, VOCABULARY, sources={"housekeep_votes"})
-    assert only.source == "housekeep_votes"
-
-
-def test_share_alike_sources_must_be_asked_for(tmp_path: Path) -> None:
-    path = table(
-        tmp_path,
-        "conceptnet_atlocation\tcup\ton-top\ttable\t1\t",
-        "tidybot\tcup\ton-top\ttable\t1\t",
-    )
-    assert [row.source for row in read_priors(path, VOCABULARY)] == ["tidybot"]
-    every = {source.licence for source in PRIOR_SOURCES.values()}
-    assert len(read_priors(path, VOCABULARY, licences=every)) == 2
-    assert read_priors(path, VOCABULARY, licences={"Apache-2.0"}) == []
-    shared = {source.licence for source in PRIOR_SOURCES.values() if source.share_alike}
-    assert shared == {"CC BY-SA 4.0"} == every - PERMISSIVE
+    first, second = read_prior_scenes(path)
+    assert [thing.label for thing in first.objects] == ["bread", "table"]
+    assert (first.source, first.group, first.relations) == (
+        SOURCE, "bread table", ((0, "on-top", 1),)
+    )  # fmt: skip
+    assert (second.group, second.relations) == (first.group, ((0, "below", 1),))
+    (only,) = read_prior_scenes(path, sources={"housekeep_votes"})
+    assert only.group == "cup desk"
 
 
 @pytest.mark.parametrize(
-    ("row", "problem"),
+    ("row", "message"),
     [
-        ("tidybot\tcup\ton-top\ttable\t1", "line 2: has 5 columns, not 6"),
         ("nobody\tcup\ton-top\ttable\t1\t", "line 2: unknown source 'nobody'"),
-        ("tidybot\tcup\ton-top\ttable\tmany\t", "line 2: the count must be a number from 0"),
-        ("tidybot\tcup\ton-top\ttable\tnan\t", "line 2: the count must be a number from 0"),
-        (f"tidybot\tcup\ton-top\ttable\t{'9' * 400}\t", "line 2: the count must be a number"),
-        (f"tidybot\t{'x' * MAX_LINE}\ton-top\ttable\t1\t", "line 2: is longer than 4096 bytes"),
+        ("tidybot\tcup\ton-top\ttable\t1", "line 2: has 5 columns, not 6"),
+        ("x" * MAX_LINE, f"line 2: is longer than {MAX_LINE} bytes"),
+        ("\udcff", "line 2: not UTF-8"),
     ],
 )
-def test_malformed_rows(tmp_path: Path, row: str, problem: str) -> None:
-    with pytest.raises(DatasetError, match=rf"pairs\.tsv, {problem}"):
-        read_priors(table(tmp_path, row), VOCABULARY)
+def test_malformed_rows(tmp_path: Path, row: str, message: str) -> None:
+    path = tmp_path / "pairs.tsv"
+    path.write_bytes(f"{HEAD}\n{row}\n".encode("utf-8", "surrogateescape"))
+    with pytest.raises(DatasetError, match=message):
+        read_prior_scenes(path)
 
 
-def test_malformed_files(tmp_path: Path) -> None:
+def test_files_that_are_no_table(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"none\.tsv\.gz: cannot be read"):
-        read_priors(tmp_path / "none.tsv.gz", VOCABULARY)
+        read_prior_scenes(tmp_path / "none.tsv.gz")
     with pytest.raises(DatasetError, match="line 1: must name the columns source, subject"):
-        read_priors(table(tmp_path, head="a\tb"), VOCABULARY)
-    path = tmp_path / "bomb.tsv.gz"
-    path.write_bytes(gzip.compress(HEAD.encode() + b"\n" + b" " * 2**20))
-    with pytest.raises(DatasetError, match=r"bomb\.tsv\.gz, line 2: is longer"):
-        read_priors(path, VOCABULARY)
-    path.write_bytes(path.read_bytes()[:-12])
-    with pytest.raises(DatasetError, match=r"bomb\.tsv\.gz"):
-        read_priors(path, VOCABULARY)
-    path = table(tmp_path)
-    path.write_bytes(path.read_bytes() + b"\xff\n")
-    with pytest.raises(DatasetError, match="line 2: not UTF-8"):
-        read_priors(path, VOCABULARY)
+        read_prior_scenes(table(tmp_path, head="a\tb"))
 
 
 def test_the_real_table(repository: Path) -> None:
-    path = repository.parent / "shared" / "data" / "extra" / "placing_priors.tsv.gz"
+    path = repository.parent / "shared" / "data" / "extra" / f"{SOURCE}.tsv.gz"
     if not path.is_file():
         pytest.skip("the table of ../shared/data is not here")
-    vocabulary = indoor_vocabulary()
-    rows = read_priors(path, vocabulary)
-    assert len(rows) > 4000
-    assert all(row.subject != row.anchor for row in rows)
-    assert sum(row.room >= 0 for row in rows) > 1000
-    names = {(vocabulary.labels[r.subject], vocabulary.labels[r.anchor]) for r in rows}
-    assert ("kettle", "stove") in names
+    scenes = read_prior_scenes(path)
+    assert len(scenes) > 1000
+    assert "kettle stove" in {scene.group for scene in scenes}
