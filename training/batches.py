@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.machines import BoltzmannMachine, Triway
-from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
+from training.machines import BoltzmannMachine
+from training.machines.edges import Edges
 
 if TYPE_CHECKING:
     from training.datasets import EncodedScene
@@ -143,27 +143,8 @@ def scene_tensors(
 
 
 def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
-    """(edges, r, observed) of a batch in the machine's own layout.
-
-    In an ungated machine the units that touch an absent class are off, and observed so where the
-    scene's relations were annotated at all.
-    """
-    if isinstance(machine, Triway):
-        gated = machine.edges(batch.classes, batch.counts)
-        return gated, batch.holds.flatten(1), batch.observed.flatten(1)
-    edges = machine.edges(batch.classes)
-    pairs = pair_edges(batch.classes, batch.holds.shape[1])
-    keys = triple_keys(pairs.relation, pairs.subject, pairs.object, machine.spec.V)
-    position, found = find_triples(machine.triple_keys, keys)
-    found = found & pairs.valid
-    row, slot = found.nonzero(as_tuple=True)
-    unit = position[row, slot]
-    r = torch.zeros(len(batch), machine.spec.T)
-    r[row, unit] = batch.holds.flatten(1)[row, slot]
-    annotated = batch.observed.flatten(1).any(1)
-    observed = annotated.unsqueeze(1).expand(-1, machine.spec.T).clone()
-    observed[row, unit] = batch.observed.flatten(1)[row, slot]
-    return edges, r, observed
+    """(edges, r, observed) of a batch in the machine's own layout."""
+    return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 
 def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:

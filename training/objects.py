@@ -67,7 +67,7 @@ def fit_objects(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> None:
-    """Train b, c1, c2, W, J and Q in place.
+    """Train b, c1, c2, W, J and Q of a local machine in place.
 
     Args:
         train: scenes; those with incomplete object lists are left out.
@@ -75,13 +75,10 @@ def fit_objects(
         progress: called with the share of the updates that are done.
 
     Raises:
-        ValueError: the seed form, in which relations act on the objects.
         FloatingPointError: the weights diverged.
     """
     if not config.epochs:
         return
-    if machine.spec.form != "local":
-        raise ValueError("objects are trained by themselves in the local form only")
     generator = torch.Generator().manual_seed(seed)
     scenes = _Scenes(train, generator)
     weights = {name: machine.get_parameter(name) for name in OBJECT_WEIGHTS if name != "Q"}

@@ -41,19 +41,14 @@ def polish(
     room_dropout: float,
     seed: int,
 ) -> None:
-    """Change b, c1, c2, W and Q in place, and fill the fantasies.
+    """Change b, c1, c2, W and Q of a local machine in place, and fill the fantasies.
 
     Args:
         config: how many updates and chains; none of either does nothing.
         room_dropout: share of chains and scenes whose room type is withheld.
-
-    Raises:
-        ValueError: in the seed form, where chains cannot leave relations out.
     """
     if not config.updates and not machine.spec.N:
         return
-    if machine.spec.form != "local":
-        raise ValueError("chains over objects alone are for machines of the local form")
     generator = torch.Generator().manual_seed(seed)
 
     def scenes(count: int) -> tuple[Tensor, Tensor, Tensor]:

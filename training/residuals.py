@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from training.batches import SceneTensors, relation_units
-from training.machines import BoltzmannMachine, Triway, build
+from training.machines import BoltzmannMachine, build
 from training.machines.mean_field import Evidence, mean_field
 from training.objectives.relations import partly_shown
 
@@ -43,7 +43,7 @@ def with_counted_residuals(
         offsets: (sources, A), added to the logits of each source's scenes.
         source_weights: (sources,) what a relation of each source counts for.
     """
-    if not isinstance(machine, Triway):
+    if not machine.has_residuals:
         return machine
     keys, logits, holds, weights = _known_units(machine, train, offsets, source_weights)
     triples, which, counts = np.unique(keys, return_inverse=True, return_counts=True)
@@ -53,7 +53,8 @@ def with_counted_residuals(
         slope = np.bincount(which, weights * (holds - p), len(triples)) - _PRECISION * delta
         curvature = np.bincount(which, weights * p * (1 - p), len(triples)) + _PRECISION
         delta += (slope / curvature).clip(-2, 2)
-    old = dict(zip(machine.triple_keys.tolist(), machine.residual.tolist(), strict=True))
+    before = machine.get_parameter("residual").tolist()
+    old = dict(zip(machine.triple_keys.tolist(), before, strict=True))
     kept = (counts >= _SCENES) & (np.abs(delta) >= _LEAST)
     for key, value in zip(triples[kept].tolist(), delta[kept].tolist(), strict=True):
         old[key] = old.get(key, 0.0) + value
@@ -62,7 +63,7 @@ def with_counted_residuals(
 
 @torch.no_grad()
 def _known_units(
-    machine: Triway, train: SceneTensors, offsets: Tensor, source_weights: Tensor
+    machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Keys (U,), logits, values and weights of all known units."""
     columns: list[list[Tensor]] = [[], [], [], []]
@@ -83,7 +84,7 @@ def _known_units(
     return key.numpy(), logits.double().numpy(), r.double().numpy(), weight.double().numpy()
 
 
-def _with_residuals(machine: Triway, residuals: dict[int, float]) -> BoltzmannMachine:
+def _with_residuals(machine: BoltzmannMachine, residuals: dict[int, float]) -> BoltzmannMachine:
     V = machine.spec.V
     keys = torch.tensor(sorted(residuals), dtype=torch.int64)
     triples = torch.stack([keys // V // V, keys // V % V, keys % V], 1).to(torch.int32)

@@ -25,7 +25,8 @@ from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.reconstruction import reconstruction_error
 from training.evaluation.relations import machine_score as relation_score
 from training.evaluation.relations import rank_relations
-from training.machines import BoltzmannMachine, MachineSpec, Triway, build
+from training.machines import BoltzmannMachine, MachineSpec, build
+from training.machines.edges import find_triples, triple_keys
 from training.objectives import OBJECTIVES, CompositeLikelihood, Objective, RelationLikelihood
 from training.objectives.relations import bake_word_prior
 from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples
@@ -114,10 +115,9 @@ def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
 
 def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
     """Relation biases at the frequencies seen where relations were annotated."""
-    A = machine.spec.A
-    held, seen = torch.zeros(A), torch.zeros(A)
-    per_unit = torch.zeros(machine.spec.T)
-    V, annotated = machine.spec.V, 0
+    A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
+    held, seen, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
+    logs, times, annotated = torch.zeros(V), torch.zeros(V), 0
     for scene in scenes.scenes:
         e = scene.evidence
         if not e.observed.any():
@@ -125,31 +125,18 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
         annotated += 1
         held += torch.from_numpy(e.holds.sum((1, 2)))
         seen += torch.from_numpy(e.observed.sum((1, 2)))
-        if not isinstance(machine, Triway):
-            relation, subject, object_ = e.holds.nonzero()
-            keys = (relation * V + e.classes[subject]) * V + e.classes[object_]
-            place = torch.searchsorted(machine.triple_keys, torch.from_numpy(keys))
-            place = place.clamp(max=max(machine.spec.T - 1, 0))
-            if machine.spec.T:
-                per_unit[place[machine.triple_keys[place] == torch.from_numpy(keys)]] += 1
-    if isinstance(machine, Triway):
-        machine.d.copy_(log_odds_of(held, seen))
-        machine.usual.copy_(usual_log_counts(scenes))
-    else:
-        machine.get_parameter("d").copy_(
-            log_odds_of(per_unit, torch.full_like(per_unit, annotated))
-        )
-
-
-def usual_log_counts(scenes: SceneTensors) -> Tensor:
-    """Mean log of the instances of each class, (V,), over scenes with annotated relations."""
-    total, times = torch.zeros(scenes.v.shape[1]), torch.zeros(scenes.v.shape[1])
-    for scene in scenes.scenes:
-        e = scene.evidence
-        if e.observed.any():
-            total[torch.from_numpy(e.classes)] += torch.from_numpy(e.counts).log()
-            times[torch.from_numpy(e.classes)] += 1
-    return total / times.clamp(min=1)
+        classes = torch.from_numpy(e.classes)
+        relation, subject, object_ = torch.from_numpy(e.holds).nonzero(as_tuple=True)
+        keys = triple_keys(relation, classes[subject], classes[object_], V)
+        place, found = find_triples(machine.triple_keys, keys)
+        per_unit[place[found]] += 1
+        logs[classes] += torch.from_numpy(e.counts).log()
+        times[classes] += 1
+    machine.start_relations(
+        log_odds_of(held, seen),
+        log_odds_of(per_unit, torch.full_like(per_unit, annotated)),
+        logs / times.clamp(min=1),
+    )
 
 
 class Trainer:

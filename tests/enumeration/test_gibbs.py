@@ -15,13 +15,13 @@ import pytest
 import torch
 
 from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
+from training.machines.edges import present_classes
 from training.machines.gibbs import (
     FREE,
     Clamp,
     State,
     gibbs_step,
     initial_state,
-    present_classes,
     run,
 )
 

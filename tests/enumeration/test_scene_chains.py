@@ -18,8 +18,9 @@ from app.inference.relations import Given
 from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
+from training.machines.edges import present_classes
 from training.machines.fantasies import Fantasies, pack_scenes
-from training.machines.gibbs import Clamp, present_classes, run, sample_relations
+from training.machines.gibbs import Clamp, run, sample_relations
 
 CHAINS = 20_000
 # McDiarmid: one chain moves a total variation by 1/N, so P(TV > E + t) <= exp(-2 N t²) = 1e-9.

@@ -115,7 +115,7 @@ def machine_density(
     Raises:
         ValueError: the machine is of the seed form, whose relations do not drop out.
     """
-    if machine.spec.form != "local":
+    if machine.relations_act:
         raise ValueError("objects have a density of their own in the local form alone")
     objects = object_part(machine)
     below, above = log_partition(objects, train, settings, seed)

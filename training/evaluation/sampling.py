@@ -8,8 +8,9 @@ from torch import Tensor
 from app.questions.generate import STEPS
 from training.evaluation.generation import Contradictions, Drawn, Sampler
 from training.machines import BoltzmannMachine
+from training.machines.edges import present_classes
 from training.machines.fantasies import Fantasies
-from training.machines.gibbs import Clamp, State, gibbs_step, present_classes, run
+from training.machines.gibbs import Clamp, State, gibbs_step, run
 
 _CHAINS = 256
 
@@ -42,7 +43,7 @@ def _sweep(
     machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp, steps: int
 ) -> State:
     """Gibbs sweeps. In the local form relations do not act on the rest: the last one draws them."""
-    always = machine.spec.form == "seed"
+    always = machine.relations_act
     state = run(machine, state, generator, steps - 1, clamp, relations=always)
     return gibbs_step(machine, state, generator, clamp)
 

@@ -8,9 +8,10 @@ A row of `Edges` belongs to a scene; a unit outside the row is off.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,6 +33,15 @@ class Edges(ABC):
     def shape(self) -> torch.Size:
         """(B or 1, E)."""
 
+    @property
+    @abstractmethod
+    def classes(self) -> Tensor:
+        """(B or 1, n) int64, the classes that `BoltzmannMachine.edges` makes these units from."""
+
+    @abstractmethod
+    def expand(self, rows: int) -> Edges:
+        """The units of one scene for each of so many."""
+
     @abstractmethod
     def ends_present(self, v: Tensor) -> Tensor:
         """(..., B, E) float: 1 where both ends of a unit are present in v (..., B, V)."""
@@ -50,6 +60,15 @@ class TripleEdges(Edges):
     def shape(self) -> torch.Size:
         """(1, E)."""
         return self.valid.shape
+
+    @property
+    def classes(self) -> Tensor:
+        """(1, 0): the table is the same for all classes."""
+        return self.subject.new_zeros(1, 0)
+
+    def expand(self, rows: int) -> TripleEdges:
+        """The same row, which all scenes share."""
+        return self
 
     def ends_present(self, v: Tensor) -> Tensor:
         """(..., B, E) float: 1 where both ends of a unit are present."""
@@ -84,6 +103,16 @@ class PairEdges(Edges):
         """(B, A·n·m)."""
         (B, n), m = self.subjects.shape, self.objects.shape[1]
         return torch.Size((B, self.relations * n * m))
+
+    @property
+    def classes(self) -> Tensor:
+        """(B, n), the subjects, -1 where padded."""
+        return torch.where(self.valid_subjects, self.subjects, -1)
+
+    def expand(self, rows: int) -> PairEdges:
+        """A row for each scene."""
+        ends = [getattr(self, field.name) for field in fields(self) if field.name != "relations"]
+        return PairEdges(self.relations, *(end.expand(rows, -1) for end in ends))
 
     @cached_property
     def relation(self) -> Tensor:  # type: ignore[override]
@@ -178,3 +207,25 @@ def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros_like(keys), torch.zeros_like(keys, dtype=torch.bool)
     position = torch.searchsorted(table, keys.contiguous()).clamp(max=table.numel() - 1)
     return position, table[position] == keys
+
+
+def present_classes(v: Tensor, leading: Tensor | None = None) -> Tensor:
+    """The classes present in each row of v, (B, n) int64 padded with -1; `leading` ones first.
+
+    Args:
+        leading: (B, k) classes that are present and keep their order.
+    """
+    # numpy lists the units that are on several times faster than torch does.
+    present = v.detach().numpy() > 0
+    lead = np.zeros((len(v), 0), np.int64) if leading is None else leading.numpy()
+    rows = np.arange(len(v))[:, None]
+    if lead.size:
+        present[rows, lead] = False
+    row, column = present.nonzero()
+    counts = present.sum(1)
+    width = lead.shape[1] + int(counts.max(initial=0))
+    classes = np.full((len(v), width), -1, dtype=np.int64)
+    classes[:, : lead.shape[1]] = lead
+    place = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
+    classes[row, lead.shape[1] + place] = column
+    return torch.from_numpy(classes)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
+from training.machines.bernoulli import bernoulli
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 from training.machines.rbm import RBM, scale
@@ -40,9 +41,26 @@ class GBM(RBM):
         result = result.index_add(-1, edges.subject[0], r * self.g[:, 0])
         return result.index_add(-1, edges.object[0], r * self.g[:, 1])
 
+    def sample_objects(
+        self,
+        v: Tensor,
+        h1: Tensor,
+        r: Tensor,
+        edges: Edges,
+        generator: torch.Generator,
+        *,
+        held: Tensor | None = None,
+        collapsed: bool = True,
+    ) -> Tensor:
+        """Given h1 and r in the seed form."""
+        logits = self._object_input(h1)
+        if self.relations_act:
+            logits = logits + self.relation_input(edges, r)
+        return bernoulli(logits.sigmoid_(), generator)
+
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
         """sum over R_i of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0); 0 in the local form."""
-        if self.spec.form == "local":
+        if not self.relations_act:
             return super().attraction(v, h1, edges, candidates)
         subject, object_ = edges.subject[0], edges.object[0]
         bare = RBM.relation_logits(self, edges, v, h1)

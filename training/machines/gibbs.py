@@ -20,17 +20,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from training.machines.bernoulli import bernoulli
 from training.machines.edges import Edges
-from training.machines.gbm import GBM
 from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
 from training.machines.presence import presence_product
-from training.machines.triway import Triway
 
 _PROPOSAL_BLOCKS = 8
 # Relations that imply each other are drawn in twice so many groups, each given those before it.
@@ -66,6 +63,13 @@ class Clamp:
     r: Tensor | None = None
     observed: Tensor | None = None
     room: Tensor | None = None
+
+    @property
+    def relations(self) -> tuple[Edges, Tensor, Tensor] | None:
+        """(edges, r, observed), or None where no relation is observed."""
+        if self.edges is None or self.r is None or self.observed is None:
+            return None
+        return self.edges, self.r, self.observed
 
 
 FREE = Clamp()
@@ -150,18 +154,19 @@ def sample_h1(
     x = presence_product(v, machine.W).add_(machine.context_bias(clamp.room))
     if second is not None:
         x = torch.addmm(x, second, machine.J.T)
-    if machine.spec.form == "seed" and state.r.shape[-1]:
+    if machine.relations_act and state.r.shape[-1]:
         x = x + machine.hidden_input(state.edges, state.r)
     prior = x.sigmoid_()
-    if machine.spec.form == "seed" or clamp.edges is None:
+    given = clamp.relations
+    if machine.relations_act or given is None:
         return _keep(clamp.h1, state.h1, bernoulli(prior, generator))
     h1 = state.h1
-    weight = _observed_weight(machine, v, h1, clamp)
+    weight = _observed_weight(machine, v, h1, given)
     block = torch.randint(_PROPOSAL_BLOCKS, h1.shape, generator=generator)
     for k in range(_PROPOSAL_BLOCKS):
         proposal = torch.where(block == k, bernoulli(prior, generator), h1)
         proposal = _keep(clamp.h1, h1, proposal)
-        new = _observed_weight(machine, v, proposal, clamp)
+        new = _observed_weight(machine, v, proposal, given)
         accept = torch.rand(new.shape, generator=generator, dtype=new.dtype).log() < new - weight
         h1 = torch.where(accept.unsqueeze(-1), proposal, h1)
         weight = torch.where(accept, new, weight)
@@ -177,32 +182,10 @@ def sample_v(
     collapsed: bool = True,
 ) -> Tensor:
     """v | h1, with unobserved relations summed out where `collapsed`, else v | h1, r; (B, V)."""
-    # addmm: the bias enters with the product; memory is what a sweep waits for.
-    logits = torch.addmm(machine.b, state.h1, machine.W.T)
-    if isinstance(machine, GBM) and machine.spec.form == "seed":
-        logits = logits + machine.relation_input(state.edges, state.r)
-    elif isinstance(machine, Triway) and machine.spec.form == "seed":
-        if collapsed:
-            return _collapsed_sweep(machine, state, generator, clamp)
-        if bool(machine.kappa.any()):
-            raise ValueError("the plain kernel needs κ = 0: κ ties objects even given h1 and r")
-        held = machine.held_objects(state.edges, state.r)
-        return _keep(clamp.v, state.v, bernoulli(logits.sigmoid(), generator).maximum(held))
-    return _keep(clamp.v, state.v, bernoulli(logits.sigmoid_(), generator))
-
-
-def _collapsed_sweep(
-    machine: Triway, state: State, generator: torch.Generator, clamp: Clamp
-) -> Tensor:
-    v, h1 = state.v.clone(), state.h1
-    logits = machine.object_logits(h1)
-    for i in range(machine.spec.V):
-        candidate = torch.tensor([[i]])
-        gain = machine.attraction_to_all(v, h1, candidate)[:, 0]
-        drawn = bernoulli((logits[:, i] + gain).sigmoid(), generator)
-        held = None if clamp.v is None else clamp.v.expand_as(v)[:, i]
-        v[:, i] = _keep(held, v[:, i], drawn)
-    return v
+    drawn = machine.sample_objects(
+        *(state.v, state.h1, state.r, state.edges, generator), held=clamp.v, collapsed=collapsed
+    )
+    return _keep(clamp.v, state.v, drawn)
 
 
 def sample_relations(
@@ -217,27 +200,12 @@ def sample_relations(
     Returns:
         The units and r (B, E). In a Triway machine the classes of `clamp.edges` come first.
     """
-    if not isinstance(machine, Triway):
-        edges = machine.edges(torch.zeros(1, 0, dtype=torch.int64))
-        p = machine.relation_logits(edges, v, h1).sigmoid() * machine.gate(edges, v)
-        r = bernoulli(p, generator)
-        if clamp.edges is None or clamp.r is None or clamp.observed is None:
-            return edges, r
-        return edges, torch.where(clamp.observed, clamp.r, r)
-    pairs = machine.evidence_pairs(clamp.edges, len(v))
-    classes = present_classes(v, pairs.subjects if pairs is not None else None)
-    edges = machine.edges(classes)
+    edges, r, known = machine.open_units(v, clamp.relations)
     logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
-    r, known = torch.zeros_like(logits), torch.zeros_like(logits, dtype=torch.bool)
-    if pairs is not None and clamp.r is not None and clamp.observed is not None:
-        # Both are copied into views of r and known.
-        n = pairs.subjects.shape[1]
-        edges.unflatten(known)[..., :n, :n] = pairs.unflatten(clamp.observed)
-        edges.unflatten(r)[..., :n, :n] = pairs.unflatten(clamp.r * clamp.observed)
     if not machine.spec.G:
         return edges, torch.where(known, r, bernoulli(logits.sigmoid() * gate, generator))
     context = mean_field(machine, Evidence(v, room=clamp.room)).y.sigmoid()
-    group = _drawing_order(edges.unflatten(logits), generator).flatten(-3)
+    group = _drawing_order(machine.between(edges, logits, edges.classes), generator).flatten(-3)
     for k in range(2 * _RELATION_GROUPS):
         p = (logits + machine.implied(edges, r, context)).sigmoid() * gate
         r = torch.where((group == k) & ~known, bernoulli(p, generator), r)
@@ -252,35 +220,13 @@ def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
     return group + _RELATION_GROUPS * later
 
 
-def present_classes(v: Tensor, leading: Tensor | None = None) -> Tensor:
-    """The classes present in each row of v, (B, n) int64 padded with -1; `leading` ones first.
-
-    Args:
-        leading: (B, k) classes that are present and keep their order.
-    """
-    # numpy lists the units that are on several times faster than torch does.
-    present = v.detach().numpy() > 0
-    lead = np.zeros((len(v), 0), np.int64) if leading is None else leading.numpy()
-    rows = np.arange(len(v))[:, None]
-    if lead.size:
-        present[rows, lead] = False
-    row, column = present.nonzero()
-    counts = present.sum(1)
-    width = lead.shape[1] + int(counts.max(initial=0))
-    classes = np.full((len(v), width), -1, dtype=np.int64)
-    classes[:, : lead.shape[1]] = lead
-    place = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
-    classes[row, lead.shape[1] + place] = column
-    return torch.from_numpy(classes)
-
-
-def _observed_weight(machine: BoltzmannMachine, v: Tensor, h1: Tensor, clamp: Clamp) -> Tensor:
+def _observed_weight(
+    machine: BoltzmannMachine, v: Tensor, h1: Tensor, relations: tuple[Edges, Tensor, Tensor]
+) -> Tensor:
     """log p(observed r | v, h1), (B,)."""
-    if clamp.edges is None or clamp.r is None or clamp.observed is None:
-        raise ValueError("observed relations need edges, r and observed")
-    gate = machine.gate(clamp.edges, v)
-    logits = machine.relation_logits(clamp.edges, v, h1)
-    return machine.relation_term(logits, gate, clamp.r, clamp.observed).sum(-1)
+    edges, r, observed = relations
+    logits = machine.relation_logits(edges, v, h1)
+    return machine.relation_term(logits, machine.gate(edges, v), r, observed).sum(-1)
 
 
 def _keep(mask: Tensor | None, old: Tensor, new: Tensor) -> Tensor:

@@ -85,7 +85,7 @@ def object_log_odds(
         rows = machine.W[candidates]
         y = field.y.unsqueeze(1)
         gain = machine.b[candidates] + (softplus(y + rows) - softplus(y)).sum(-1)
-    if evidence.edges is None or machine.spec.form == "local":
+    if evidence.edges is None or not machine.relations_act:
         return gain
     return gain + machine.attraction(evidence.v, field.y.sigmoid(), evidence.edges, candidates)
 
@@ -164,7 +164,7 @@ def relation_log_odds_observed(machine: BoltzmannMachine, evidence: Evidence) ->
     Raises:
         ValueError: in the local form, or where a unit is unobserved.
     """
-    if machine.spec.form == "local":
+    if not machine.relations_act:
         raise ValueError("the local form has no closed form with relations observed")
     relations = evidence.relations(machine)
     if relations is None or not bool(relations[2].all()):

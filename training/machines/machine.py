@@ -28,7 +28,8 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from app.inference.variants import MachineSpec
-from training.machines.edges import Edges, triple_keys
+from training.machines.bernoulli import bernoulli
+from training.machines.edges import Edges, PairEdges, triple_keys
 
 
 class BoltzmannMachine(nn.Module, ABC):
@@ -36,6 +37,9 @@ class BoltzmannMachine(nn.Module, ABC):
 
     Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
     """
+
+    # Triples have weights of their own beside shared ones, which `training.residuals` may fit.
+    has_residuals = False
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__()
@@ -90,6 +94,16 @@ class BoltzmannMachine(nn.Module, ABC):
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
         return self
 
+    @abstractmethod
+    def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
+        """Set relation biases to the log-odds seen in training.
+
+        Args:
+            by_relation: (A,) log-odds that an observed relation holds.
+            by_unit: (T,) log-odds that a scene with relations holds each triple of the table.
+            usual: (V,) mean log of the instances of each class.
+        """
+
     @property
     def parameter_count(self) -> int:
         """Number of trained weights."""
@@ -105,6 +119,33 @@ class BoltzmannMachine(nn.Module, ABC):
             classes: (B, n) int64, -1 where padded.
             counts: (B, n) instances per class, 0 where unknown; one each where omitted.
         """
+
+    @abstractmethod
+    def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
+        """The machine's units, the place of each pair's unit among them, and whether it has one.
+
+        The last two are (B, A·n·m); the place is arbitrary where there is no unit.
+        """
+
+    @abstractmethod
+    def lay_out(
+        self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
+    ) -> tuple[Edges, Tensor, Tensor]:
+        """Relations between the classes of scenes as (edges, r, observed) of this machine.
+
+        In an ungated machine the units that touch an absent class are off, and observed so where
+        the scene's relations were annotated at all.
+
+        Args:
+            classes, counts: (B, n), as in `edges`.
+            holds, observed: (B, A, n, n).
+        """
+
+    @abstractmethod
+    def open_units(
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+    ) -> tuple[Edges, Tensor, Tensor]:
+        """The units that v leaves open, as (edges, r, observed), and r as far as it is given."""
 
     @abstractmethod
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
@@ -163,9 +204,43 @@ class BoltzmannMachine(nn.Module, ABC):
             classes: (B, n) int64, -1 where padded; `edges` are their units.
         """
 
+    @property
+    def relations_act(self) -> bool:
+        """Whether unobserved relations act on objects and context; never in the local form."""
+        return not self.spec.is_local
+
     @abstractmethod
     def acting_units(self, v: Tensor) -> Edges | None:
         """Units that act on objects while they are unobserved; None in the local form."""
+
+    def context_units(self, edges: Edges) -> Edges | None:
+        """Of these units, those that the context sees unobserved while relations are learnt."""
+        del edges
+        return None
+
+    def sample_objects(
+        self,
+        v: Tensor,
+        h1: Tensor,
+        r: Tensor,
+        edges: Edges,
+        generator: torch.Generator,
+        *,
+        held: Tensor | None = None,
+        collapsed: bool = True,
+    ) -> Tensor:
+        """v given h1 and, where it acts, r, (B, V); see `training.machines.gibbs`.
+
+        Args:
+            held: bool, broadcastable to v: these keep their value where it matters to others.
+            collapsed: unobserved relations are summed out, if they act.
+        """
+        del v, r, edges, held, collapsed
+        return bernoulli(self._object_input(h1).sigmoid_(), generator)
+
+    def _object_input(self, h1: Tensor) -> Tensor:
+        # addmm: the bias enters with the product; memory is what a sweep waits for.
+        return torch.addmm(self.b, h1, self.W.T)
 
     def begin_independent(self, machine: BoltzmannMachine) -> None:
         """Set this machine's relation weights to those of `machine` at beta = 0, see `scaled`."""
@@ -192,14 +267,14 @@ class BoltzmannMachine(nn.Module, ABC):
             observed: bool, broadcastable to logits.
         """
         summed = softplus(logits)
-        if self.spec.form == "local":
+        if not self.relations_act:
             return torch.where(observed, r * logits - summed, 0.0) * gate
         return torch.where(observed, r * logits, summed) * gate
 
     def relation_slope(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
         """Derivative of `relation_term` by the logit, (..., B, E)."""
         mean = logits.sigmoid()
-        if self.spec.form == "local":
+        if not self.relations_act:
             return torch.where(observed, r - mean, 0.0) * gate
         return torch.where(observed, r, mean) * gate
 
@@ -270,7 +345,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """
         if self.spec.H2 and h2 is None:
             raise ValueError("F has no closed form over a second layer: give h2")
-        if self.spec.form == "local":
+        if not self.relations_act:
             if r is not None:
                 raise ValueError("F has no closed form in the local form with relations observed")
             return self.free_energy_given(v, v.new_zeros(()), h2, room)

@@ -47,11 +47,11 @@ class Evidence:
             return None
         shape = (len(self.v), self.edges.shape[-1])
         if self.r is None or self.observed is None:
-            if machine.spec.form == "local":
+            if not machine.relations_act:
                 return None
             zeros = self.v.new_zeros(shape)
             return self.edges, zeros, torch.zeros_like(zeros, dtype=torch.bool)
-        if machine.spec.form == "local" and not bool(self.observed.any()):
+        if not machine.relations_act and not bool(self.observed.any()):
             return None
         return self.edges, self.r, self.observed
 
@@ -103,7 +103,7 @@ def mean_field(
     if relations is not None:
         edges, r, observed = relations
         gate = machine.gate(edges, evidence.v)
-        if machine.spec.form == "seed" and bool((observed | (gate == 0)).all()):
+        if machine.relations_act and bool((observed | (gate == 0)).all()):
             added, relations = machine.hidden_input(edges, r * gate), None
     for _ in range(iterations if two_layers or relations is not None else 0):
         if relations is not None:

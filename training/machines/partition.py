@@ -122,7 +122,7 @@ def reverse_ais(
 
 def _free_energy(machine: BoltzmannMachine, state: State) -> Tensor:
     h2 = state.h2 if machine.spec.H2 else None
-    if machine.spec.form == "local":
+    if not machine.relations_act:
         return machine.free_energy(state.v, h2=h2)
     return machine.free_energy(state.v, state.r, state.edges, h2)
 

@@ -18,6 +18,7 @@ from torch.nn.functional import softplus
 from app.inference.variants import MachineSpec
 from training.machines.edges import (
     Edges,
+    PairEdges,
     find_triples,
     pair_edges,
     triple_edges,
@@ -34,6 +35,11 @@ class RBM(BoltzmannMachine):
         self.d = nn.Parameter(torch.zeros(spec.T))
         self.U = nn.Parameter(torch.zeros(spec.T, spec.H1))
 
+    @torch.no_grad()
+    def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
+        """d is the log-odds of each unit."""
+        self.d.copy_(by_unit)
+
     def context_weights(self) -> Tensor:
         """U, (T, H1)."""
         return self.U
@@ -41,6 +47,35 @@ class RBM(BoltzmannMachine):
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
         """All T units, whatever the scene holds."""
         return triple_edges(self.triples)
+
+    def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
+        """By a look-up in the table of triples."""
+        keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
+        return triple_edges(self.triples), *find_triples(self.triple_keys, keys)
+
+    def lay_out(
+        self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
+    ) -> tuple[Edges, Tensor, Tensor]:
+        """Relations without a unit are lost."""
+        pairs = pair_edges(classes, holds.shape[1])
+        edges, position, found = self.places(pairs)
+        row, slot = (found & pairs.valid).nonzero(as_tuple=True)
+        unit = position[row, slot]
+        r = torch.zeros(len(classes), self.spec.T)
+        r[row, unit] = holds.flatten(1)[row, slot]
+        annotated = observed.flatten(1).any(1)
+        known = annotated.unsqueeze(1).expand(-1, self.spec.T).clone()
+        known[row, unit] = observed.flatten(1)[row, slot]
+        return edges, r, known
+
+    def open_units(
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+    ) -> tuple[Edges, Tensor, Tensor]:
+        """All of them."""
+        if given is not None:
+            return given
+        r = v.new_zeros(len(v), self.spec.T)
+        return triple_edges(self.triples), r, torch.zeros_like(r, dtype=torch.bool)
 
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
         """No gate: every unit of the table may be on."""
@@ -58,10 +93,6 @@ class RBM(BoltzmannMachine):
         """U itself."""
         return self.context_weights().unsqueeze(0)
 
-    def relation_input(self, edges: Edges, r: Tensor) -> Tensor:
-        """What relations add to the log-odds of objects, (..., B, V): nothing."""
-        return r.new_zeros(*r.shape[:-1], self.spec.V)
-
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
         """Zero: given the context, relations do not touch objects."""
         return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
@@ -69,16 +100,15 @@ class RBM(BoltzmannMachine):
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
         """Each unit at its triple; most relations have none."""
         pairs = pair_edges(classes, self.spec.A)
-        keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
-        position, found = find_triples(self.triple_keys, keys)
+        _, position, found = self.places(pairs)
         if not self.spec.T:
-            return pairs.unflatten(torch.full(keys.shape, -torch.inf))
+            return pairs.unflatten(torch.full(found.shape, -torch.inf))
         spread = values.gather(1, position)
         return pairs.unflatten(torch.where(found & pairs.valid, spread, -torch.inf))
 
     def acting_units(self, v: Tensor) -> Edges | None:
         """All T units."""
-        return None if self.spec.is_local else triple_edges(self.triples)
+        return triple_edges(self.triples) if self.relations_act else None
 
     @torch.no_grad()
     def begin_independent(self, machine: BoltzmannMachine) -> None:
@@ -87,7 +117,7 @@ class RBM(BoltzmannMachine):
 
     def relation_log_partition(self) -> float:
         """sum_t softplus(d_t) in the seed form."""
-        return 0.0 if self.spec.is_local else float(softplus(self.d).sum())
+        return float(softplus(self.d).sum()) if self.relations_act else 0.0
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:

@@ -29,7 +29,15 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding, softplus
 
 from app.inference.variants import MachineSpec, feature_count
-from training.machines.edges import Edges, PairEdges, find_triples, pair_edges, triple_keys
+from training.machines.bernoulli import bernoulli
+from training.machines.edges import (
+    Edges,
+    PairEdges,
+    find_triples,
+    pair_edges,
+    present_classes,
+    triple_keys,
+)
 from training.machines.implications import implied
 from training.machines.machine import BoltzmannMachine
 from training.machines.rbm import scale
@@ -37,6 +45,8 @@ from training.machines.rbm import scale
 
 class Triway(BoltzmannMachine):
     """Gated, factorised relations on active pairs; seed or locally normalised form."""
+
+    has_residuals = True
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__(spec)
@@ -57,6 +67,12 @@ class Triway(BoltzmannMachine):
             self.B = nn.Parameter(torch.zeros(spec.G, H1))
         self.kappa = nn.Parameter(torch.zeros(A), requires_grad=False)
 
+    @torch.no_grad()
+    def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
+        """d is the log-odds of each relation."""
+        self.d.copy_(by_relation)
+        self.usual.copy_(usual)
+
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> PairEdges:
         """The A·n² units between the given classes; all others are off.
 
@@ -68,6 +84,17 @@ class Triway(BoltzmannMachine):
         usual = self.usual[classes.clamp(min=0)]
         logs = torch.where(counts > 0, counts.clamp(min=1).to(self.b.dtype).log(), usual)
         return pair_edges(classes, self.spec.A, log_subjects=logs)
+
+    def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
+        """Every pair has a unit."""
+        place = torch.arange(pairs.shape[-1]).expand(pairs.shape)
+        return pairs, place, torch.ones_like(place, dtype=torch.bool)
+
+    def lay_out(
+        self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
+    ) -> tuple[Edges, Tensor, Tensor]:
+        """As they are."""
+        return self.edges(classes, counts), holds.flatten(1), observed.flatten(1)
 
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
         """v_i v_j."""
@@ -179,7 +206,7 @@ class Triway(BoltzmannMachine):
         logs: Tensor,
         candidates: Tensor,
     ) -> Tensor:
-        if self.spec.form == "local":
+        if not self.relations_act:
             return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
         present = v.gather(-1, anchors.expand(*v.shape[:-1], -1)) * valid
         candidates = candidates.expand(len(anchors), -1)
@@ -209,15 +236,63 @@ class Triway(BoltzmannMachine):
         position, found = find_triples(self.triple_keys, triple_keys(axis, ends, ends, self.spec.V))
         return logits + self.residual[position] * found
 
-    @staticmethod
-    def evidence_pairs(edges: Edges | None, rows: int) -> PairEdges | None:
-        """The square frame of observed relations, one row a chain; None where there are none."""
-        if edges is None:
-            return None
-        pairs = _pairs(edges)
-        if len(pairs.subjects) != rows:
-            raise ValueError(f"observed relations need one row per chain: {rows}")
-        return pairs
+    def open_units(
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+    ) -> tuple[Edges, Tensor, Tensor]:
+        """Those between present classes, the classes of the given units first.
+
+        Raises:
+            ValueError: the given units do not have one row for each of v.
+        """
+        frame = None if given is None else _pairs(given[0])
+        if frame is not None and len(frame.subjects) != len(v):
+            raise ValueError(f"observed relations need one row per chain: {len(v)}")
+        edges = self.edges(present_classes(v, None if frame is None else frame.subjects))
+        r = self.b.new_zeros(edges.shape)
+        known = torch.zeros_like(r, dtype=torch.bool)
+        if frame is not None and given is not None:
+            # Both are copied into views of r and known.
+            n = frame.subjects.shape[1]
+            edges.unflatten(known)[..., :n, :n] = frame.unflatten(given[2])
+            edges.unflatten(r)[..., :n, :n] = frame.unflatten(given[1] * given[2])
+        return edges, r, known
+
+    def sample_objects(
+        self,
+        v: Tensor,
+        h1: Tensor,
+        r: Tensor,
+        edges: Edges,
+        generator: torch.Generator,
+        *,
+        held: Tensor | None = None,
+        collapsed: bool = True,
+    ) -> Tensor:
+        """In the seed form object after object, or with those present that a relation needs.
+
+        Raises:
+            ValueError: the seed form with κ, not collapsed.
+        """
+        if not self.relations_act:
+            return super().sample_objects(v, h1, r, edges, generator)
+        if collapsed:
+            return self._collapsed_sweep(v.clone(), h1, held, generator)
+        if bool(self.kappa.any()):
+            raise ValueError("the plain kernel needs κ = 0: κ ties objects even given h1 and r")
+        drawn = super().sample_objects(v, h1, r, edges, generator)
+        return drawn.maximum(self.held_objects(edges, r))
+
+    def _collapsed_sweep(
+        self, v: Tensor, h1: Tensor, held: Tensor | None, generator: torch.Generator
+    ) -> Tensor:
+        logits = self.object_logits(h1)
+        for i in range(self.spec.V):
+            gain = self.attraction_to_all(v, h1, torch.tensor([[i]]))[:, 0]
+            drawn = bernoulli((logits[:, i] + gain).sigmoid(), generator)
+            if held is not None:
+                drawn = torch.where(held.expand_as(v)[:, i], v[:, i], drawn)
+            v[:, i] = drawn
+        return v
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
         """sum of κ_a over active units."""
@@ -232,15 +307,19 @@ class Triway(BoltzmannMachine):
 
     def acting_units(self, v: Tensor) -> Edges | None:
         """The units between the classes present in v (B, V)."""
-        if self.spec.is_local:
+        if not self.relations_act:
             return None
         value, index = v.topk(int(v.sum(1).max()), dim=1)
         return self.edges(torch.where(value > 0, index, -1))
 
+    def context_units(self, edges: Edges) -> Edges | None:
+        """All of them in the seed form."""
+        return edges if self.relations_act else None
+
     @torch.no_grad()
     def begin_independent(self, machine: BoltzmannMachine) -> None:
         """In the seed form κ is -log 2."""
-        if not self.spec.is_local:
+        if self.relations_act:
             self.kappa.fill_(-math.log(2))
 
     @torch.no_grad()

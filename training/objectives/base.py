@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from training.batches import Batch
 from training.config import ObjectiveConfig
 from training.machines import BoltzmannMachine
+from training.machines.edges import Edges
 
 
 class Objective(ABC):
@@ -41,3 +44,44 @@ def withhold_rooms(batch: Batch, share: float, generator: torch.Generator) -> Te
     """Room types of the batch with a share of them withheld, (B,)."""
     hidden = torch.rand(len(batch), generator=generator) < share
     return torch.where(hidden, -1, batch.room)
+
+
+def withhold_counts(batch: Batch, share: float, generator: torch.Generator) -> Batch:
+    """The batch with the numbers of instances unknown in a share of its scenes."""
+    if not share:
+        return batch
+    withheld = torch.rand(len(batch), 1, generator=generator) < share
+    return replace(batch, counts=batch.counts.masked_fill(withheld, 0))
+
+
+def relation_nll(
+    machine: BoltzmannMachine,
+    edges: Edges,
+    logits: Tensor,
+    r: Tensor,
+    observed: Tensor,
+    weight: Tensor,
+    h1: Tensor,
+    generator: torch.Generator,
+) -> Tensor:
+    """-sum over units of weight_e log p(r_e | v, h1).
+
+    A machine with implications adds the same of the other units where a random share of the
+    observed relations, another one for each scene, is given.
+
+    Args:
+        logits, r, observed, weight: (B, E) over `edges`.
+        h1: (B, H1), means given the objects.
+    """
+    nll = bernoulli_nll(logits, r, weight).sum()
+    if not machine.spec.G:
+        return nll
+    share = torch.rand(len(r), 1, generator=generator)
+    given = r * observed * (torch.rand(r.shape, generator=generator) < share)
+    shifted = logits + machine.implied(edges, given, h1)
+    return nll + bernoulli_nll(shifted, r, weight * (1 - given)).sum()
+
+
+def bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
+    """-weight log p(r) of each unit."""
+    return (softplus(logits) - r * logits) * weight

@@ -35,10 +35,10 @@ from torch.nn.functional import softplus
 
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
-from training.machines import BoltzmannMachine, Triway
+from training.machines import BoltzmannMachine
 from training.machines.log_odds import object_log_odds
 from training.machines.mean_field import Evidence, mean_field
-from training.objectives.base import Objective, withhold_rooms
+from training.objectives.base import Objective, relation_nll, withhold_counts, withhold_rooms
 from training.objectives.generative import ObjectChains
 
 
@@ -144,7 +144,7 @@ class CompositeLikelihood(Objective):
             v = v * (torch.rand(v.shape, generator=generator) >= self.config.object_dropout)
         room = withhold_rooms(batch, self.config.room_dropout, generator)
         edges = None
-        if machine.spec.form == "seed":
+        if machine.relations_act:
             classes = torch.where(v.gather(1, batch.classes.clamp(min=0)) > 0, batch.classes, -1)
             edges = machine.edges(classes, batch.counts)
         return object_log_odds(machine, Evidence(v, edges, room=room))
@@ -163,20 +163,13 @@ class CompositeLikelihood(Objective):
         if self.config.unlisted == "off":
             some = unlisted_off(some, self.classes_apart(machine))
         room = withhold_rooms(some, self.config.room_dropout, generator)
-        if self.config.count_dropout:
-            withheld = torch.rand(len(some), 1, generator=generator) < self.config.count_dropout
-            some = replace(some, counts=some.counts.masked_fill(withheld, 0))
+        some = withhold_counts(some, self.config.count_dropout, generator)
         edges, r, observed = relation_units(machine, some)
-        unseen = edges if machine.spec.form == "seed" and isinstance(machine, Triway) else None
-        h1 = mean_field(machine, Evidence(some.v, unseen, room=room)).y.sigmoid()
+        evidence = Evidence(some.v, machine.context_units(edges), room=room)
+        h1 = mean_field(machine, evidence).y.sigmoid()
         logits = machine.relation_logits(edges, some.v, h1)
         counted = observed * machine.gate(edges, some.v)
-        nll = _bernoulli_nll(logits, r, counted)
-        if machine.spec.G:
-            share = torch.rand(len(some), 1, generator=generator)
-            given = r * observed * (torch.rand(r.shape, generator=generator) < share)
-            implied = machine.implied(edges, given, h1)
-            nll = nll + _bernoulli_nll(logits + implied, r, counted * (1 - given))
+        nll = relation_nll(machine, edges, logits, r, observed, counted, h1, generator)
         return nll / len(batch)
 
 
@@ -186,7 +179,3 @@ def unlisted_off(batch: Batch, structure: Tensor) -> Batch:
     thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
     pairs = thing[:, :, None] & thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)
     return replace(batch, observed=batch.observed | pairs[:, None])
-
-
-def _bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
-    return ((softplus(logits) - r * logits) * weight).sum()

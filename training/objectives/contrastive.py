@@ -19,13 +19,12 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
 
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
-from training.machines.edges import Edges, PairEdges
+from training.machines.edges import Edges
 from training.machines.gibbs import (
     Clamp,
     State,
@@ -35,7 +34,7 @@ from training.machines.gibbs import (
     sample_h1,
 )
 from training.machines.mean_field import Evidence, mean_field
-from training.objectives.base import Objective, withhold_rooms
+from training.objectives.base import Objective, bernoulli_nll, withhold_rooms
 
 _OFFSETS = ("offset_v", "offset_h1", "offset_h2")
 
@@ -71,8 +70,7 @@ def relation_nll(
 ) -> Tensor:
     """-log p(observed r | v, h1), (B,)."""
     logits = machine.relation_logits(edges, v, h1)
-    weight = observed * machine.gate(edges, v)
-    return ((softplus(logits) - r * logits) * weight).sum(-1)
+    return bernoulli_nll(logits, r, observed * machine.gate(edges, v)).sum(-1)
 
 
 def energy_difference(
@@ -84,7 +82,7 @@ def energy_difference(
     model_room: Tensor,
 ) -> Tensor:
     """mean F(data) - mean F(model); in the local form mean E, plus -log p(r | v, h1)."""
-    if machine.spec.form == "local":
+    if not machine.relations_act:
         positive = object_energy(machine, data.v, data.h1, data.h2, data_room)
         positive = positive + relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
         negative = object_energy(machine, model.v, model.h1, model.h2, model_room)
@@ -108,7 +106,7 @@ class ContrastiveDivergence(Objective):
         """mean E(data) - mean E(after k steps)."""
         room = withhold_rooms(batch, self.config.room_dropout, generator)
         data, observed = data_state(machine, batch, room, generator)
-        relations = machine.spec.form == "seed"
+        relations = machine.relations_act
         clamp = Clamp(room=room)
         # The data's own h1 starts the first reconstruction.
         model = reconstruct(machine, data, generator, clamp, collapsed=False, relations=relations)
@@ -116,7 +114,7 @@ class ContrastiveDivergence(Objective):
             model = gibbs_step(
                 machine, model, generator, clamp, collapsed=False, relations=relations
             )
-        if machine.spec.form == "local":
+        if not machine.relations_act:
             # The energies there are of h1 as drawn. The h1 that v was drawn from is the data's own
             # after one step: with it c1 and J would see no difference.
             model = replace(model, h1=sample_h1(machine, model, generator, clamp))
@@ -139,7 +137,7 @@ class PersistentCD(Objective):
         free = torch.full((len(batch),), -1)
         data, observed = data_state(machine, batch, free, generator)
         chains = self._resume(machine, generator)
-        relations = machine.spec.form == "seed"
+        relations = machine.relations_act
         for _ in range(self.config.k):
             chains = gibbs_step(machine, chains, generator, relations=relations)
         self.chains = chains
@@ -166,12 +164,8 @@ class PersistentCD(Objective):
         state = dict(zip(_OFFSETS, self.offsets, strict=True))
         if self.chains is None:
             return state
-        edges = self.chains.edges
-        classes = torch.zeros(1, 0, dtype=torch.int64)
-        if isinstance(edges, PairEdges):
-            classes = torch.where(edges.valid_subjects, edges.subjects, -1)
         blocks = {name: getattr(self.chains, name) for name in ("v", "h1", "h2", "r")}
-        return state | blocks | {"classes": classes}
+        return state | blocks | {"classes": self.chains.edges.classes}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore the offsets and remember where the chains were."""

@@ -27,11 +27,8 @@ Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Sala
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import softplus
 from torch.nn.utils.parametrize import (
     cached,
     is_parametrized,
@@ -43,7 +40,7 @@ from training.batches import Batch, SceneTensors, relation_units
 from training.config import ObjectiveConfig
 from training.machines import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
-from training.objectives.base import Objective, withhold_rooms
+from training.objectives.base import Objective, relation_nll, withhold_counts, withhold_rooms
 
 _OBJECT_PART = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B", "usual", "d"})
 # The map of word vectors is shared by all classes, and needs less of a prior than one class does.
@@ -118,9 +115,7 @@ class RelationLikelihood(Objective):
 
     def _loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
         room = withhold_rooms(batch, self.config.room_dropout, generator)
-        if self.config.count_dropout:
-            withheld = torch.rand(len(batch), 1, generator=generator) < self.config.count_dropout
-            batch = replace(batch, counts=batch.counts.masked_fill(withheld, 0))
+        batch = withhold_counts(batch, self.config.count_dropout, generator)
         edges, r, observed = relation_units(machine, batch)
         with torch.no_grad():
             shown = partly_shown(batch.v, generator)
@@ -130,12 +125,7 @@ class RelationLikelihood(Objective):
         logits = machine.relation_logits(edges, batch.v, h1)
         logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
         known = observed * machine.gate(edges, batch.v) * weight
-        nll = _negative_log_likelihood(logits, r, known)
-        if machine.spec.G:
-            share = torch.rand(len(batch), 1, generator=generator)
-            given = r * observed * (torch.rand(r.shape, generator=generator) < share)
-            implied = machine.implied(edges, given, h1)
-            nll = nll + _negative_log_likelihood(logits + implied, r, known * (1 - given))
+        nll = relation_nll(machine, edges, logits, r, observed, known, h1, generator)
         return nll / len(batch) + self._prior(machine) / max(self.scenes, 1)
 
     def _prior(self, machine: BoltzmannMachine) -> Tensor:
@@ -171,7 +161,3 @@ def bake_word_prior(machine: BoltzmannMachine) -> None:
     for name in (*_ROWS, *_COLUMNS):
         if is_parametrized(machine, name):
             remove_parametrizations(machine, name, leave_parametrized=True)
-
-
-def _negative_log_likelihood(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
-    return ((softplus(logits) - r * logits) * weight).sum()

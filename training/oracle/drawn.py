@@ -79,7 +79,7 @@ class DrawnPosterior:
         """In closed form, prepared, in a local machine without given relations."""
         machine, evidence = self.observation.machine, self.observation.evidence
         where = torch.from_numpy(np.asarray(absent, dtype=np.int64))
-        if machine.spec.form == "local" and evidence.edges is None:
+        if not machine.relations_act and evidence.edges is None:
             y = self.object_draws.field.y[0].numpy()
             gain = self._artifact.scorer.gain(y)
             return _numpy(machine.b[where] + torch.from_numpy(gain)[where])
@@ -305,7 +305,7 @@ def presence_log_odds(
         candidates: (B or 1, N) int64.
         draws: of h1 given the evidence; those of `draw_context` by default.
     """
-    if machine.spec.form == "local" and evidence.edges is None:
+    if not machine.relations_act and evidence.edges is None:
         return object_log_odds(machine, evidence, candidates=candidates)
     draws = draw_context(machine, evidence) if draws is None else draws
     weights = machine.W[candidates]

@@ -19,7 +19,7 @@ from torch import Tensor
 from app.questions.posterior import Present, present
 from app.scene.evidence import class_evidence
 from app.scene.scene import Scene
-from training.machines import BoltzmannMachine, Triway
+from training.machines import BoltzmannMachine
 from training.machines.draws import HiddenDraws, draw_hidden
 from training.machines.mean_field import Evidence
 from training.oracle.units import Units, units_between
@@ -112,11 +112,9 @@ class Observation:
         kept = kept.expand(-1, self.machine.spec.A, -1, -1)
         observed = evidence.observed & self.units.flat(kept)
         edges = self.units.edges
-        if isinstance(self.machine, Triway) and self.machine.spec.form == "seed":
-            # Unobserved relations attract there, and a candidate's anchors go row by row.
-            shape = (size, int(self.touched.sum()))
-            classes, counts = self.classes[self.touched], self.counts[self.touched]
-            edges = self.machine.edges(classes.expand(shape), counts.expand(shape))
+        if self.machine.relations_act:
+            # Unobserved relations attract, and a candidate's anchors go row by row.
+            edges = edges.expand(size)
         return Evidence(v, edges, evidence.r.expand(size, -1), observed, room)
 
 
@@ -154,7 +152,7 @@ def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
 
 def _with_relations(scene: Observation) -> Observation:
     touched, machine = scene.touched, scene.machine
-    if machine.spec.form == "local":
+    if not machine.relations_act:
         pairs = scene.observed.any(0)
         touched = pairs.any(0) | pairs.any(1)
         if not bool(touched.any()):

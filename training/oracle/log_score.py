@@ -36,7 +36,7 @@ def log_score(
         h1: (B, H1), the context that drew the relations.
     """
     known = torch.ones_like(r, dtype=torch.bool)
-    local = machine.spec.form == "local"
+    local = not machine.relations_act
     evidence = Evidence(v, room=room) if local else Evidence(v, edges, r, known, room)
     m = mean_field(machine, evidence).h2 if machine.spec.H2 else None
     if local:

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from app.inference import relations
-from training.machines import BoltzmannMachine, Triway
-from training.machines.edges import Edges, find_triples, pair_edges, triple_keys
+from training.machines import BoltzmannMachine
+from training.machines.edges import Edges, pair_edges
 
 # As a plain number: tensors do not take numpy's.
 NO_UNIT = float(relations.NO_UNIT)
@@ -71,13 +71,9 @@ def units_between(
         log_subjects=_logs(machine, subjects, subject_counts),
         log_objects=_logs(machine, objects, object_counts),
     )
+    edges, place, exists = machine.places(pairs)
     shape = (A, len(subjects), len(objects))
-    if isinstance(machine, Triway):
-        place = torch.arange(pairs.shape[-1]).view(shape)
-        return Units(pairs, place, torch.ones(shape, dtype=torch.bool))
-    keys = triple_keys(pairs.relation, pairs.subject, pairs.object, machine.spec.V)
-    place, exists = find_triples(machine.triple_keys, keys)
-    return Units(machine.edges(subjects.unsqueeze(0)), place.view(shape), exists.view(shape))
+    return Units(edges, place.view(shape), exists.view(shape))
 
 
 def _logs(machine: BoltzmannMachine, classes: Tensor, counts: Tensor | None) -> Tensor:
