@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import torch
 import typer
@@ -30,8 +30,7 @@ from training.config import (
     with_settings,
 )
 from training.datasets import DatasetError
-from training.domain.command import init
-from training.domain.example import example
+from training.domain.command import example, fail, init
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.experiments.ablate import ablate
@@ -110,7 +109,7 @@ def train(
         *(ConfigError, DatasetError, CheckpointError, RegistryError, RunError),
         FloatingPointError,
     ) as error:
-        _fail(error)
+        fail(error)
 
 
 @app.command()
@@ -157,7 +156,7 @@ def publish(
         console.print("nothing was published; --even-if-worse publishes and promotes all the same")
         raise typer.Exit(3) from None
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
-        _fail(error)
+        fail(error)
 
 
 @app.command(name="evaluate")
@@ -202,7 +201,7 @@ def evaluate_command(
                     progress=status.update,
                 )
     except (ConfigError, DatasetError, RegistryError) as error:
-        _fail(error)
+        fail(error)
     _show(tables)
     if output is not None:
         rows = {name: [_flat(row) for row in table] for name, table in tables.items()}
@@ -215,7 +214,7 @@ def list_command(store: StorePath = _STORE) -> None:
     try:
         models = load_model_set(Store(store))
     except RegistryError as error:
-        _fail(error)
+        fail(error)
     table = Table("model", "version", "variant", "state", title="Published")
     for (name, version), entry in sorted(models.entries.items()):
         state = getattr(entry, "reason", "verified")
@@ -355,8 +354,3 @@ def _flat(row: Row) -> dict[str, str | float]:
         "task": row.task, "source": row.source, "metric": row.metric,
         "value": f.value, "low": f.low, "high": f.high, "n": f.n,
     }  # fmt: skip
-
-
-def _fail(error: Exception) -> NoReturn:
-    console.print(f"[red]error:[/red] {error}")
-    raise typer.Exit(1)

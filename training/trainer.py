@@ -73,7 +73,6 @@ class TrainingResult:
     epochs: list[Epoch]
     best_epoch: int
     seconds: float
-    finished: bool
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
@@ -287,7 +286,7 @@ class Trainer:
                 self.config.objective.room_dropout,
                 self.config.training.seed,
             )
-        return TrainingResult(machine, self.epochs, self.best_epoch, self.seconds, True)
+        return TrainingResult(machine, self.epochs, self.best_epoch, self.seconds)
 
     @property
     def _digest(self) -> str:

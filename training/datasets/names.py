@@ -95,21 +95,18 @@ class Names:
 
 
 @cache
-def curated_names(path: Path = NAMES_FILE) -> Names:
+def curated_names() -> Names:
     """Read the curated names.
 
     Raises:
         ValueError: a name that means two things.
     """
-    values = tomllib.loads(path.read_text(encoding="utf-8"))
+    values = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
+    lists = ("base", "household", "structure", "not_objects", "surroundings", "outdoor")
     return Names(
-        base=tuple(values["base"]),
-        household=tuple(values["household"]),
-        structure=tuple(values["structure"]),
-        not_objects=tuple(values["not_objects"]),
-        surroundings=tuple(values["surroundings"]),
-        outdoor=tuple(values["outdoor"]),
-        aliases={name: tuple(others) for name, others in values["aliases"].items()},
-        kinds={name: tuple(others) for name, others in values["kinds"].items()},
-        rooms={name: tuple(others) for name, others in values["rooms"].items()},
+        **{name: tuple(values[name]) for name in lists},
+        **{
+            table: {name: tuple(others) for name, others in values[table].items()}
+            for table in ("aliases", "kinds", "rooms")
+        },
     )

@@ -1,4 +1,4 @@
-"""`python -m training init`: look at somebody's scenes, propose how to train on them."""
+"""The commands about scenes: `init` proposes how to train on somebody's, `example` writes some."""
 
 from __future__ import annotations
 
@@ -6,13 +6,20 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import typer
 from rich.console import Console
 
 from training.config import ConfigError, is_file, shipped_configs, source_name
-from training.datasets import READERS, AnnotatedScene, DatasetError, vocabulary_json
+from training.datasets import (
+    READERS,
+    AnnotatedScene,
+    DatasetError,
+    generate_rooms,
+    vocabulary_json,
+)
+from training.datasets.furniture import DOMAINS
 from training.datasets.jsonl import scan_jsonl, write_jsonl
 from training.datasets.readers import guess_format
 from training.domain.proposal import Proposal, propose
@@ -73,7 +80,7 @@ def init(
     except BadLinesError as error:
         _fail_lines(error)
     except (ConfigError, DatasetError, ValueError) as error:
-        _fail(error)
+        fail(error)
     folder.mkdir(parents=True, exist_ok=True)
     for path, some in copies.items():
         write_jsonl(some, path)
@@ -163,6 +170,27 @@ def _fail_lines(error: BadLinesError) -> NoReturn:
     raise typer.Exit(1)
 
 
-def _fail(error: Exception) -> NoReturn:
+def fail(error: Exception) -> NoReturn:
+    """Print the error and leave with exit code 1."""
     console.print(f"[red]error:[/red] {error}", soft_wrap=True)
     raise typer.Exit(1) from None
+
+
+def example(
+    file: Annotated[Path, typer.Argument(help="to write, such as scenes.jsonl")],
+    domain: Annotated[
+        Literal["homes", "workplaces"],
+        typer.Option(help="furnished rooms, or laboratories, workshops and storerooms"),
+    ] = "workplaces",
+    scenes: Annotated[int, typer.Option(min=1, help="how many")] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="draws others")] = 0,
+) -> None:
+    """Write scenes that a small generator makes up: an example of the format, and of a domain.
+
+    One seed begins alike whatever the number: with more scenes the earlier ones stay.
+    """
+    if file.exists():
+        fail(ConfigError(f"{file} is there already"))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_jsonl(generate_rooms(scenes, seed, DOMAINS[domain]), file)
+    console.print(f"{scenes} generated scenes of {domain}: {file}", soft_wrap=True)

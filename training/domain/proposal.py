@@ -97,7 +97,6 @@ def propose(
     scenes: Sequence[AnnotatedScene],
     sources: Sequence[str],
     *,
-    vocabulary_file: str = "vocabulary.json",
     terms: str = "",
 ) -> Proposal:
     """Look at the scenes and choose.
@@ -122,7 +121,7 @@ def propose(
     )
     data: dict[str, Any] = {
         "sources": list(sources),
-        "vocabulary": vocabulary_file,
+        "vocabulary": "vocabulary.json",
         "split": "stable",
         "split_seed": seed,
     }

@@ -89,22 +89,17 @@ def draw_hidden(
     evidence: Evidence,
     *,
     draws: int = 64,
-    uniforms: Tensor | None = None,
     pull: float = 1.0,
 ) -> HiddenDraws:
     """Weighted draws of h1 given the evidence.
 
     Args:
         draws: M; a power of two keeps the Sobol sequence balanced.
-        uniforms: (M, H1) or (M, B, H1) to use in place of the fixed ones.
         pull: weight of the observed relations' likelihood, from 0 to 1.
     """
     field = mean_field(machine, evidence, pull=pull)
-    if uniforms is None:
-        uniforms = fixed_uniforms(draws, machine.spec.H1).to(field.y.dtype)
-    if uniforms.dim() == 2:
-        uniforms = uniforms.unsqueeze(1)
     y = field.y
+    uniforms = fixed_uniforms(draws, machine.spec.H1).to(y.dtype).unsqueeze(1)
     h1 = (uniforms < y.sigmoid()).to(y.dtype)
     log_q = (h1 * logsigmoid(y) + (1 - h1) * logsigmoid(-y)).sum(-1)
     target = (h1 * field.x).sum(-1)

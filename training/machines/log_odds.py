@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from app.inference.mean_field import SWEEPS
-from training.machines.draws import HiddenDraws, draw_hidden
+from training.machines.draws import draw_hidden
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
@@ -62,7 +61,6 @@ def object_log_odds(
     evidence: Evidence,
     *,
     candidates: Tensor | None = None,
-    iterations: int = SWEEPS,
     pull: float = 1.0,
 ) -> Tensor:
     """Log-odds of candidate objects with the context at the mean-field fixed point, (B, N).
@@ -74,10 +72,9 @@ def object_log_odds(
 
     Args:
         candidates: (B or 1, N) int64; all V classes by default.
-        iterations: sweeps of the mean field.
         pull: weight of the observed relations, see `mean_field`.
     """
-    field = mean_field(machine, evidence, iterations=iterations, pull=pull)
+    field = mean_field(machine, evidence, pull=pull)
     if candidates is None:
         gain = machine.b + context_gain(field.y, machine.W)
         candidates = torch.arange(machine.spec.V).unsqueeze(0)
@@ -94,11 +91,9 @@ def object_log_odds_estimate(
     machine: BoltzmannMachine,
     evidence: Evidence,
     *,
-    candidates: Tensor | None = None,
-    draws: HiddenDraws | None = None,
     count: int = 64,
 ) -> tuple[Tensor, Tensor]:
-    """Log-odds of candidate objects as log E[exp(...)] over draws, with their standard error.
+    """Log-odds of all objects as log E[exp(...)] over draws, with their standard error.
 
         log E_{h1 | rest}[ exp(b_i + W_i·h1 + attraction_i(h1)) ]
 
@@ -106,14 +101,12 @@ def object_log_odds_estimate(
     with a second layer, of holding h2 at its mean-field value.
 
     Returns:
-        (B, N) log-odds and (B, N) standard errors.
+        (B, V) log-odds and (B, V) standard errors.
     """
-    draws = draw_hidden(machine, evidence, draws=count) if draws is None else draws
-    if candidates is None:
-        candidates = torch.arange(machine.spec.V).unsqueeze(0)
+    draws = draw_hidden(machine, evidence, draws=count)
     gain = machine.object_logits(draws.h1)
-    gain = gain.gather(-1, candidates.expand(*gain.shape[:-1], -1))
     if evidence.edges is not None:
+        candidates = torch.arange(machine.spec.V).unsqueeze(0)
         gain = gain + machine.attraction(evidence.v, draws.h1, evidence.edges, candidates)
     log_odds = draws.log_mean_exp(gain)
     ratio = (gain - log_odds).exp()
@@ -125,7 +118,6 @@ def relation_log_odds(
     edges: Edges,
     evidence: Evidence,
     *,
-    draws: HiddenDraws | None = None,
     count: int = 64,
 ) -> tuple[Tensor, Tensor]:
     """Log-odds of the units of `edges`, each unobserved in the evidence, with standard errors.
@@ -140,7 +132,7 @@ def relation_log_odds(
     Returns:
         (B, E) log-odds and (B, E) standard errors of the log-odds.
     """
-    draws = draw_hidden(machine, evidence, draws=count) if draws is None else draws
+    draws = draw_hidden(machine, evidence, draws=count)
     logits = machine.relation_logits(edges, evidence.v, draws.h1)
     relations = evidence.relations(machine)
     if machine.spec.G and relations is not None:
