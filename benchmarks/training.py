@@ -44,6 +44,7 @@ def training_step(
         holds=(torch.rand(pairs, generator=generator) < _HOLDS).float(),
         observed=torch.ones(pairs, dtype=torch.bool),
         room=torch.full((scenes,), -1),
+        source=torch.zeros(scenes, dtype=torch.int64),
     )
     spec = MachineSpec("triway", V=V, A=A, H1=H1, H2=H2, K=K, form="seed")
     dense_units = V + A * V * V

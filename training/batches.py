@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -28,10 +28,6 @@ class Batch:
         holds, observed: (B, A, n, n) relations between those classes.
         room: (B,) int64, -1 where nobody said.
         source: (B,) int64 index into the source names of the scene tensors.
-        weight: (B,) what a scene counts for in object learning.
-        complete: (B,) bool, its object list is nearly the whole scene.
-
-    The last three default to source 0, weight 1 and complete.
     """
 
     v: Tensor
@@ -40,14 +36,7 @@ class Batch:
     holds: Tensor
     observed: Tensor
     room: Tensor
-    source: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
-    weight: Tensor = field(default_factory=lambda: torch.ones(0))
-    complete: Tensor = field(default_factory=lambda: torch.ones(0, dtype=torch.bool))
-
-    def __post_init__(self) -> None:
-        for name, value in (("source", 0), ("weight", 1), ("complete", 1)):
-            if not len(tensor := getattr(self, name)):
-                object.__setattr__(self, name, tensor.new_full((len(self.v),), value))
+    source: Tensor
 
     def __len__(self) -> int:
         return len(self.v)
@@ -109,8 +98,6 @@ class SceneTensors:
             observed=torch.from_numpy(observed),
             room=self.room[index],
             source=self.source[index],
-            weight=self.weight[index],
-            complete=self.complete[index],
         )
 
 

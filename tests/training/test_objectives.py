@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from app.scene.evidence import ClassEvidence
 from tests.enumeration.small_machines import SEED_FORM, SMALL, enumerate_joint, small_machine
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
@@ -157,6 +156,7 @@ def toy_batch(size=24, seed=0):
         holds=holds,
         observed=observed,
         room=torch.full((size,), -1),
+        source=torch.zeros(size, dtype=torch.int64),
     )
 
 
@@ -233,14 +233,6 @@ def test_masking_takes_one_class_out_and_never_structure():
     assert bool(masked.absent.gather(1, masked.target.unsqueeze(1)).all())
 
 
-def test_a_class_that_a_source_never_mentions_counts_as_absent():
-    """All classes are candidates, whatever the source of the scene."""
-    structure = torch.zeros(5, dtype=torch.bool)
-    masked = mask_one_class(toy_batch(), structure, torch.Generator().manual_seed(0))
-    assert masked is not None
-    assert torch.equal(masked.absent, masked.v == 0)
-
-
 def test_relations_that_nobody_listed_can_count_as_off():
     """Between things, not structure; scenes that nobody annotated teach nothing either way."""
     batch = toy_batch()
@@ -284,8 +276,3 @@ def test_both_terms_of_the_seed_form_are_free_energies(name):
         machine.free_energy(s.v, s.r, s.edges, h2) for s, h2 in zip(states, second, strict=True)
     ]
     torch.testing.assert_close(ours, free[0].mean() - free[1].mean())
-
-
-def test_evidence_is_the_scene_layer_s():
-    """The arrays batches are cut from are those of `ClassEvidence`."""
-    assert {"classes", "counts", "holds", "observed"} <= set(ClassEvidence.__dataclass_fields__)

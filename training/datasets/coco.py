@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from training.datasets.json_file import load_json, take
+from training.datasets.files import load_json, located, take
 from training.datasets.records import AnnotatedObject, AnnotatedScene, Box2d, DatasetError
 
 SOURCE = "coco"
@@ -16,7 +16,7 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
     """Read the images that show anything, with boxes in the image plane.
 
     Boxes around crowds are left out: they are no single thing. Left and above follow from the boxes
-    when scenes are encoded (`training.datasets.image_plane`).
+    when scenes are encoded (`derive_from_boxes`).
 
     Raises:
         DatasetError: the file is not in the layout of COCO.
@@ -40,12 +40,8 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
         if entry.get("iscrowd"):
             continue
         key = str(take(path, where, entry, "id", int))
-        try:
+        with located(path, where):
             box = AnnotatedObject(key, categories[category], box2d=_box(path, where, entry))
-        except DatasetError:
-            raise
-        except ValueError as error:
-            raise DatasetError(path, where, str(error)) from error
         images[image].append(box)
     scenes = []
     for image, objects in images.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -9,12 +10,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from app.scene import (
     CANONICAL,
     ClassEvidence,
     PoseRelations,
+    Viewpoint,
     Vocabulary,
     canonicalise,
     derive_relations,
@@ -22,15 +24,15 @@ from app.scene import (
     pool_instances,
     to_viewer_frame,
 )
-from training.datasets.image_plane import derive_from_boxes
+from scene_client.image_plane import are_neighbours, relation_between
 from training.datasets.meanings import Meaning, meaning_of
 from training.datasets.names import Names, curated_names
 from training.datasets.records import AnnotatedObject, AnnotatedScene
-from training.datasets.viewpoints import room_viewpoint
 
 A = len(CANONICAL)
 _ON_TOP: Final = CANONICAL.index("on-top")
 _VERTICAL: Final = [_ON_TOP, CANONICAL.index("above")]
+_IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 
 # Labels that a source annotates so incompletely that they say nothing there.
 LEFT_OUT: Final[dict[str, tuple[str, ...]]] = {"sunrgbd": ("wall", "floor")}
@@ -81,7 +83,7 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
     - listed relations; a relation listed in both directions is unobserved;
     - positions: the rules of `app.scene.geometry`, from `room_viewpoint` where the axes are not a
       viewer's; a support link is on-top, and the other relations of its pair are off;
-    - boxes in an image: the rule of `training.datasets.image_plane`;
+    - boxes in an image: the rule of `scene_client.image_plane`, left and above;
     - otherwise support links alone, or nothing.
 
     `training.datasets.meanings` says which unlisted relations of a source are off.
@@ -271,3 +273,55 @@ def _add_supports(found: PoseRelations, objects: Sequence[AnnotatedObject]) -> N
             found.holds[:, i, j] = False
             found.observed[:, i, j] = True
         found.holds[_ON_TOP, index, support] = True
+
+
+def room_viewpoint(scene_id: str, positions: NDArray[np.float64]) -> Viewpoint:
+    """Somebody who stands at the middle of one side of the room and looks straight in.
+
+    The room is the bounding box of the object centres; a hash of the scene's id draws the side, so
+    that a scene is always seen from the same place and a collection from all sides.
+
+    Args:
+        scene_id: the scene.
+        positions: (n, 3) centres in metres; rows with NaN do not count.
+
+    Raises:
+        ValueError: no object has a position.
+    """
+    known = positions[np.isfinite(positions).all(axis=1), :2]
+    if not len(known):
+        raise ValueError(f"scene {scene_id!r} has no object with a position")
+    (x0, y0), (x1, y1) = known.min(axis=0).tolist(), known.max(axis=0).tolist()
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    return (
+        Viewpoint(x0, y, 0.0),
+        Viewpoint(x, y0, math.pi / 2),
+        Viewpoint(x1, y, math.pi),
+        Viewpoint(x, y1, -math.pi / 2),
+    )[hashlib.sha256(scene_id.encode()).digest()[0] % 4]
+
+
+def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
+    """Relations between n boxes of an image, left and above: `scene_client.image_plane`.
+
+    Args:
+        boxes: (n, 4) rows (xmin, ymin, xmax, ymax), y downwards; a row with NaN is unseen.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    corners = np.asarray(boxes, dtype=np.float64)
+    n = len(corners)
+    if corners.shape != (n, 4) and n:
+        raise ValueError(f"boxes has shape {corners.shape}, must be {(n, 4)}")
+    rows = [tuple(row) for row in corners.tolist()]
+    holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
+    observed = np.zeros_like(holds)
+    for i in range(n):
+        for j in range(i + 1, n):
+            if not are_neighbours(rows[i], rows[j]):
+                continue
+            observed[_IN_THE_IMAGE, i, j] = observed[_IN_THE_IMAGE, j, i] = True
+            if (relation := relation_between(rows[i], rows[j])) is not None:
+                holds[canonicalise(i, relation, j)] = True
+    return PoseRelations(holds, observed)

@@ -20,8 +20,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from training.datasets.json_file import bounded_int
-from training.datasets.lines import read_lines
+from training.datasets.files import bounded_int, read_lines
 from training.datasets.predicates import relation_of
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from app.scene import RELATIONS, label_key
-from training.datasets.lines import read_lines
+from training.datasets.files import read_lines
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 
 COLUMNS: Final = ("source", "subject", "relation", "object", "count", "room")

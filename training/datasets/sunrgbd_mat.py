@@ -17,6 +17,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from training.datasets.files import located, take
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 
 SOURCE = "sunrgbd-mat"
@@ -46,9 +47,10 @@ def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
         else:
             group = f"sunrgbd-{collection}-{taken[collection] // _BLOCK}"
         taken[collection] += 1
+        boxes = _structs(take(path, where, frame, "groundtruth3DBB", object))
         objects = tuple(
             _box(path, f"{where}.groundtruth3DBB({position + 1})", position, box)
-            for position, box in enumerate(_structs(_field(path, where, frame, "groundtruth3DBB")))
+            for position, box in enumerate(boxes)
         )
         if objects:
             scenes.append(
@@ -81,21 +83,15 @@ def _structs(value: Any) -> list[Any]:
     return list(value) if isinstance(value, list) else list(np.atleast_1d(value))
 
 
-def _field(path: Path, where: str, struct: Any, name: str) -> Any:
-    if not isinstance(struct, dict) or name not in struct:
-        raise DatasetError(path, where, f"lacks the field {name}")
-    return struct[name]
-
-
 def _text(path: Path, where: str, struct: Any, name: str) -> str:
-    value = _field(path, where, struct, name)
+    value = take(path, where, struct, name, object)
     if not isinstance(value, str) or not value.strip():
         raise DatasetError(path, where, f"{name} must be a non-empty string, not {value!r}")
     return value.strip()
 
 
 def _array(path: Path, where: str, struct: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    value = _field(path, where, struct, name)
+    value = take(path, where, struct, name, object)
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -112,7 +108,7 @@ def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
     x, y, z = _array(path, where, struct, "centroid", (3,)).tolist()
     upright = int(np.abs(basis[:, 2]).argmax())
     ahead, aside = (upright + 1) % 3, (upright + 2) % 3
-    try:
+    with located(path, where):
         return AnnotatedObject(
             id=str(number),
             label=_text(path, where, struct, "classname"),
@@ -121,10 +117,6 @@ def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
             size=(2 * float(half[ahead]), 2 * float(half[aside]), 2 * float(half[upright])),
             yaw=math.atan2(-float(basis[ahead, 0]), float(basis[ahead, 1])),
         )
-    except ValueError as error:
-        if isinstance(error, DatasetError):
-            raise
-        raise DatasetError(path, where, str(error)) from error
 
 
 def _room_type(path: Path) -> str | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from training.datasets.json_file import load_json, take
+from training.datasets.files import load_json, located, take
 from training.datasets.predicates import relation_of
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 
@@ -48,7 +48,7 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
         if scene_id in seen:
             raise DatasetError(path, where, f"scene {scene_id} is listed twice")
         seen.add(scene_id)
-        try:
+        with located(path, where):
             scenes.append(
                 AnnotatedScene(
                     scene_id=scene_id,
@@ -59,10 +59,6 @@ def read_3dssg(path: Path) -> list[AnnotatedScene]:
                     relations=_relations(path, where, scan, list(objects)),
                 )
             )
-        except DatasetError:
-            raise
-        except (TypeError, ValueError) as error:
-            raise DatasetError(path, where, str(error)) from error
     return scenes
 
 

@@ -5,13 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from app.scene import ObjectClass, Viewpoint, Vocabulary, to_viewer_frame
+from app.scene import ObjectClass, Vocabulary, to_viewer_frame
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
 from training.datasets import AnnotatedObject, AnnotatedScene, annotated_classes, encode
-from training.datasets.viewpoints import room_viewpoint
+from training.datasets.encoding import room_viewpoint
 
 VOCABULARY = Vocabulary(
     [
@@ -153,14 +151,6 @@ def test_what_lies_in_a_drawer_is_on_its_desk() -> None:
     assert found.evidence.observed[:, 1, 0].all()
 
 
-def test_support_links_alone_say_only_that() -> None:
-    objects = (AnnotatedObject("d", "desk"), AnnotatedObject("m", "monitor", supported_by="d"),
-               AnnotatedObject("p", "pencil"))  # fmt: skip
-    found = encoded(objects)
-    assert triples(found) == {(ON_TOP, MONITOR, DESK)}
-    assert not found.evidence.observed[:, 2].any()
-
-
 def test_boxes_in_an_image() -> None:
     objects = (
         AnnotatedObject("d", "desk", box2d=(0, 50, 60, 90)),
@@ -169,19 +159,6 @@ def test_boxes_in_an_image() -> None:
     found = encoded(objects)
     assert triples(found) == {(ABOVE, MONITOR, DESK)}
     assert not found.evidence.observed[[FRONT, ON_TOP]].any()
-
-
-@given(st.text(min_size=1, max_size=8))
-def test_rooms_without_axes_are_seen_from_one_of_their_sides(scene_id: str) -> None:
-    positions = np.array([[1.0, 2.0, 0.0], [5.0, 8.0, 1.0], [math.nan] * 3, [2.0, 3.0, 9.0]])
-    viewpoint = room_viewpoint(scene_id, positions)
-    assert viewpoint in (
-        Viewpoint(1.0, 5.0, 0.0),
-        Viewpoint(5.0, 5.0, math.pi),
-        Viewpoint(3.0, 2.0, math.pi / 2),
-        Viewpoint(3.0, 8.0, -math.pi / 2),
-    )
-    assert viewpoint == room_viewpoint(scene_id, positions[::-1])
 
 
 def test_every_side_is_taken() -> None:

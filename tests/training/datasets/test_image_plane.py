@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene import CANONICAL
-from training.datasets.image_plane import derive_from_boxes
+from training.datasets.encoding import derive_from_boxes
 
 LEFT, FRONT, ON_TOP, ABOVE = range(4)
 corners = st.integers(0, 40)

@@ -1,14 +1,44 @@
-"""Reading JSON files whose layout others decided, with errors that say where."""
+"""Reading files that others wrote, within bounds, with errors that say where."""
 
 from __future__ import annotations
 
+import gzip
 import json
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from training.datasets.records import DatasetError
 
 MAX_DIGITS: Final = 30
+
+
+def read_lines(path: Path, limit: int) -> Iterator[bytes]:
+    """The lines of a file, gzipped where its name says so, undecoded.
+
+    A line that is not UTF-8 is then one bad line. The limit keeps a small compressed file from
+    filling the memory.
+
+    Args:
+        path: the file.
+        limit: bytes of a line, its end included.
+
+    Raises:
+        DatasetError: the file cannot be read, or has a longer line.
+    """
+    opener = gzip.open if path.suffix == ".gz" else open
+    try:
+        with opener(path, "rb") as file:
+            number = 0
+            while line := file.readline(limit + 1):
+                number += 1
+                if len(line) > limit:
+                    raise DatasetError(path, f"line {number}", f"is longer than {limit} bytes")
+                yield line
+    except (OSError, EOFError, zlib.error) as error:
+        raise DatasetError(path, "", f"cannot be read: {error}") from error
 
 
 def load_json(path: Path) -> Any:
@@ -36,6 +66,17 @@ def bounded_int(digits: str) -> int:
     if len(digits.lstrip("-")) > MAX_DIGITS:
         raise ValueError(f"a number of {len(digits)} digits starts with {digits[:10]}")
     return int(digits)
+
+
+@contextmanager
+def located(path: Path, where: str) -> Iterator[None]:
+    """Errors of what is built within become DatasetErrors that say where."""
+    try:
+        yield
+    except DatasetError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise DatasetError(path, where, str(error)) from error
 
 
 def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type, ...]) -> Any:
