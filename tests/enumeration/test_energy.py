@@ -91,11 +91,6 @@ def test_energy_is_the_formula(name):
         )
 
 
-def test_number_of_gated_states():
-    """V = 2, A = 2, H1 = H2 = 2: 4,240 states with the gate."""
-    assert len(enumerate_joint(small_machine("triway-local-two-layers")).v) == 4240
-
-
 @pytest.mark.parametrize("name", SEED_FORM)
 def test_free_energy_sums_h1_out(name):
     machine = small_machine(name)

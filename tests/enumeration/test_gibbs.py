@@ -22,7 +22,6 @@ from training.machines.gibbs import (
     State,
     gibbs_step,
     initial_state,
-    run,
 )
 
 CHAINS = 60_000
@@ -169,19 +168,6 @@ def test_tempering_scales_the_energy_in_the_seed_form():
     cold = machine.scaled(0.5)
     energy = cold.energy(joint.v, joint.r, joint.h1, joint.h2, joint.edges)
     torch.testing.assert_close(energy, 0.5 * joint.energy)
-
-
-@pytest.mark.parametrize("sweeps", [0, 1, 3])
-def test_run_makes_the_sweeps_asked_for(sweeps):
-    machine = small_machine("rbm")
-    generator = torch.Generator().manual_seed(0)
-    state = initial_state(machine, torch.zeros(40, 2).double(), generator)
-    ran = run(machine, state, generator.manual_seed(1), sweeps)
-    generator.manual_seed(1)
-    for _ in range(sweeps):
-        state = gibbs_step(machine, state, generator)
-    for name in ("v", "h1", "h2", "r"):
-        assert torch.equal(getattr(ran, name), getattr(state, name)), name
 
 
 def test_present_classes_puts_leading_ones_first():

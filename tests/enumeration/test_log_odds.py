@@ -176,13 +176,3 @@ def test_two_layers_stay_close_to_the_joint(name):
             )
             worst = max(worst, abs(float(log_odds[0, i]) - exact))
     assert worst < 0.05
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_fixed_random_numbers_make_answers_repeatable(name):
-    machine = small_machine(name)
-    v = torch.ones(1, machine.spec.V).double()
-    edges = machine.edges(torch.arange(machine.spec.V).unsqueeze(0))
-    first, _ = relation_log_odds(machine, edges, Evidence(v, edges))
-    second, _ = relation_log_odds(machine, edges, Evidence(v, edges))
-    assert torch.equal(first, second)

@@ -243,8 +243,7 @@ def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("temperature", [1.0, 1.6])
-@pytest.mark.parametrize("layers", [0, 4])
+@pytest.mark.parametrize(("layers", "temperature"), [(0, 1.0), (4, 1.6)])
 def test_relations_that_imply_each_other_are_drawn_as_by_tensors(layers, temperature):
     """Three classes, one relation, strong implications: the law of its six units from 40,000 draws
     each. Two samples: total variation within its mean and 1e-9 of McDiarmid.

@@ -39,19 +39,3 @@ def test_neighbouring_draws_are_independent():
     for lag in range(1, 17):
         correlation = float((drawn[:-lag] * drawn[lag:]).mean()) / 0.21
         assert abs(correlation) < 5 / math.sqrt(DRAWS)
-
-
-def test_a_seed_repeats_and_each_row_follows_its_own_probability():
-    p = torch.tensor([0.0, 1.0, 0.5]).expand(1000, 3)
-    first, second = (bernoulli(p, torch.Generator().manual_seed(6)) for _ in range(2))
-    assert torch.equal(first, second)
-    assert first[:, :2].mean(0).tolist() == [0, 1]
-    assert 0.4 < float(first[:, 2].mean()) < 0.6
-
-
-def test_no_unit_gives_no_draw():
-    assert bernoulli(torch.zeros(3, 0)).shape == (3, 0)
-
-
-def test_probabilities_with_a_gradient_are_drawn_from():
-    assert not bernoulli(torch.full((4,), 0.5, requires_grad=True)).requires_grad

@@ -106,30 +106,6 @@ def test_fantasies_are_weighed_by_the_formula(classes, room, held):
     assert bool((state.h1[:, list(held)] == 1).all())
 
 
-def test_a_fantasy_that_holds_what_is_given_is_preferred():
-    """Two kinds of scenes, told by one unit: nearly all chains start at the kind of the class."""
-    machine = machine_of(N=2)
-    for parameter in machine.parameters():
-        parameter.zero_()
-    machine.W[:10, 0], machine.W[10:20, 0] = 6.0, -6.0
-    machine.b[:10] = -3.0
-    machine.b[10:20] = 3.0
-    dreamt = torch.zeros(2, V)
-    dreamt[0, :5] = dreamt[1, 10:15] = 1
-    machine.fantasies.copy_(pack_scenes(dreamt))
-    for given_class, kind in ((7, 0), (17, 1)):
-        chains = evidence(given_class, chains=500)
-        state = start_chains(machine, chains, torch.Generator().manual_seed(0))
-        at_home = (state.v[:, :5].all(1), state.v[:, 10:15].all(1))[kind]
-        # exp(-3) against 1: some 24 chains of 500 start elsewhere.
-        assert float(at_home.double().mean()) > 0.9
-        assert bool((state.v[:, given_class] == 1).all())
-    # One unit that is on in the first kind of scenes alone.
-    clamp = Clamp(h1=torch.tensor([True, False, False, False]))
-    state = start_chains(machine, evidence(chains=500), torch.Generator().manual_seed(0), clamp)
-    assert bool((state.v[:, :5] == 1).all())
-
-
 def test_a_room_type_that_nobody_dreamt_of_takes_any_fantasy():
     machine = machine_of()
     machine.fantasy_rooms.fill_(0)

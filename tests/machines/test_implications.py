@@ -49,21 +49,6 @@ def test_features_are_those_of_the_docstring(grid):
     torch.testing.assert_close(ours, features_by_hand(grid))
 
 
-def test_a_path_and_the_degrees_by_hand():
-    """r(0, 1) and r(1, 2), then 0 to 3, 4, 5 and 6 as well: degrees stop at three."""
-    grid = torch.zeros(1, 1, 7, 7)
-    grid[0, 0, 0, 1] = grid[0, 0, 1, 2] = 1
-    pair, back, path = implication_features(grid)[0, :3]
-    assert pair.nonzero().tolist() == [[0, 1], [1, 2]]
-    assert back.nonzero().tolist() == [[1, 0], [2, 1]]
-    assert path.nonzero().tolist() == [[0, 2]]
-    grid[0, 0, 0, 3:] = 1
-    away = implication_features(grid)[0, 6]
-    assert away[0].tolist() == [3.0] * 7
-    grid[0, 0, 0, 5:] = 0
-    assert implication_features(grid)[0, 6, 0].tolist() == [3, 2, 3, 2, 2, 3, 3]
-
-
 @given(relations())
 def test_a_relation_says_nothing_of_itself(grid):
     """Whatever else is given, changing r_e leaves x_e as it is, for every e."""
@@ -71,22 +56,6 @@ def test_a_relation_says_nothing_of_itself(grid):
     flips = torch.eye(units, dtype=torch.float64).reshape(units, *grid.shape)
     changed = shift((grid - flips).abs()).reshape(units, units)
     torch.testing.assert_close(changed.diagonal(), shift(grid).flatten(), rtol=0, atol=1e-12)
-
-
-@given(relations(), st.randoms())
-def test_the_order_of_classes_does_not_count(grid, random):
-    order = list(range(grid.shape[-1]))
-    random.shuffle(order)
-    torch.testing.assert_close(
-        shift(grid[:, order][:, :, order]), shift(grid)[:, order][:, :, order]
-    )
-
-
-@given(st.integers(1, 3), st.integers(0, 6))
-def test_nothing_given_implies_nothing(A, n):
-    x = shift(torch.zeros(4, A, n, n).double())
-    assert x.shape == (4, A, n, n)
-    assert not bool(x.any())
 
 
 def machine_of(G=2, A=1, V=4, seed=0):
@@ -159,15 +128,6 @@ def test_relations_observed_in_another_layout_are_refused():
     r = torch.ones(1, 16).double()
     with pytest.raises(ValueError, match="layout"):
         relation_log_odds(machine, other, Evidence(torch.ones(1, 4).double(), edges, r, r > 0))
-
-
-@pytest.mark.parametrize(
-    ("variant", "form", "K"),
-    [("triway", "seed", 2), ("rbm", "local", 0), ("product_rbm", "local", 2)],
-)
-def test_only_the_local_triway_knows_implications(variant, form, K):
-    with pytest.raises(ValueError, match="G must be 0"):
-        MachineSpec(variant, V=2, A=1, H1=1, K=K, G=1, form=form)
 
 
 # -- draws ----------------------------------------------------------------------------------------

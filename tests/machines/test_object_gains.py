@@ -9,9 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.inference.objects import ContextScorer
-from training.machines import MachineSpec, build
-from training.machines.log_odds import object_log_odds
-from training.machines.mean_field import Evidence, mean_field
 
 SIZES = st.integers(1, 40)
 SEEDS = st.integers(0, 2**32)
@@ -64,23 +61,6 @@ def test_gain_neither_overflows_nor_cancels_at_the_corners(V, H1, weight, logit,
     for signs in (W, W.abs(), -W.abs()):
         for logits in (x, x.abs(), -x.abs()):
             close_to_exact(gains(signs, logits), logits, signs)
-
-
-def test_an_object_with_no_weight_gains_nothing():
-    """0 up to the rounding of sigmoid(-x) + sigmoid(x), whatever the padding of the last group."""
-    gain = gains(torch.zeros(3, 17), torch.randn(4, 17))
-    torch.testing.assert_close(gain, torch.zeros(4, 3), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("layers", [0, 5])
-def test_scores_equal_the_log_odds_of_the_machine(layers):
-    spec = MachineSpec("triway", V=30, A=2, H1=21, H2=layers, K=2, form="local")
-    generator = torch.Generator().manual_seed(1)
-    machine = build(spec).initialise(generator, scale=1.0).requires_grad_(False)
-    machine.b.normal_(generator=generator)
-    evidence = Evidence((torch.rand(3, 30, generator=generator) < 0.2).float())
-    scores = machine.b + gains(machine.W, mean_field(machine, evidence).y)
-    torch.testing.assert_close(scores, object_log_odds(machine, evidence), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])

@@ -23,14 +23,6 @@ def test_equals_the_dense_product(chains, V, H, density, seed):
     torch.testing.assert_close(presence_product(v, W), v @ W)
 
 
-def test_counts_objects_of_a_transposed_block():
-    """A view that is not contiguous is read by its rows, not by its memory."""
-    W = torch.arange(12.0).view(4, 3)
-    v = torch.zeros(4, 100).T.clone(memory_format=torch.preserve_format)
-    v[3, 2] = 1
-    assert torch.equal(presence_product(v, W)[3], W[2])
-
-
 def test_is_differentiable_in_the_weights():
     W = torch.ones(100, 3, requires_grad=True)
     v = torch.zeros(20, 100)

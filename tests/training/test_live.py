@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import re
-import signal
 import subprocess
 import sys
-import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +18,6 @@ from typer.testing import CliRunner
 from training.checkpoints import save_checkpoint
 from training.cli import app
 from training.config import Config
-from training.curves import Epoch
 from training.live import Display, sparkline, summarise
 from training.pipeline import prepare
 from training.trainer import Trainer
@@ -91,10 +86,6 @@ def test_nobody_who_asks_for_no_logs_waits_for_tensorboard() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
-def epochs_of(curve: Path) -> int:
-    return len(curve.read_text().splitlines()) - 1 if curve.exists() else 0
-
-
 @pytest.mark.parametrize("kept", [0, 2])
 def test_ctrl_c_while_an_epoch_is_kept_counts_those_that_were(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int
@@ -113,45 +104,3 @@ def test_ctrl_c_while_an_epoch_is_kept_counts_those_that_were(
     result = CliRunner().invoke(app, ["train", str(config), "--runs", str(tmp_path)])
     assert result.exit_code == 130
     assert f"stopped after epoch {kept};" in " ".join(result.output.split())
-
-
-@pytest.mark.slow
-def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path) -> None:
-    config = tmp_path / "live.toml"
-    config.write_text(CONFIG.format(epochs=400))
-    command = [sys.executable, "-m", "training", "train", str(config), "--runs", str(tmp_path)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    curve = tmp_path / "live" / "seed-0" / "curve.csv"
-    with (tmp_path / "log").open("w") as log:
-        process = subprocess.Popen(
-            command,
-            stdout=log,
-            stderr=log,
-            cwd=tmp_path,
-            env=environment,
-            # Tests that run in the background inherit that Ctrl-C is ignored.
-            preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
-        )
-        try:
-            while epochs_of(curve) < 2:
-                assert process.poll() is None, (tmp_path / "log").read_text()
-                time.sleep(0.05)
-            process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=120) == 130
-        finally:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
-    text = " ".join((tmp_path / "log").read_text().split())
-    stopped = re.search(r"stopped after epoch (\d+); the same command goes on from there", text)
-    assert stopped is not None
-    # The curve may be an epoch ahead of the checkpoint, which is written after it.
-    assert 2 <= epochs_of(curve) <= int(stopped[1]) + 1
-
-    import tomllib
-
-    resumed = Config.model_validate(tomllib.loads(config.read_text()))
-    trainer = Trainer(resumed, prepare(resumed, tmp_path).training_data(), curve.parent)
-    assert trainer.resume()
-    assert len(trainer.epochs) == int(stopped[1])
-    assert all(isinstance(epoch, Epoch) for epoch in trainer.epochs)

@@ -37,17 +37,6 @@ def dreamt(machine):
     return unpack_scenes(machine.fantasies, machine.spec.V)
 
 
-@pytest.mark.parametrize("variant", ["triway", "rbm"])
-def test_a_seed_dreams_the_same_scenes(variant):
-    first, again, other = (machine_of(50, variant) for _ in range(3))
-    assert not bool(first.fantasies.any())
-    for machine, seed in ((first, 1), (again, 1), (other, 2)):
-        dream(machine, DATA, seed)
-    assert torch.equal(first.fantasies, again.fantasies)
-    assert not torch.equal(first.fantasies, other.fantasies)
-    assert len(dreamt(first).unique(dim=0)) > 5
-
-
 def test_fantasies_follow_the_machine_and_not_the_scenes_they_began_at():
     """Independent classes: frequencies within five standard errors, 12 classes, so that chance
     fails with probability < 8e-6."""
@@ -74,17 +63,6 @@ def test_each_fantasy_knows_the_room_type_it_was_dreamt_under():
         # h1 is on with probability 0.9997 there, and each thing then with 0.98.
         assert float(found[own == room][:, things].mean()) > 0.85
         assert float(found[own != room][:, things].mean()) < 0.15
-
-
-def test_without_fantasies_nothing_is_dreamt():
-    machine = machine_of(0)
-    dream(machine, DATA, 0)
-    assert not hasattr(machine, "fantasies")
-
-
-def test_the_seed_form_is_refused():
-    with pytest.raises(ValueError, match="local form"):
-        dream(machine_of(4, form="seed"), DATA, 0)
 
 
 @pytest.mark.parametrize("variant", ["triway", "gbm"])

@@ -141,13 +141,6 @@ def test_the_last_average_of_the_relation_likelihood_is_kept(worded):
     assert losses[-1] < losses[0]
 
 
-def test_objects_alone_may_have_a_phase_before_any_objective(data):
-    config = with_settings(small_config(), {"objects.epochs": 1, "objects.chains": 8})
-    result = Trainer(config, data).run()
-    first = Trainer(with_settings(config, {"training.epochs": 1}), data).run()
-    assert torch.equal(result.machine.W, first.machine.W)
-
-
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_an_object_phase_that_diverges_says_so(data):
     config = with_settings(phased(), {"objects.learning_rate": 1e39})
@@ -196,13 +189,6 @@ def test_weights_can_be_held_at_zero(data, name):
 def test_weights_to_hold_must_exist():
     with pytest.raises(ConfigError, match="a triway has no weights H, g, only b, c1"):
         with_settings(small_config(), {"machine.without": ["H", "M", "g"]})
-
-
-def test_a_digest_knows_what_is_held_at_zero():
-    config = small_config()
-    assert "without" not in config.model_dump_json()
-    assert with_settings(config, {"machine.without": ["M"]}).digest != config.digest
-    assert with_settings(config, {"machine.without": []}).digest == config.digest
 
 
 def test_patience_ends_a_run_early(data):

@@ -80,20 +80,6 @@ def test_shares_hold_over_all_and_within_room_types(protocol: Protocol) -> None:
             assert here[room] == pytest.approx(fraction * size, abs=8)
 
 
-@given(st.integers(0, 60), st.integers(0, 5))
-def test_the_final_split_tests_nothing(groups: int, seed: int) -> None:
-    """What ships learns from all scenes but those that calibrate it."""
-    parts = split(collection("a", groups), seed=seed, protocol="final")
-    assert list(parts) == ["train", "test", "validation"]
-    assert parts["test"] == []
-
-
-def test_seeds_draw_different_splits() -> None:
-    scenes = collection("a", 100)
-    assert parts_of(scenes, seed=0) == parts_of(scenes, seed=0)
-    assert parts_of(scenes, seed=0) != parts_of(scenes, seed=1)
-
-
 def test_the_seed_protocol_tears_groups_apart() -> None:
     scenes = collection("a", 60)
     found = parts_of(scenes, seed=0, protocol="random")
