@@ -6,6 +6,7 @@ import tomllib
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 from app.scene import head_of, label_key
 
@@ -101,12 +102,11 @@ def curated_names() -> Names:
     Raises:
         ValueError: a name that means two things.
     """
-    values = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
-    lists = ("base", "household", "structure", "not_objects", "surroundings", "outdoor")
-    return Names(
-        **{name: tuple(values[name]) for name in lists},
-        **{
-            table: {name: tuple(others) for name, others in values[table].items()}
-            for table in ("aliases", "kinds", "rooms")
-        },
-    )
+    values: dict[str, Any] = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
+    found: dict[str, Any] = {
+        name: {key: tuple(others) for key, others in entry.items()}
+        if isinstance(entry, dict)
+        else tuple(entry)
+        for name, entry in values.items()
+    }
+    return Names(**found)

@@ -31,7 +31,7 @@ from torch.nn.functional import logsigmoid
 from app.inference import weights
 from app.inference.chains import OTHER_ROOM
 from training.machines.bernoulli import bernoulli
-from training.machines.gibbs import FREE, Clamp, State, initial_state
+from training.machines.gibbs import FREE, Clamp, State, bare_state, initial_state
 from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
 
@@ -88,10 +88,7 @@ class Fantasies:
         weight = self.log_weight(given, clamp)
         chosen = torch.multinomial(weight.softmax(1), 1, generator=generator).squeeze(1)
         h1, h2 = bernoulli(self.h1[chosen], generator), bernoulli(self.h2[chosen], generator)
-        # No relations: in the local form, which alone has fantasies, they do not act on the rest.
-        edges = machine.edges(torch.zeros(len(given), 0, dtype=torch.int64))
-        r = given.new_zeros(len(given), edges.shape[-1])
-        return _held(State(self.v[chosen].maximum(given), h1, h2, r, edges), clamp)
+        return _held(bare_state(machine, self.v[chosen].maximum(given), h1, h2), clamp)
 
     def log_weight(self, given: Tensor, clamp: Clamp = FREE) -> Tensor:
         """log w of every fantasy, (B, N); see the module."""

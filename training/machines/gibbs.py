@@ -86,6 +86,12 @@ def initial_state(
     return State(v, h1, h2, r, edges)
 
 
+def bare_state(machine: BoltzmannMachine, v: Tensor, h1: Tensor, h2: Tensor) -> State:
+    """A state without relations, for the local form, where they do not act on the rest."""
+    edges = machine.edges(torch.zeros(len(v), 0, dtype=torch.int64))
+    return State(v, h1, h2, v.new_zeros(len(v), edges.shape[-1]), edges)
+
+
 @torch.no_grad()
 def gibbs_step(
     machine: BoltzmannMachine,

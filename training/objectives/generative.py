@@ -17,7 +17,7 @@ from torch import Tensor
 
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
-from training.machines.gibbs import Clamp, State, gibbs_step, initial_state
+from training.machines.gibbs import Clamp, bare_state, initial_state, run
 from training.machines.mean_field import Evidence, mean_field
 
 
@@ -56,9 +56,6 @@ class ObjectChains:
             state = initial_state(machine, v[pick], generator, Clamp(room=room[pick]))
             self.blocks = {"v": state.v, "h1": state.h1, "h2": state.h2, "room": room[pick]}
         clamp = Clamp(room=self.blocks["room"])
-        no_units = machine.edges(torch.zeros(self.count, 0, dtype=torch.int64))
-        off = torch.zeros(self.count, no_units.shape[-1])
-        state = State(self.blocks["v"], self.blocks["h1"], self.blocks["h2"], off, no_units)
-        for _ in range(self.steps):
-            state = gibbs_step(machine, state, generator, clamp, relations=False)
+        state = bare_state(machine, self.blocks["v"], self.blocks["h1"], self.blocks["h2"])
+        state = run(machine, state, generator, self.steps, clamp, relations=False)
         self.blocks |= {"v": state.v, "h1": state.h1, "h2": state.h2}
