@@ -23,7 +23,6 @@ from training.datasets import (
     encode,
     jsonl,
     read_scenes,
-    split,
 )
 from training.datasets.meanings import BOXES, LISTS, MEANINGS, meaning_of
 from training.pipeline import read_sources
@@ -223,15 +222,3 @@ def test_sources_by_name_are_found_in_the_folder_extra(
     for source in ("vsr", "nr3d.jsonl.gz"):
         with pytest.raises(ConfigError, match="there is no"):
             read_sources(DataConfig(sources=(source,)), tmp_path)
-
-
-def test_coco_images_of_two_real_sources_fall_into_one_part(repository: Path) -> None:
-    root = repository.parent / "shared" / "data"
-    if not (root / "extra").is_dir():
-        pytest.skip("the real scenes of ../shared/data are not here")
-    found = read_sources(DataConfig(sources=("coco_captions", "vsr")), root)
-    groups = [{scene.group for scene in scenes} for scenes in found.values()]
-    assert groups[0] & groups[1]
-    parts = split([scene for scenes in found.values() for scene in scenes], seed=0)
-    of = {part: {scene.group for scene in scenes} for part, scenes in parts.items()}
-    assert sum(map(len, of.values())) == len(groups[0] | groups[1])

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from collections import Counter
 from pathlib import Path
 
@@ -228,19 +227,6 @@ def test_coverage_of_the_real_scenes(real: dict[str, list[AnnotatedScene]]) -> N
     for source, least in COVERAGE.items():
         assert coverage(vocabulary, real[source]) >= least, source
         assert coverage(vocabulary, real[source], structure=False) >= least - 0.005, source
-
-
-def test_the_417_most_frequent_labels_are_known(repository: Path) -> None:
-    path = repository.parent / "shared" / "design" / "vocabulary.json"
-    if not path.is_file():
-        pytest.skip("the list of ../shared/design is not here")
-    vocabulary = indoor_vocabulary()
-    entries = json.loads(path.read_text())["objects"]
-    assert len(entries) == 417
-    for entry in entries:
-        index = vocabulary.index(entry["label"])
-        assert index is not None
-        assert all(vocabulary.index(alias) == index for alias in entry["aliases"])
 
 
 def test_real_scenes_encode(real: dict[str, list[AnnotatedScene]]) -> None:
