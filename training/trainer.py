@@ -27,7 +27,7 @@ from training.evaluation.relations import machine_score as relation_score
 from training.evaluation.relations import rank_relations
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import find_triples, triple_keys
-from training.objectives import OBJECTIVES, CompositeLikelihood, Objective, RelationLikelihood
+from training.objectives import OBJECTIVES, Objective, RelationLikelihood
 from training.objectives.relations import bake_word_prior
 from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples
 from training.polish import polish
@@ -174,10 +174,7 @@ class Trainer:
         config = self.config.objective
         if config.name == "relations":
             return RelationLikelihood(config, self.machine, self.data.train, self.data.words)
-        objective = OBJECTIVES[config.name](config, self.machine)
-        if isinstance(objective, CompositeLikelihood):
-            objective.structure = self.data.structure
-        return objective
+        return OBJECTIVES[config.name](config, self.machine, self.data.structure)
 
     def _optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training

@@ -247,8 +247,7 @@ def test_relations_that_nobody_listed_can_count_as_off():
     losses = []
     for unlisted in ("unobserved", "off"):
         config = ObjectiveConfig(name="composite", unlisted=unlisted, room_dropout=0.0)
-        target = OBJECTIVES["composite"](config, machine)
-        target.structure = structure
+        target = OBJECTIVES["composite"](config, machine, structure)
         loss = target.relation_part(machine, batch, torch.Generator().manual_seed(0))
         losses.append(float(loss.detach()))
     # 16 of 24 scenes are annotated; each of their units is near even odds here.

@@ -7,16 +7,12 @@ checkpoint stores.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from training.config import ObjectiveConfig
-from training.machines import BoltzmannMachine
 from training.objectives.base import Objective
 from training.objectives.composite import CompositeLikelihood
 from training.objectives.contrastive import ContrastiveDivergence, PersistentCD
 from training.objectives.relations import RelationLikelihood
 
-OBJECTIVES: dict[str, Callable[[ObjectiveConfig, BoltzmannMachine], Objective]] = {
+OBJECTIVES: dict[str, type[Objective]] = {
     "contrastive_divergence": ContrastiveDivergence,
     "persistent_cd": PersistentCD,
     "composite": CompositeLikelihood,

@@ -18,8 +18,13 @@ from training.machines.edges import Edges
 class Objective(ABC):
     """A loss over batches, with whatever it carries from one update to the next."""
 
-    def __init__(self, config: ObjectiveConfig, machine: BoltzmannMachine) -> None:
+    def __init__(
+        self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
+    ) -> None:
+        """Args: structure: (V,) bool, classes such as walls; none of them by default."""
         self.config = config
+        nothing = torch.zeros(machine.spec.V, dtype=torch.bool)
+        self.structure = nothing if structure is None else structure
 
     @abstractmethod
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:

@@ -85,10 +85,10 @@ class CompositeLikelihood(Objective):
     (`ObjectChains`): conditionals alone leave a joint whose own samples drift from the data.
     """
 
-    structure: Tensor | None = None
-
-    def __init__(self, config: ObjectiveConfig, machine: BoltzmannMachine) -> None:
-        super().__init__(config, machine)
+    def __init__(
+        self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
+    ) -> None:
+        super().__init__(config, machine, structure)
         self.chains = ObjectChains(config.chains, config.k)
 
     def state(self) -> dict[str, Tensor]:
@@ -110,11 +110,10 @@ class CompositeLikelihood(Objective):
             room = withhold_rooms(batch, self.config.room_dropout, generator)
             chains = self.chains.loss(machine, batch.v, room, generator)
             total = total + self.config.generative_weight * chains
-        structure = self.classes_apart(machine)
-        masked = mask_one_class(batch, structure, generator)
+        masked = mask_one_class(batch, self.structure, generator)
         if masked is None:
             return total
-        log_odds = self._log_odds(machine, masked, structure, generator)
+        log_odds = self._log_odds(machine, masked, generator)
         chosen = log_odds.gather(1, masked.target.unsqueeze(1)).squeeze(1)
         others = log_odds.masked_fill(~masked.absent, -torch.inf)
         ranking = others.logsumexp(1) - chosen
@@ -122,24 +121,17 @@ class CompositeLikelihood(Objective):
         presence = masked.removable * softplus(-chosen) + off.sum(1)
         return total + (ranking + self.config.presence_weight * presence).mean()
 
-    def classes_apart(self, machine: BoltzmannMachine) -> Tensor:
-        """(V,) bool, structure: neither taken out nor related."""
-        if self.structure is not None:
-            return self.structure
-        return torch.zeros(machine.spec.V, dtype=torch.bool)
-
     def _log_odds(
         self,
         machine: BoltzmannMachine,
         masked: Masked,
-        structure: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
         """Log-odds of all classes given the rest, its relations unobserved, (B, V)."""
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
             drop = torch.rand(v.shape, generator=generator) < self.config.structure_dropout
-            v = v * ~(drop & structure)
+            v = v * ~(drop & self.structure)
         if self.config.object_dropout:
             v = v * (torch.rand(v.shape, generator=generator) >= self.config.object_dropout)
         room = withhold_rooms(batch, self.config.room_dropout, generator)
@@ -161,7 +153,7 @@ class CompositeLikelihood(Objective):
             return machine.b.sum() * 0.0
         some = batch.rows(annotated)
         if self.config.unlisted == "off":
-            some = unlisted_off(some, self.classes_apart(machine))
+            some = unlisted_off(some, self.structure)
         room = withhold_rooms(some, self.config.room_dropout, generator)
         some = withhold_counts(some, self.config.count_dropout, generator)
         edges, r, observed = relation_units(machine, some)

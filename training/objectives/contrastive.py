@@ -124,8 +124,10 @@ class ContrastiveDivergence(Objective):
 class PersistentCD(Objective):
     """PCD-k with centred gradients: the model term from chains that go on between updates."""
 
-    def __init__(self, config: ObjectiveConfig, machine: BoltzmannMachine) -> None:
-        super().__init__(config, machine)
+    def __init__(
+        self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
+    ) -> None:
+        super().__init__(config, machine, structure)
         spec = machine.spec
         self.chains: State | None = None
         self.saved: dict[str, Tensor] = {}
