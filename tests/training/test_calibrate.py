@@ -242,6 +242,12 @@ def test_hidden_classes_are_as_likely_as_said(model, fitted):
     assert found.brier_skill().value > 0
 
 
+@pytest.mark.slow
+def test_a_seed_gives_the_same_calibration(model, fitted):
+    again = calibrate_objects(model, rooms(300, 1), rooms(ROOM_COUNT, 2), STRUCTURE)
+    assert again == fitted
+
+
 def test_photographs_alone_are_calibrated_on_photographs():
     """There no scene lists all of its objects."""
     cut = tensors([replace(scene([0, 1]), complete=False) for _ in range(20)], WIDE)

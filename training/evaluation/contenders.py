@@ -71,7 +71,7 @@ def artifact_contender(
     machine = machine_of(artifact.weights)
     objects, completion = machine_score(machine), relation_score(artifact, given=True)
     density = None
-    if machine.spec.form == "local":
+    if not machine.relations_act:
         density = cache(partial(machine_density, machine, train, settings, seed))
     return Contender(
         objects=objects,
