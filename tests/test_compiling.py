@@ -113,6 +113,7 @@ def test_a_second_start_compiles_nothing(package: Path) -> None:
     assert log == ""
 
 
+@pytest.mark.slow
 def test_a_change_of_another_file_is_compiled_in(package: Path) -> None:
     start(package)
     (package / "other.py").write_text("UNUSED = 2\n")
@@ -131,6 +132,7 @@ def test_a_change_of_another_file_is_compiled_in(package: Path) -> None:
         assert (answer["result"], answer["compiled"]) == (expected, [1, 1]), (file, new)
 
 
+@pytest.mark.slow
 def test_a_folder_that_others_can_change_is_refused(package: Path, tmp_path: Path) -> None:
     root = tmp_path / "root"
     start(package, NUMBA_CACHE_DIR=str(root))
@@ -188,6 +190,7 @@ def test_only_old_folders_of_ours_are_removed(package: Path, tmp_path: Path) -> 
     assert (elsewhere / "kept").exists()
 
 
+@pytest.mark.slow
 def test_two_that_start_at_once_compile_once(package: Path) -> None:
     both = [begin(package), begin(package)]
     answers, logs = zip(*map(end, both), strict=True)

@@ -110,6 +110,7 @@ async def test_no_answer_is_larger_than_estimated(
         assert len(answer.content) <= sizes.pop()
 
 
+@pytest.mark.slow
 def test_memory_stays_bounded(shared_store: Path, tmp_path: Path) -> None:
     """It grew by 700 MB."""
     with launch(shared_store, tmp_path / "log") as service:

@@ -119,6 +119,7 @@ def test_the_longest_deadline_is_no_shorter_than_the_default(shared_store: Path)
         Settings(store=shared_store, request_timeout_ms=2_000, max_request_timeout_ms=1_000)
 
 
+@pytest.mark.slow
 def test_work_of_a_departed_client_ends(shared_store: Path, tmp_path: Path) -> None:
     with launch(shared_store, tmp_path / "log") as service:
         body = {**DEEP, "count": 64, "steps": 2000}

@@ -179,6 +179,7 @@ def test_a_header_of_a_million_tensors_is_not_parsed() -> None:
     assert refused.value.code == "too_large"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "place", ["data", "metrics", "vocabulary.objects", "calibration.relation", "training.x"]
 )

@@ -84,6 +84,7 @@ def test_scaling():
     assert sizes[0] < sizes[1]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_service(tmp_path):
     started, asked = service(store=make_store(tmp_path), objects=3, requests=5, rounds=1)
@@ -99,6 +100,7 @@ def test_service_without_a_store_is_refused(tmp_path):
         service(store=tmp_path / "none")
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_service_without_a_default_model_is_refused(tmp_path):
     publish(tmp_path, "one", "1.0.0")

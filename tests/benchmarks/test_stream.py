@@ -22,6 +22,7 @@ def test_one_thing_moves_at_a_time() -> None:
     assert moves(things, 12) == moved
 
 
+@pytest.mark.slow
 @pytest.mark.anyio
 async def test_every_update_ping_and_request_is_counted_once(tmp_path: Path) -> None:
     with servers.service(make_store(tmp_path / "store"), access_log="false") as service:

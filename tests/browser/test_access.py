@@ -66,6 +66,7 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     assert {state: found[state] for state in found if found[state]} == {}
 
 
+@pytest.mark.slow
 def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
     board = open_board()
     page = board.page

@@ -124,6 +124,7 @@ def test_offsets_say_where_a_ghost_stands_and_how_far_it_varies(bedroom: Board) 
     assert placed["z"] == pytest.approx(top + found["size"]["z"] / 2, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_what_is_accepted_stands_where_the_page_says(bedroom: Board, api: httpx.Client) -> None:
     board = bedroom
     board.slide("Suggestions", 8)

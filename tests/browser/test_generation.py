@@ -34,6 +34,7 @@ def chips(board: Board) -> list[str]:
     return board.page.locator("#drawn .chips").first.locator("li:not(.went)").all_text_contents()
 
 
+@pytest.mark.slow
 def test_each_stop_is_what_the_service_draws_with_so_many_sweeps(
     open_board: OpenBoard, api: httpx.Client
 ) -> None:
@@ -76,6 +77,7 @@ def test_a_drawn_scene_can_be_kept_and_reads_as_it_was_drawn(
     assert board.things == ["desk", "chair"]
 
 
+@pytest.mark.slow
 def test_what_is_on_the_board_stays_in_the_drawn_scene(
     open_board: OpenBoard, api: httpx.Client
 ) -> None:
@@ -91,6 +93,7 @@ def test_what_is_on_the_board_stays_in_the_drawn_scene(
     expect(board.page.locator("#board .object")).to_have_count(2)
 
 
+@pytest.mark.slow
 def test_contexts_are_named_and_can_be_held_on(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board()
     board.tab("Imagine")
@@ -114,6 +117,7 @@ def test_contexts_are_named_and_can_be_held_on(open_board: OpenBoard, api: httpx
     assert chips(board) == scene["objects"]
 
 
+@pytest.mark.slow
 def test_another_seed_draws_another_scene(open_board: OpenBoard) -> None:
     board = open_board()
     board.tab("Imagine")

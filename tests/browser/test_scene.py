@@ -101,6 +101,7 @@ def test_what_stands_on_something_moves_with_it(open_board: OpenBoard) -> None:
     assert place(board, "lamp") == pytest.approx((before[0], before[1] - 0.5, before[2]))
 
 
+@pytest.mark.slow
 def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> None:
     board = open_board()
     board.tab("Wrong")  # where no suggestion lies over the chair
@@ -225,6 +226,7 @@ NO_SCENES = [
 ]
 
 
+@pytest.mark.slow
 def test_what_is_no_scene_is_refused_in_words(open_board: OpenBoard) -> None:
     board = open_board()
     page = board.page
@@ -237,6 +239,7 @@ def test_what_is_no_scene_is_refused_in_words(open_board: OpenBoard) -> None:
         assert board.things == ["desk", "chair"]
 
 
+@pytest.mark.slow
 def test_a_link_holds_the_scene(open_board: OpenBoard) -> None:
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
     scene = board.exported()
@@ -294,6 +297,7 @@ def test_relations_that_positions_replace_are_told(open_board: OpenBoard) -> Non
     expect(board.page.locator("#note")).to_be_hidden()
 
 
+@pytest.mark.slow
 def test_new_objects_leave_room_for_the_robot(open_board: OpenBoard) -> None:
     board = open_board()
     for _ in range(12):

@@ -33,6 +33,7 @@ def crowd(api: httpx.Client, count: int) -> dict[str, object]:
     }
 
 
+@pytest.mark.slow
 def test_the_largest_scene_is_drawn_and_answered(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board(crowd(api, 256))
     expect(board.page.locator("#board .object")).to_have_count(256)
@@ -49,6 +50,7 @@ def test_the_largest_scene_is_drawn_and_answered(open_board: OpenBoard, api: htt
     expect(board.page.locator("#search-error")).to_be_empty()
 
 
+@pytest.mark.slow
 def test_a_question_that_is_overtaken_is_dropped(open_board: OpenBoard) -> None:
     board = open_board()
     posted: list[str] = []
@@ -88,6 +90,7 @@ def test_a_refused_room_is_told_beside_the_room(open_board: OpenBoard) -> None:
     assert board.rows("missing")
 
 
+@pytest.mark.slow
 def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> None:
     board = open_board(allow=("429",))
     refusals = []
@@ -114,6 +117,7 @@ def test_a_full_service_is_asked_again_when_it_says(open_board: OpenBoard) -> No
     assert board.rows("missing")
 
 
+@pytest.mark.slow
 def test_the_page_outlives_the_service(
     open_board: OpenBoard, repository: Path, tmp_path: Path
 ) -> None:
@@ -132,6 +136,7 @@ def test_the_page_outlives_the_service(
         assert board.rows("missing")
 
 
+@pytest.mark.slow
 def test_a_service_with_a_key_is_asked_with_it(
     open_board: OpenBoard, repository: Path, tmp_path: Path
 ) -> None:

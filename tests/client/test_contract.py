@@ -179,6 +179,7 @@ def test_a_store_without_a_usable_default_is_not_ready(tmp_path: Path) -> None:
             assert raised.value.type == "/problems/not-ready"
 
 
+@pytest.mark.slow
 def test_what_is_served_is_changed_alike_with_a_service_and_without(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
     with launch(store, tmp_path / "log") as service:

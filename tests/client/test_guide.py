@@ -46,6 +46,7 @@ def test_every_command_runs(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
         assert done.exit_code == 0, (line, done.stderr)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_the_cpp_block_compiles_and_runs(
     url: str, tmp_path: Path, require_system_tool: Callable[[str], Path]

@@ -110,8 +110,9 @@ def test_chains_are_stationary(name, beta):
     check_stationary(name, conditions(room=1), lambda joint: joint.p >= 0, room=1, beta=beta)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("r", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.parametrize("r", [0, 1])
 def test_chains_are_stationary_under_conditions(name, r):
     """Two classes present, a unit held on, one relation between them seen on or off."""
 
@@ -122,6 +123,7 @@ def test_chains_are_stationary_under_conditions(name, r):
     check_stationary(name, conditions([0, 1], [(0, 0, 1, r)], [1]), given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_observed_relations_tell_of_the_context(name):
     """Every relation between two classes seen, some on: h1 from 8,000 chains of 20 sweeps
@@ -213,8 +215,9 @@ def test_fantasies_are_weighed_as_the_tensors_weigh_them(wide, name):
     np.testing.assert_allclose(chains.sample_weights(condition), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONDITIONS)
-@pytest.mark.parametrize("temperature", [1.0, pytest.param(1.6, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("temperature", [1.0, 1.6])
 def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
     """Means over 600 chains each, of every class, every unit and the number of relations of each
     kind: 114 differences within 5.5 standard errors fail by chance with probability 5e-6."""

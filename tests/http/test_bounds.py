@@ -167,6 +167,7 @@ async def test_a_batch_stops_where_its_deadline_passes(
     assert statuses == [200] * answered + [504] * (20 - answered)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_ending_finishes_what_was_begun_and_takes_nothing_new(
     shared_store: Path, tmp_path: Path

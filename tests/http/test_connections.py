@@ -129,6 +129,7 @@ def wait_for_descriptors(service: LiveService, files: int) -> None:
     pytest.fail(f"{service.descriptors} descriptors, where there were {files}")
 
 
+@pytest.mark.slow
 def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
     """Sixty bodies of 2 MiB less one byte: the service holds as many as its budget allows."""
     store = make_store(tmp_path / "store")

@@ -239,6 +239,7 @@ async def test_a_client_is_told_and_goes_on(live: LiveService) -> None:
         await stream.update(["bed"])
 
 
+@pytest.mark.slow
 @pytest.mark.anyio
 async def test_a_client_connects_again_and_sends_the_whole_scene(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
@@ -276,6 +277,7 @@ async def test_a_client_connects_again_and_sends_the_whole_scene(tmp_path: Path)
             await asyncio.to_thread(service.stop)
 
 
+@pytest.mark.slow
 @pytest.mark.anyio
 async def test_a_client_gives_up_after_a_while(tmp_path: Path) -> None:
     service = launch(make_store(tmp_path / "store"), tmp_path / "log")
@@ -422,6 +424,7 @@ def test_no_more_streams_than_there_is_room_for(guarded: LiveService) -> None:
         pytest.fail("a place is lost")
 
 
+@pytest.mark.slow
 def test_who_is_silent_loses_the_place(guarded: LiveService) -> None:
     with opened(guarded, additional_headers=KEY) as stream:
         assert closed(stream) == (1008, "stream-idle")
@@ -589,6 +592,7 @@ def counted(service: LiveService) -> dict[tuple[str, ...], float]:
     }
 
 
+@pytest.mark.slow
 def test_streams_are_counted_and_logged(tmp_path: Path) -> None:
     with launch(make_store(tmp_path / "store"), tmp_path / "log") as service:
         with opened(service) as stream:

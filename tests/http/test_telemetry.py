@@ -153,6 +153,7 @@ def collector() -> Iterator[tuple[str, list[ExportTraceServiceRequest]]]:
         server.server_close()
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_collector_is_sent_the_spans(shared_store: Path, tmp_path: Path) -> None:
     with (

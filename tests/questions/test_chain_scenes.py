@@ -47,6 +47,7 @@ def single(name):
     return made, enumerate_joint(copy.deepcopy(machine_of(made.weights)).double())
 
 
+@pytest.mark.slow
 def test_stated_relations_tell_of_the_objects():
     """Of four units seen between two classes: how often the third class is there, within five
     standard errors of the joint, over 2,048 chains; other relations make for another share."""

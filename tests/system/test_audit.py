@@ -113,6 +113,7 @@ def test_the_exit_status_tells_what_was_found_from_what_was_not_run(
     assert exit_status(verdicts, may_be_unreachable=True) == lenient
 
 
+@pytest.mark.slow
 def test_the_bills_name_every_locked_package(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

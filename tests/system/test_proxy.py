@@ -174,6 +174,7 @@ def test_an_answer_may_take_longer_than_a_client_may_pause(proxy: Proxy) -> None
     assert response.elapsed.total_seconds() > 2
 
 
+@pytest.mark.slow
 def test_a_stream_passes_and_outlives_the_pauses_of_requests(proxy: Proxy) -> None:
     with opened(proxy) as stream:  # type: ignore[arg-type]
         assert talk(stream, "open", ask={"missing": {}})["type"] == "opened"
@@ -243,6 +244,7 @@ def test_the_old_protocol_has_no_chunks(proxy: Proxy) -> None:
     refused(proxy, head + b"%x\r\n%s\r\n0\r\n\r\n" % (len(BODY), BODY), 400)
 
 
+@pytest.mark.slow
 def test_what_is_wrong_below_http_reaches_nobody(proxy: Proxy) -> None:
     """Every refusal is a client's error; no request hides in another."""
     with ThreadPoolExecutor(8) as pool:
@@ -280,6 +282,7 @@ def lines(service: LiveService) -> int:
     return len(service.log.read_text().splitlines())
 
 
+@pytest.mark.slow
 def test_a_body_that_trickles_in_is_ended_by_the_service(proxy: Proxy) -> None:
     """Every byte restarts the proxy's time-out; the service bounds the time of the whole body."""
     began = time.monotonic()
@@ -370,6 +373,7 @@ def test_an_escape_that_is_none_hides_no_route(proxy: Proxy) -> None:
     assert answers[0].status in {400, 404}
 
 
+@pytest.mark.slow
 def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
     haproxy: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -396,6 +400,7 @@ def test_the_log_holds_no_key_no_path_and_the_id_of_the_request(
     assert [entry["request_id"] for entry in entries].count("find-me") == 3
 
 
+@pytest.mark.slow
 def test_a_service_that_is_not_ready_is_not_asked(
     haproxy: Callable[..., Any], tmp_path: Path
 ) -> None:

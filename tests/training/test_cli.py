@@ -68,6 +68,7 @@ def pinned(name: str) -> set[str]:
     return {line.split("==")[0] for line in lines if "==" in line}
 
 
+@pytest.mark.slow
 def test_training_imports_nothing_that_only_checks_need():
     """The training image has `requirements-training.lock` alone."""
     checks = pinned("requirements-dev.lock") - pinned("requirements-training.lock")

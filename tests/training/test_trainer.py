@@ -95,6 +95,7 @@ def state(machine):
     return {name: value.clone() for name, value in machine.state_dict().items()}
 
 
+@pytest.mark.slow
 def test_phases_resume_to_the_same_bits_wherever_they_were_interrupted(worded, tmp_path):
     """Among the objects nothing is kept; after them, the objects are."""
     config = phased()

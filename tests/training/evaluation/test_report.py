@@ -241,6 +241,7 @@ def test_publishing_measures_the_published_tasks_on_every_source():
     assert {source for _, source, _ in found} == {"a", "b", "pooled"}
 
 
+@pytest.mark.slow
 def test_what_is_published_is_the_calibrated_artifact_s():
     """Another default threshold, other alarms; and no more scenes than the limit allows."""
 

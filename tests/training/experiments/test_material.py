@@ -73,6 +73,7 @@ def rows_of(results):
 ONE_TASK = ("--task", "T2 missing", "--baseline", "popularity")
 
 
+@pytest.mark.slow
 def test_a_baseline_of_a_corrected_file_is_not_gone_on_with(tmp_path):
     write_scenes(tmp_path, "flats")
     code, output = run(*arguments(tmp_path, *ONE_TASK))

@@ -154,6 +154,7 @@ def test_a_configuration_without_a_space_says_so(tmp_path):
     assert "name a TOML file with --space" in output
 
 
+@pytest.mark.slow
 def test_a_trial_below_the_median_is_given_up(tmp_path):
     """Test scenes are never looked at: training and judging go as well without any."""
     arguments(tmp_path)

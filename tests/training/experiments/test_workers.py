@@ -24,6 +24,7 @@ def plan(folder):
     return Plan(folder, Material(None, None, "these scenes"), settings, ["T2 missing"])
 
 
+@pytest.mark.slow
 def test_a_row_that_fails_stops_no_other(tmp_path):
     """Workers take the failing rows and go on to the rest."""
     makers = {"first": diverges, "second": answers, "third": diverges, "fourth": answers}
@@ -42,6 +43,7 @@ def test_a_row_that_fails_stops_no_other(tmp_path):
     assert {("second", "done"), ("fourth", "done")} <= set(said)
 
 
+@pytest.mark.slow
 def test_what_is_not_a_rows_own_failure_is_raised(tmp_path):
     entries = [Row("first", 0, "first", diverges), Row("second", 0, "second", answers)]
     with pytest.raises(FloatingPointError, match="loss is nan"):
