@@ -148,6 +148,7 @@ def test_a_folder_that_others_can_change_is_refused(package: Path, tmp_path: Pat
     assert "other users" not in start(package, NUMBA_CACHE_DIR=str(root))[1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
 def test_a_folder_of_another_user_is_refused(package: Path, tmp_path: Path) -> None:
     root = tmp_path / "root"

@@ -56,6 +56,7 @@ def test_gibbs_yardsticks_sample_the_same_machine():
     assert ours == pytest.approx(4, abs=1)
 
 
+@pytest.mark.slow
 def test_training_step():
     result = training_step(V=12, H1=6, H2=3, K=2, scenes=3, objects=4, rounds=2)
     check_complete(result, 2)

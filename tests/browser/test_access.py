@@ -175,12 +175,14 @@ def test_colours_follow_the_system_unless_somebody_chooses(open_board: OpenBoard
     assert board.page.evaluate(background) == dark
 
 
+@pytest.mark.slow
 def test_nothing_moves_for_who_wants_no_motion(open_board: OpenBoard) -> None:
     moving = "getComputedStyle(document.querySelector('.bar rect')).transitionDuration"
     assert open_board(reduced_motion="no-preference").page.evaluate(moving) != "0s"
     assert open_board(reduced_motion="reduce").page.evaluate(moving) == "0s"
 
 
+@pytest.mark.slow
 def test_a_narrow_page_does_not_scroll_sideways(open_board: OpenBoard) -> None:
     board = open_board(scene=None, width=320)
     for tab in ("Missing", "Wrong", "Relations", "Imagine"):

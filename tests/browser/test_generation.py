@@ -55,6 +55,7 @@ def test_each_stop_is_what_the_service_draws_with_so_many_sweeps(
         assert names == set(scene["objects"])
 
 
+@pytest.mark.slow
 def test_a_drawn_scene_can_be_kept_and_reads_as_it_was_drawn(
     open_board: OpenBoard, api: httpx.Client
 ) -> None:
@@ -139,6 +140,7 @@ def test_a_seed_that_is_none_is_refused_by_the_form(open_board: OpenBoard) -> No
     expect(board.page.locator("#draft")).to_be_hidden()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("button", ["Back to mine", "Stop"])
 def test_a_drawing_that_runs_can_be_ended(open_board: OpenBoard, button: str) -> None:
     board = open_board()

@@ -121,6 +121,7 @@ def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> No
     assert place(board, "chair", "outliers") == before
 
 
+@pytest.mark.slow
 def test_handles_resize_and_turn(open_board: OpenBoard) -> None:
     board = open_board()
     board.tab("Wrong")

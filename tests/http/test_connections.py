@@ -157,6 +157,7 @@ def test_unfinished_bodies_leave_memory_to_others(tmp_path: Path) -> None:
         assert service.client.post("/missing/batch", json=batch).status_code == 200
 
 
+@pytest.mark.slow
 def test_connections_over_the_limit_get_a_plain_503(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
     with launch(store, tmp_path / "log", SCENE_MAX_CONNECTIONS="8") as service, ExitStack() as held:

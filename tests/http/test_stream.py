@@ -293,6 +293,7 @@ async def test_a_client_gives_up_after_a_while(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------- model swaps
 
 
+@pytest.mark.slow
 def test_the_next_answer_is_of_the_model_that_was_promoted(tmp_path: Path) -> None:
     service = launch(make_store(tmp_path / "store"), tmp_path / "log")
     with service, opened(service) as stream:
@@ -532,6 +533,7 @@ def defective(
         yield service
 
 
+@pytest.mark.slow
 def test_a_defect_ends_its_stream_alone(defective: LiveService) -> None:
     before = defective.log.read_text().count("of course")
     with opened(defective) as other, opened(defective) as stream:

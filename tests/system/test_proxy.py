@@ -161,6 +161,7 @@ def test_questions_and_pages_are_answered(proxy: Proxy) -> None:
         assert large.json()["type"] == "/problems/body-too-large"
 
 
+@pytest.mark.slow
 def test_an_answer_may_take_longer_than_a_client_may_pause(proxy: Proxy) -> None:
     service = proxy.service.process
     service.send_signal(signal.SIGSTOP)

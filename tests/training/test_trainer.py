@@ -119,6 +119,7 @@ def test_phases_resume_to_the_same_bits_wherever_they_were_interrupted(worded, t
     assert same(whole, state(last.run(objects=stop).machine))
 
 
+@pytest.mark.slow
 def test_relations_leave_the_objects_and_the_samples_as_they_are(worded):
     """And the words are part of plain weights in the end."""
     machine = Trainer(phased(), worded).run().machine
