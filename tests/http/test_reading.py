@@ -14,6 +14,7 @@ from app.serving.errors import Reason, RequestError
 from app.serving.reading import Limits, Reading, read_scene
 from scene_client.schemas import SceneRequest
 from tests.http.stores import VOCABULARY
+from tests.scene.turns import Turn, about, after
 
 
 def read(limits: Limits | None = None, **request: Any) -> Reading:
@@ -158,25 +159,6 @@ def observed(reading: Reading) -> set[tuple[str, str, str]] | None:
     return {(entry.subject, entry.relation, entry.object) for entry in reading.observed}
 
 
-Turn = tuple[float, float, float, float]
-
-
-def after(first: Turn, second: Turn) -> Turn:
-    """The turn ``second``, then ``first``: the product of two quaternions (x, y, z, w)."""
-    ax, ay, az, aw = first
-    bx, by, bz, bw = second
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
-
-
-def about_z(angle: float) -> Turn:
-    return (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
-
-
 # From body axes to those of a camera: x right, y down, z forward.
 TO_OPTICAL: Turn = (0.5, -0.5, 0.5, 0.5)
 LYING: Turn = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
@@ -191,7 +173,7 @@ def test_one_scene_told_in_three_frames_is_one_scene(seed: int) -> None:
     told: dict[str, list[Any]] = {"base_link": [], "camera_optical_frame": [], "map": []}
     for number in range(draw.randint(2, 6)):
         x, y, z = (draw.uniform(-2, 2) for _ in range(3))
-        turn = about_z(draw.uniform(-4, 4))
+        turn = about((0, 0, 1), draw.uniform(-4, 4))
         if draw.random() < 0.4:
             turn = after(turn, LYING)
         thing: dict[str, Any] = {"id": str(number), "label": "desk"}
@@ -201,7 +183,7 @@ def test_one_scene_told_in_three_frames_is_one_scene(seed: int) -> None:
         for frame, place, turned in (
             ("base_link", (x, y, z), turn),
             ("camera_optical_frame", (-y, -z, x), after(TO_OPTICAL, turn)),
-            ("map", in_map, after(about_z(robot[2]), turn)),
+            ("map", in_map, after(about((0, 0, 1), robot[2]), turn)),
         ):
             orientation = dict(zip("xyzw", turned, strict=True))
             told[frame].append(thing | {"position": at(*place), "orientation": orientation})

@@ -8,11 +8,7 @@ from hypothesis import strategies as st
 
 from app.scene.frames import body_pose, is_optical, is_world_fixed, viewer_axes
 from app.scene.geometry import Viewpoint, to_viewer_frame
-
-
-def about(axis: tuple[float, float, float], angle: float) -> tuple[float, float, float, float]:
-    sin = math.sin(angle / 2)
-    return (axis[0] * sin, axis[1] * sin, axis[2] * sin, math.cos(angle / 2))
+from tests.scene.turns import about, after
 
 
 def same_turn(a: float, b: float, period: float = 2 * math.pi) -> bool:
@@ -67,20 +63,6 @@ def test_yaw_in_an_optical_frame(angle: float) -> None:
     assert same_turn(yaw, -angle)
 
 
-def turned(
-    second: tuple[float, float, float, float], first: tuple[float, float, float, float]
-) -> tuple[float, float, float, float]:
-    """The quaternion of one turn after another (Hamilton product)."""
-    x, y, z, w = second
-    a, b, c, d = first
-    return (
-        w * a + x * d + y * c - z * b,
-        w * b - x * c + y * d + z * a,
-        w * c + x * b - y * a + z * d,
-        w * d - x * a - y * b - z * c,
-    )
-
-
 @given(st.floats(-3, 3), st.floats(-0.6, 0.6))
 def test_a_box_on_its_side(angle: float, tilt: float) -> None:
     """Tipped about x the box heads along its z axis, tipped about y along its y axis."""
@@ -89,10 +71,10 @@ def test_a_box_on_its_side(angle: float, tilt: float) -> None:
         ((0, 1, 0), (2.0, 3.0, 1.0), angle + math.pi / 2),
     ):
         # A tilt about the heading leaves it level.
-        lean = turned(about((0, 0, 1), heading), about((1, 0, 0), tilt))
-        lean = turned(lean, about((0, 0, 1), -heading))
-        tipped = turned(about((0, 0, 1), angle), about(axis, math.pi / 2))
-        _, upright, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), turned(lean, tipped))
+        lean = after(about((0, 0, 1), heading), about((1, 0, 0), tilt))
+        lean = after(lean, about((0, 0, 1), -heading))
+        tipped = after(about((0, 0, 1), angle), about(axis, math.pi / 2))
+        _, upright, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), after(lean, tipped))
         assert upright == size
         assert same_turn(yaw, heading)
 
@@ -100,7 +82,7 @@ def test_a_box_on_its_side(angle: float, tilt: float) -> None:
 @given(st.floats(-0.6, 0.6), st.floats(-3, 3))
 def test_a_tilt_is_dropped(tilt: float, angle: float) -> None:
     # Yaw after a tilt about the box's own x axis leaves that axis horizontal.
-    both = turned(about((0, 0, 1), angle), about((1, 0, 0), tilt))
+    both = after(about((0, 0, 1), angle), about((1, 0, 0), tilt))
     _, size, yaw = body_pose((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), both)
     assert size == (1.0, 2.0, 3.0)
     assert same_turn(yaw, angle)
