@@ -39,7 +39,7 @@ PACE: Final = 32
 REFUSALS: Final = 8
 """Requests refused in one tick."""
 
-CHEAP: Final = 1e-3
+CHEAP: Final = 2e-3
 """Seconds that a job may hold up the event loop."""
 
 # Seconds between two checks of whether the models have caught up.
