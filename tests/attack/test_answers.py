@@ -105,7 +105,8 @@ async def test_no_answer_is_larger_than_estimated(
     monkeypatch.setattr(answers, "require_size", note)
     for variant in ("", "plain", "deep"):
         asked = {**body, **({"model": variant} if variant else {}), "frame_id": "f" * 256}
-        answer = await client.post(f"/{question}", json=asked)
+        patient = {"X-Request-Timeout-Ms": "60000"}
+        answer = await client.post(f"/{question}", json=asked, headers=patient)
         assert answer.status_code == 200, answer.text
         assert len(answer.content) <= sizes.pop()
 
