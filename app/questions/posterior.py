@@ -74,7 +74,8 @@ def given_relations(scene: Scene, present: Present, relations: int) -> Given | N
     if not relations_given(scene) and scene.poses is None:
         return None
     on, seen = pooled(present.row, len(present.classes), *instance_evidence(scene))
-    a, i, j = np.nonzero(seen[:relations])
+    # Contiguous, however many: for other layouts the loops would be compiled again.
+    a, i, j = np.stack(np.nonzero(seen[:relations]))
     gate = present.presence[i] * present.presence[j]
     return Given(a, i, j, on[a, i, j].astype(np.float32), gate)
 

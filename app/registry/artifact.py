@@ -100,7 +100,7 @@ class Artifact:
 
     def context_rows(self) -> NDArray[np.float32]:
         """(T, H1) what each triple that has a weight of its own says of the context."""
-        relation, subject, object_ = self.weights["triples"].astype(np.int64).T
+        relation, subject, object_ = self.weights["triples"].astype(np.int64).T.copy()
         return self.spec.kind.units(self.weights).rows_of(relation, subject, object_)
 
     @cached_property
