@@ -87,6 +87,8 @@ _KEPT = 32
 _FACTORS, _LEAST = 4, np.float32(1e-7)
 _ROOM_SWEEPS = 100
 _SETTLED = 1e-7
+# Of log p of a sample beside the best room: products of two such stay within float64.
+_LEAST_PULL = -300.0
 
 
 class Pull(NamedTuple):
@@ -360,9 +362,11 @@ def _room_weights(weights: Weights, contexts: Floats) -> Floats:
     pull = np.concatenate([pull, np.zeros((len(pull), 1))], 1)
     rooms = weights["fantasy_rooms"]
     drawn, sizes = np.unique(np.where(rooms < 0, spec.C, rooms), return_counts=True)
-    # Both sums of the iteration as products: p(n | room) up to a factor of each sample.
+    # Both sums of the iteration as products: p(n | room) up to a factor of each sample. None is 0,
+    # so that no sum is.
     top = pull[:, drawn].max(1)
-    share, log_z = np.exp(pull[:, drawn] - top[:, None]), np.zeros(len(drawn))
+    share = np.exp(np.maximum(pull[:, drawn] - top[:, None], _LEAST_PULL))
+    log_z = np.zeros(len(drawn))
     mixture = np.ones(len(pull))
     for _ in range(_ROOM_SWEEPS):
         mixture = share @ (sizes * np.exp(-log_z))

@@ -115,7 +115,7 @@ def singular(word: str) -> str:
 
 
 # The models of a store name mostly the same classes.
-@lru_cache(maxsize=16_384)
+@lru_cache(maxsize=4096)
 def label_key(label: str) -> str:
     """The key under which every spelling of ``label`` is found; idempotent.
 

@@ -109,6 +109,15 @@ def test_a_room_type_counts_whatever_the_samples_were_drawn_under(rooms):
     assert np.abs(exactly(machine, [2], 0.5, 0) - exactly(machine, [2], 0.5, 1)).max() > 0.1
 
 
+def test_rooms_of_very_different_strength_give_finite_odds():
+    """Both types hold all context units on, with biases of 300 and 1200: all scenes are alike."""
+    machine = machine_of(64, (0, 1))
+    machine.Q[0], machine.Q[1] = 300.0, 1200.0
+    found = [ask(prepared(machine, NOTHING), machine, [2], 0.5, room) for room in (0, 1)]
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(*found, atol=1e-6)
+
+
 def test_the_same_scene_gets_the_same_bits():
     machine = machine_of(64)
     first = estimated(machine, [1, 4], 0.5)

@@ -3,7 +3,7 @@
 Scenes are drawn with fixed seeds, so the counts of a version of numpy and numba are always the
 same. Another order of the draws gives other counts: over 16,000 scenes of other seeds .976 are
 typical, .005 have what never belongs and .011 have fewer than three classes. The bounds of the
-three lines are what is asked of 320 scenes, not the luckiest count.
+three lines are the project's aims for 320 scenes, not the luckiest counts.
 """
 
 from __future__ import annotations

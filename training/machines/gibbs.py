@@ -64,6 +64,10 @@ class Clamp:
     observed: Tensor | None = None
     room: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        if len({self.edges is None, self.r is None, self.observed is None}) > 1:
+            raise ValueError("observed relations need edges, r and observed")
+
     @property
     def relations(self) -> tuple[Edges, Tensor, Tensor] | None:
         """(edges, r, observed), or None where no relation is observed."""

@@ -124,7 +124,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
         """The machine's units, the place of each pair's unit among them, and whether it has one.
 
-        The last two are (B, A·n·m); the place is arbitrary where there is no unit.
+        The last two are (B, A·n·m). Pairs without a unit have an arbitrary place.
         """
 
     @abstractmethod

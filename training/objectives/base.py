@@ -21,7 +21,7 @@ class Objective(ABC):
     def __init__(
         self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
     ) -> None:
-        """Args: structure: (V,) bool, classes such as walls; none of them by default."""
+        """Args: structure: (V,) bool, classes such as walls; by default no class is structural."""
         self.config = config
         nothing = torch.zeros(machine.spec.V, dtype=torch.bool)
         self.structure = nothing if structure is None else structure
