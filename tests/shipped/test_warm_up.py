@@ -1,4 +1,4 @@
-"""After its start the service compiles nothing more, whatever it is asked."""
+"""After its start the service compiles nothing more for any question."""
 
 from __future__ import annotations
 
