@@ -141,11 +141,15 @@ def _remove_old(current: Path) -> None:
 
 _FOLDER, _PROBLEM = _prepare(os.environ.get("NUMBA_CACHE_DIR", ""))
 if _FOLDER is not None:
-    # numba reads it when it is imported.
+    # For processes that this one starts.
     os.environ["NUMBA_CACHE_DIR"] = str(_FOLDER)
 
-from numba import njit  # noqa: E402
+from numba import config, njit  # noqa: E402
 from numba.core import event  # noqa: E402
+
+if _FOLDER is not None:
+    # numba may have been imported before, and has then read another value.
+    config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 _LOOPS: Final[list[Any]] = []
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from app.inference.mean_field import sigmoid
+from app.inference.elementary import sigmoid
 from app.questions.posterior import Posterior
 from app.registry import Artifact, Store, load_model_set
 from app.scene import Scene, SceneObject, derive_relations

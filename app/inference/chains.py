@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import chain_kernels as kernels
-from app.inference.mean_field import sigmoid, softplus, with_second_layer
+from app.inference.elementary import sigmoid, softplus
 from app.inference.relation_kernels import draw_in_groups
 from app.inference.relations import NEVER, Ends, Given, RelationUnits, all_pairs
 from app.inference.weights import Weights, unpack_scenes
@@ -152,7 +152,7 @@ class SceneChains:
         # (N, H1) the means of h1 given the stored scenes.
         self.mean: Floats = np.zeros((0, H1), np.float32)
         if weights.spec.N:
-            x, _ = with_second_layer(weights, weights["c1"] + weights.scenes @ W)
+            x, _ = weights.with_second_layer(weights["c1"] + weights.scenes @ W)
             self.mean = sigmoid(x).astype(np.float32)
 
     @staticmethod
@@ -253,7 +253,7 @@ class ConditionedChains:
     def _context_bias(self, classes: Places, beta: float = 1.0) -> tuple[Floats, Floats]:
         """x of h1 given present classes, (H1,), and the means of the second layer (H2,)."""
         base = self._bias + self._machine["W"][classes].sum(0)
-        x, m2 = with_second_layer(self._machine, base[None], beta)
+        x, m2 = self._machine.with_second_layer(base[None], beta)
         return x[0].astype(np.float32), m2[0]
 
     def _logits(self, classes: Places, h1: Bits) -> Floats:

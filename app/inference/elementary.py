@@ -1,22 +1,25 @@
-"""exp, log and the logistic function in single precision, for compiled loops.
+"""sigmoid and softplus of arrays; exp, log and logistic in single precision, for compiled loops.
 
-The C library's functions are called number by number; these are plain arithmetic, so that the
-compiler applies them to a whole vector register at once. Errors are below 2 units in the last place
-(`tests/machines/test_elementary.py`).
+In loops the C library's functions are called number by number; those here are plain arithmetic, so
+that the compiler applies them to a whole vector register at once. Errors are below 2 units in the
+last place (`tests/machines/test_elementary.py`).
 
 Source: range reduction and minimax polynomials of Moshier's Cephes library (`expf`, `logf`).
 """
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from app.compiling import inlined
+
+Floats = NDArray[np.floating[Any]]
 
 _f = np.float32
 _i = np.int32
@@ -28,6 +31,19 @@ _LN2_HIGH, _LN2_LOW = _f(0.693359375), _f(-2.12194440e-4)
 _SQRT_HALF_BITS = _i(0x3F3504F3)
 _MANTISSA_BITS = _i(0x007FFFFF)
 _ONE_BITS = _i(0x3F800000)
+
+
+def sigmoid(x: Floats) -> Floats:
+    """1 / (1 + e^-x); below -80 as there, since e^88 is the largest float32."""
+    found: Floats = np.exp(np.minimum(-x, 80))
+    found += 1
+    return np.reciprocal(found, out=found)
+
+
+def softplus(x: Floats) -> Floats:
+    """log(1 + e^x)."""
+    found: Floats = np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
+    return found
 
 
 @intrinsic
@@ -50,7 +66,7 @@ def _bits_of_float(_, value):  # noqa: ARG001
 def exp(x):
     """e^x for float32, with x held within [-87, 88]."""
     x = min(max(x, _LEAST), _LARGEST)
-    n = _f(math.floor(x * _f(1.44269504) + _f(0.5)))
+    n = np.floor(x * _f(1.44269504) + _f(0.5))
     r = x - n * _LN2_HIGH
     r = r - n * _LN2_LOW
     p = _f(1.9875691500e-4)

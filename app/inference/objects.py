@@ -13,14 +13,13 @@ weight below -17. Weights in float64, or too large for float32, are summed log b
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference import object_kernels as kernels
-from app.inference.mean_field import softplus
+from app.compiling import compiled, inlined
+from app.inference.elementary import exp, exponent, log, mantissa, softplus
 
 Floats = NDArray[np.floating[Any]]
 Singles = NDArray[np.float32]
@@ -36,6 +35,12 @@ _LARGEST_GROUP = 25
 _TILE = 800
 # A tile is whole vector registers.
 _LANES = 16
+# Hidden units whose factors of one class are multiplied side by side.
+_SIDE_BY_SIDE = 32
+_LN2 = np.float32(0.6931471805599453)
+_ONE = np.float32(1.0)
+# Logits whose odds, and the probabilities of both sides, are normal numbers in float32.
+_MOST_LOGIT = np.float32(80.0)
 
 
 def group_size(W: Floats) -> int:
@@ -49,13 +54,6 @@ def group_size(W: Floats) -> int:
     return min(_LARGEST_GROUP, max(1, int(_LOG_RANGE / max(largest, 1.0))))
 
 
-def halves(x: Singles) -> tuple[Singles, Singles]:
-    """sigmoid(-x) and sigmoid(x), from one exponential, and neither as a difference."""
-    fall: Singles = np.exp(np.minimum(-x, 80))
-    on = np.reciprocal(1 + fall)
-    return fall * on, on
-
-
 class ContextScorer:
     """The gain of every object from hidden logits, for a machine whose weights do not change.
 
@@ -65,23 +63,29 @@ class ContextScorer:
     Args:
         W: (V, H1).
 
+    Attributes:
+        group: see `group_size`.
+        exp_w: (tiles, H1, classes of a tile) exp(W), where there is a group.
+
     Raises:
         ValueError: W holds NaN or infinity.
     """
+
+    exp_w: Singles
 
     def __init__(self, W: Floats) -> None:
         if not np.isfinite(W).all():
             raise ValueError("W must be finite to score with")
         self.V, self.H1 = W.shape
-        self._W, self._group = W, group_size(W)
-        if self._group:
+        self._W, self.group = W, group_size(W)
+        if self.group:
             tiles = -(-self.V // _TILE)
             width = -(-self.V // (tiles * _LANES)) * _LANES
             # What fills up the last tile gains nothing: its factors are 1.
             exp_w = np.ones((tiles * width, self.H1), dtype=np.float32)
             np.exp(W, out=exp_w[: self.V])
             tiled = exp_w.reshape(tiles, width, self.H1).swapaxes(1, 2)
-            self._exp = np.ascontiguousarray(tiled)
+            self.exp_w = np.ascontiguousarray(tiled)
 
     def gain(self, x: Floats) -> Floats:
         """sum_k [softplus(x_k + W_ik) - softplus(x_k)], (..., V) in W's precision, for x (..., H1).
@@ -92,80 +96,234 @@ class ContextScorer:
         if x.shape[-1:] != (self.H1,):
             raise ValueError(f"x must be (..., {self.H1}), not {x.shape}")
         rows = x.reshape(-1, self.H1)
-        if self._group:
-            found: Floats = self.gains(*halves(rows.astype(np.float32)))
+        if self.group:
+            found: Floats = gains(rows.astype(np.float32), self.exp_w, self.group, self.V)
         else:
             logits = rows.astype(np.float64)[:, None]
             terms = softplus(logits + self._W) - softplus(logits)
             found = terms.sum(2).astype(self._W.dtype)
         return found.reshape(*x.shape[:-1], self.V)
 
-    def gains(self, off: Singles, on: Singles) -> Singles:
-        """The same of many (M, V), from their `halves` (M, H1).
 
-        Where products of float32 are safe.
-        """
-        found = np.empty((len(on), self.V), dtype=np.float32)
-        kernels.gains(off, on, self._exp, self._group, found)
-        return found
+@inlined
+def _set_halves(x, off, on):
+    """sigmoid(-x) and sigmoid(x), from one exponential, and neither as a difference."""
+    for k in range(len(x)):
+        fall = exp(min(-x[k], _MOST_LOGIT))
+        on[k] = _ONE / (_ONE + fall)
+        off[k] = fall * on[k]
 
 
-class ObjectPart:
-    """Gains of single classes in contexts of their own, for weights W (V, H1) in float32."""
+@compiled
+def gains(x, exp_w, group, classes):
+    """Of contexts x (M, H1) and all V classes, (M, V).
 
-    def __init__(self, W: Singles) -> None:
-        self._W, self._group = W, group_size(W)
+    Of a group's product only the exponent is set aside, and one log is taken in the end.
 
-    @cached_property
-    def _fall(self) -> Singles:
-        """e^-W of all classes; for many at a time."""
-        return np.exp(-self._W)
+    Args:
+        exp_w: see `ContextScorer`.
+        classes: V.
+    """
+    (tiles, units, width), M = exp_w.shape, len(x)
+    found, off, on = np.empty((M, classes), np.float32), np.empty_like(x), np.empty_like(x)
+    for m in range(M):
+        _set_halves(x[m], off[m], on[m])
+    product, exponents = np.empty(width, np.float32), np.empty(width, np.int32)
+    for t in range(tiles):
+        tile = exp_w[t]
+        for m in range(M):
+            offs, ons, into = off[m], on[m], found[m, t * width :]
+            product[:], exponents[:] = _ONE, np.int32(0)
+            for start in range(0, units, group):
+                end = min(start + group, units)
+                # Two factors at a time halve the reads and writes of the product.
+                for k in range(start, end - 1, 2):
+                    a1, b1, row1 = offs[k], ons[k], tile[k]
+                    a2, b2, row2 = offs[k + 1], ons[k + 1], tile[k + 1]
+                    for i in range(width):
+                        product[i] *= (a1 + b1 * row1[i]) * (a2 + b2 * row2[i])
+                if (end - start) % 2:
+                    a1, b1, row1 = offs[end - 1], ons[end - 1], tile[end - 1]
+                    for i in range(width):
+                        product[i] *= a1 + b1 * row1[i]
+                for i in range(width):
+                    exponents[i] += exponent(product[i])
+                    product[i] = mantissa(product[i])
+            for i in range(min(width, classes - t * width)):
+                into[i] = log(product[i]) + _LN2 * np.float32(exponents[i])
+    return found
 
-    def gains_with(self, context: Places, off: Singles, on: Singles, classes: Places) -> Singles:
-        """What class n gained by being in context[n], its own part in it included, (N,).
 
-        Args:
-            off, on: (M, H1) `halves` of contexts.
-        """
-        found: Singles = kernels.paired_gains(off, on, self._fall, context, classes, self._group)
-        return -found
+@compiled
+def _gain(off, on, growth, group, product):
+    """sum_k log of (off + on e^W) / (off + on), for growth e^W (H1,); product is overwritten."""
+    size, total = len(off), np.float32(0.0)
+    for first in range(0, size, group * _SIDE_BY_SIDE):
+        product[:] = _ONE
+        last = min(first + group * _SIDE_BY_SIDE, size)
+        for start in range(first, last, _SIDE_BY_SIDE):
+            # Slices: the compiler takes eight numbers at a time where an index begins at 0.
+            end = min(start + _SIDE_BY_SIDE, last)
+            a, b, c = off[start:end], on[start:end], growth[start:end]
+            for lane in range(len(a)):
+                product[lane] *= (a[lane] + b[lane] * c[lane]) / (a[lane] + b[lane])
+        for lane in range(_SIDE_BY_SIDE):
+            product[lane] = log(product[lane])
+        for lane in range(_SIDE_BY_SIDE):
+            total += product[lane]
+    return total
 
-    def gains_without(self, y: Singles, classes: Places, share: Singles) -> Singles:
-        """The gain of each class, its share (n, H1) of y (H1,) taken out, (n,)."""
-        off, on = halves(y - share)
-        every = np.arange(len(classes))
-        found: Singles = kernels.paired_gains(
-            off, on, np.exp(self._W[classes]), every, every, self._group
-        )
-        return found
 
-    def gains_without_others(
-        self,
-        y: Singles,
-        classes: Places,
-        share: Singles,
-        rows: Places,
-        common: Singles,
-        index: Places,
-    ) -> Singles:
-        """The gain of the classes in rows (N,), each other class of the scene taken out, (N, n).
+@compiled
+def gains_without(y, share, W, group):
+    """The gain of each class, its share (n, H1) of y (H1,) taken out, (n,).
 
-        Args:
-            common, index: see `RelationUnits.common`.
-        """
-        off, on = halves(y)
-        fall, growth = np.exp(-share), np.exp(self._W[classes])
-        found: Singles = kernels.gains_without_others(
-            *(rows, off, on * fall, growth, fall, np.exp(common), index, self._group)
-        )
-        return found
+    Args:
+        W: (n, H1) of the classes.
+    """
+    found, growth = np.empty(len(W), np.float32), _exps(W)
+    off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
+    for i in range(len(W)):
+        _set_halves(y - share[i], off, on)
+        found[i] = _gain(off, on, growth[i], group, product)
+    return found
 
-    def reasons_for_absent(self, y: Singles, candidates: Places, share: Singles) -> Singles:
-        """How the gain of absent classes (N,) changes by each that is there, (N, n)."""
-        off, on = halves(np.concatenate([y[None], y - share]))
-        N, M = len(candidates), len(off)
-        which, context = np.divmod(np.arange(N * M), M)
-        growth = np.exp(self._W[candidates])
-        gains = kernels.paired_gains(off, on, growth, context, which, self._group).reshape(N, M)
-        change: Singles = gains[:, :1] - gains[:, 1:]
-        return change
+
+@compiled
+def gains_without_others(y, share, W, rows, common, index, group):
+    """The gain of the classes in rows (N,), each other class of the scene taken out, (N, n).
+
+    Args:
+        share: (n, H1) what each class and its relations add to y (H1,).
+        W: (n, H1) of the classes.
+        common, index: see `RelationUnits.common`.
+    """
+    n, size = share.shape
+    found, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
+    off, on, fall, growth = np.empty_like(y), np.empty_like(y), _exps(-share), _exps(W)
+    twice, product = _exps(common), np.empty(_SIDE_BY_SIDE, np.float32)
+    _set_halves(y, off, on)
+    for c in range(len(rows)):
+        i = rows[c]
+        left = on * fall[i]
+        for j in range(n):
+            down = fall[j]
+            for k in range(size):
+                both[k] = left[k] * down[k]
+            if index[i, j] >= 0:
+                # Relations between the two go out with either, so they must not go out twice.
+                again = twice[index[i, j]]
+                for k in range(size):
+                    both[k] *= again[k]
+            found[c, j] = _gain(off, both, growth[i], group, product)
+    return found
+
+
+@compiled
+def reasons_for_absent(y, share, W, group):
+    """How the gain of absent classes (N,) changes by each class that is there, (N, n).
+
+    Args:
+        share: (n, H1) what each class that is there adds to y (H1,).
+        W: (N, H1) of the absent classes.
+    """
+    n, growth = len(share), _exps(W)
+    found, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
+    off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
+    _set_halves(y, off, on)
+    for c in range(len(W)):
+        all_of[c] = _gain(off, on, growth[c], group, product)
+    for j in range(n):
+        _set_halves(y - share[j], off, on)
+        for c in range(len(W)):
+            found[c, j] = all_of[c] - _gain(off, on, growth[c], group, product)
+    return found
+
+
+@compiled
+def _exps(x):
+    """e^x of (N, H1)."""
+    found = np.empty_like(x)
+    for n in range(len(x)):
+        row, into = x[n], found[n]
+        for k in range(len(row)):
+            into[k] = exp(row[k])
+    return found
+
+
+@compiled
+def resampled(weight, against, classes, presence, closed, count):
+    """Systematic resampling of N samples by their weights given a scene, (M,) ascending.
+
+    Args:
+        weight: (N,) of a scene without listed classes.
+        against: (V, N) e^-l of each class in each sample.
+        classes, presence: (n,) the listed classes that count.
+        closed: 1 - c, for the coverage c.
+        count: M.
+    """
+    weight, below = weight.copy(), np.empty(len(weight))
+    for i in range(len(classes)):
+        row, here = against[classes[i]], presence[i]
+        # log σ(l) - log(1 - c σ(l)) = -log(1 - c + e^-l)
+        for n in range(len(row)):
+            weight[n] -= here * log(closed + row[n])
+    largest = weight.max()
+    for n in range(len(weight)):
+        weight[n] = exp(weight[n] - largest)
+    below[:] = np.cumsum(weight.astype(np.float64))
+    picked, n = np.empty(count, np.int64), 0
+    for m in range(count):
+        wanted = (m + 0.5) / count * below[-1]
+        while n < len(below) - 1 and below[n] < wanted:
+            n += 1
+        picked[m] = n
+    return picked
+
+
+@compiled
+def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
+    """Log-odds of the mean probability of each class over M completions, (V,).
+
+    A completion adds the usable classes whose odds against, in its sample, are below `most`.
+
+    Args:
+        y: (H1,) logits of h1 without unlisted classes.
+        picked: (M,) the sample of each completion.
+        against: (V, N) odds against each class in each sample.
+        most: (V, M).
+        usable: (V,) bool.
+        bias: (V,) log-odds of each class without context.
+        W, exp_w, group: see `ContextScorer`.
+    """
+    (V, size), M = W.shape, len(picked)
+    completed, added = np.empty((M, size), np.float32), np.zeros((M, V), np.bool_)
+    completed[:] = y
+    for i in range(V):
+        if usable[i]:
+            for m in range(M):
+                if against[i, picked[m]] < most[i, m]:
+                    added[m, i] = True
+                    completed[m] += W[i]
+    gain = gains(completed, exp_w, group, V)
+    here, away = np.zeros(V, np.float32), np.zeros(V, np.float32)
+    off, on, fall = np.empty_like(y), np.empty_like(y), np.empty_like(y)
+    product = np.empty(_SIDE_BY_SIDE, np.float32)
+    for m in range(M):
+        _set_halves(completed[m], off, on)
+        for i in range(V):
+            if added[m, i]:
+                # softplus(y) - softplus(y - W): the class itself is taken out.
+                row = W[i]
+                for k in range(size):
+                    fall[k] = exp(-row[k])
+                gain[m, i] = -_gain(off, on, fall, group, product)
+        for i in range(V):
+            # One exponential for both probabilities, and neither as a difference.
+            odds = exp(min(max(-bias[i] - gain[m, i], -_MOST_LOGIT), _MOST_LOGIT))
+            p = _ONE / (_ONE + odds)
+            here[i] += p
+            away[i] += odds * p
+    for i in range(V):
+        here[i] = log(here[i]) - log(away[i])
+    return here

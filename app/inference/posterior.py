@@ -60,9 +60,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.mean_field import sigmoid, with_second_layer
-from app.inference.objects import ContextScorer, ObjectPart, group_size, halves
-from app.inference.relation_kernels import accumulate
+from app.inference import objects
+from app.inference.elementary import sigmoid
+from app.inference.objects import ContextScorer, group_size
 from app.inference.relations import Between, Context, Ends, Given
 from app.inference.weights import Weights
 
@@ -116,7 +116,7 @@ class ClosedForm:
         self._weights = weights
         self.W, self.b = weights["W"], weights["b"]
         self.units = weights.spec.kind.units(weights)
-        self._objects = ObjectPart(self.W)
+        self._group = group_size(self.W)
 
     @staticmethod
     def fits(weights: Weights) -> bool:
@@ -165,7 +165,7 @@ class ClosedForm:
             return base, None
         without = base - presence[:, None] * self.W[classes]
         bases = np.concatenate([base[None], without]).astype(np.float32)
-        x, _ = with_second_layer(self._weights, bases)
+        x, _ = self._weights.with_second_layer(bases)
         pulled = (x - bases).astype(np.float32)
         return x[0].astype(np.float32), pulled[0] - pulled[1:]
 
@@ -209,7 +209,10 @@ class ClosedForm:
 
     def gains_given_rest(self, context: Context, shares: Floats) -> Floats:
         """What the rest of a scene does for the log-odds of each of its classes, (n,)."""
-        return self._objects.gains_without(context.object_y, context.classes, shares)
+        found: Floats = objects.gains_without(
+            context.object_y, shares, self.W[context.classes], self._group
+        )
+        return found
 
     def reasons(self, context: Context, shares: Floats, gains: Floats, rows: Places) -> Floats:
         """How the gain of the classes in `rows` (N,) changes by each other class, (N, n).
@@ -217,16 +220,20 @@ class ClosedForm:
         Args:
             gains: (n,) given the rest.
         """
-        common = self.units.common(context)
-        change = gains[rows, None] - self._objects.gains_without_others(
-            context.object_y, context.classes, shares, rows, *common
+        without: Floats = objects.gains_without_others(
+            *(context.object_y, shares, self.W[context.classes], rows),
+            *(*self.units.common(context), self._group),
         )
+        change = gains[rows, None] - without
         change[np.arange(len(rows)), rows] = 0
         return change
 
     def reasons_for_absent(self, context: Context, shares: Floats, candidates: Places) -> Floats:
         """The same of absent classes (N,): what each present one does for them, (N, n)."""
-        return self._objects.reasons_for_absent(context.object_y, candidates, shares)
+        found: Floats = objects.reasons_for_absent(
+            context.object_y, shares, self.W[candidates], self._group
+        )
+        return found
 
 
 def _scaled(pull: float, x: Floats, y: Floats, slopes: Floats) -> tuple[Floats, Floats]:
@@ -258,14 +265,14 @@ class Completions:
     ) -> None:
         if not self.fits(weights):
             raise ValueError("completions need stored samples and moderate weights in float32")
-        self._scorer, self._objects, self._count = scorer, ObjectPart(weights["W"]), count
-        self._things = ~structure
+        self._scorer, self._structure = scorer, structure
         self._W, self._b = weights["W"], weights["b"]
         generator = np.random.Generator(np.random.Philox(SEED))
         contexts = _contexts(weights, generator)
         logits = self._b + contexts @ self._W.T
-        self._odds_against = np.exp(-np.maximum(logits, _LEAST_LOGIT))
-        self._noise = np.exp(-_stratified_logits(count, len(self._b), generator))
+        # Of classes (V,) and samples (N,) or completions (M,): a class lies in one piece.
+        self._odds_against = np.exp(-np.maximum(logits, _LEAST_LOGIT)).T.copy()
+        self._noise = np.exp(-_stratified_logits(count, len(self._b), generator)).T.copy()
         self._rooms = _room_weights(weights, contexts)
         # Of the instance: a cache of the method would keep every instance alive.
         self._empty = lru_cache(maxsize=_KEPT)(self._unlisted_evidence)
@@ -294,38 +301,23 @@ class Completions:
         base = self._empty(coverage)
         if room is not None and len(self._rooms):
             base = base + self._rooms[room]
-        picked = self._resample(base, classes, presence, coverage)
         unlisted = np.float32(math.log1p(-coverage))
-        possible = self._things.copy()
-        possible[classes] = False
-        added = possible & (self._odds_against[picked] < np.exp(unlisted) * self._noise)
-        context, new = np.divmod(np.flatnonzero(added), len(self._b))
-        ones = np.ones(len(new), np.float32)
-        completed = y + accumulate(context, ones, self._W[new], self._count)
-        off, on = halves(completed)
-        gains = self._scorer.gains(off, on)
-        # softplus(y) - softplus(y - W): the class itself is taken out.
-        gains[context, new] = self._objects.gains_with(context, off, on, new)
-        # One exponential for both, and neither as a difference.
-        odds = np.exp(-(self._b + unlisted) - gains)
-        present = 1 / (1 + odds)
-        found: Floats = np.log(present.sum(0)) - np.log((odds * present).sum(0))
-        return found
-
-    def _resample(self, base: Floats, classes: Places, presence: Floats, coverage: float) -> Places:
-        """Systematic resampling of the samples by their weights given a scene, (M,) ascending."""
-        weighed = self._things[classes]
-        # log σ(l) - log(1 - c σ(l)) = -log(1 - c + e^-l)
-        against = self._odds_against[:, classes[weighed]]
-        weight = base - np.log(np.float32(1 - coverage) + against) @ presence[weighed]
-        below = np.cumsum(np.exp(weight - weight.max()), dtype=np.float64)
-        wanted = (np.arange(self._count) + 0.5) / self._count * below[-1]
-        found: Places = np.searchsorted(below, wanted).clip(max=len(below) - 1)
+        telling = ~self._structure[classes]
+        picked = objects.resampled(
+            *(base, self._odds_against, classes[telling], presence[telling]),
+            *(np.float32(1 - coverage), self._noise.shape[1]),
+        )
+        usable = ~self._structure
+        usable[classes] = False
+        found: Floats = objects.completed_log_odds(
+            *(y, picked, self._odds_against, np.exp(unlisted) * self._noise, usable),
+            *(self._b + unlisted, self._W, self._scorer.exp_w, self._scorer.group),
+        )
         return found
 
     def _unlisted_evidence(self, coverage: float) -> Floats:
         """sum_i log(1 - c σ(l_i)) over all classes but structure, (N,)."""
-        chance = 1 / (1 + self._odds_against[:, self._things].T)
+        chance = 1 / (1 + self._odds_against[~self._structure])
         total = np.zeros(chance.shape[1], np.float32)
         for start in range(0, len(chance), _FACTORS):
             factors = 1 - np.float32(coverage) * chance[start : start + _FACTORS]
@@ -339,7 +331,7 @@ def _contexts(weights: Weights, generator: np.random.Generator) -> Floats:
     if weights.spec.C:
         rooms = weights["fantasy_rooms"]
         base += np.where((rooms >= 0)[:, None], weights["Q"][rooms.clip(min=0)], 0)
-    y, _ = with_second_layer(weights, base)
+    y, _ = weights.with_second_layer(base)
     on: Floats = (generator.random(y.shape) < sigmoid(y)).astype(np.float32)
     return on
 

@@ -35,30 +35,6 @@ def pair_rows(start, keys, pairs):
     return found
 
 
-@compiled
-def pair_terms(w, first, ends, z, base):
-    """What the logits of pairs have whatever the context: z_e into (B, K, P), the rest (B, R, P).
-
-    Args:
-        w: `relations.SharedArrays`.
-        first: the first of the R relations.
-        ends: `relations.Ends`, (B, P) each.
-    """
-    # By name: each access through the tuple would count a reference.
-    S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
-    subjects, objects, log_i, log_j = ends.i, ends.j, ends.log_i, ends.log_j
-    for b in range(len(z)):
-        pairs = pair_rows(w.start, w.key, subjects[b] * len(S) + objects[b])
-        for p in range(len(pairs)):
-            i, j, own = subjects[b, p], objects[b, p], pairs[p]
-            for k in range(z.shape[1]):
-                z[b, k, p] = S[i, k] * O[j, k]
-            for c in range(base.shape[1]):
-                a = first + c
-                total = s[i, a] + n[a, 0] * log_i[b, p] + o[j, a] + n[a, 1] * log_j[b, p]
-                base[b, c, p] = total + residual[own, a]
-
-
 @compiled_in_any_order
 def unit_terms(w, g, a, ends):
     """Of units (E,): logits without U_e·h1, and z_e (E, K).
@@ -84,30 +60,57 @@ def unit_terms(w, g, a, ends):
     return base, z
 
 
+@compiled
+def pair_terms(w, first, ends, z, base):
+    """What the logits of pairs have whatever the context: z_e into (B, K, P'), the rest (B, R, P').
+
+    Args:
+        w: `relations.SharedArrays`.
+        first: the first of the R relations.
+        ends: `relations.Ends`, (B, P) each; P' is P or more.
+    """
+    # By name: each access through the tuple would count a reference.
+    S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
+    for b in range(len(z)):
+        subjects, objects, log_i, log_j = ends.i[b], ends.j[b], ends.log_i[b], ends.log_j[b]
+        pairs = pair_rows(w.start, w.key, subjects * len(S) + objects)
+        for p in range(len(pairs)):
+            i, j = subjects[p], objects[p]
+            S_i, O_j, own = S[i], O[j], residual[pairs[p]]
+            for k in range(z.shape[1]):
+                z[b, k, p] = S_i[k] * O_j[k]
+            for c in range(base.shape[1]):
+                a = first + c
+                of_counts = n[a, 0] * log_i[p] + n[a, 1] * log_j[p]
+                base[b, c, p] = s[i, a] + o[j, a] + of_counts + own[a]
+
+
 @compiled_in_any_order
-def spreads(C, q, spread):
+def spreads(C, q):
     """√3 σ of logits (B, R, P): the root of 3 q'C q.
 
     Args:
         C: (B, R, r (r + 1) / 2) its lower half; entries off the diagonal are doubled.
-        q: (B, R r, P).
+        q: (B, R, r, P).
     """
-    (B, R, P), r = spread.shape, q.shape[1] // spread.shape[1]
-    row, variance = np.empty(P, np.float32), np.empty(P, np.float32)
+    B, R, r, P = q.shape
+    found, row = np.empty((B, R, P), np.float32), np.empty(P, np.float32)
     for b in range(B):
         for c in range(R):
-            variance[:], t = np.float32(0.0), 0
-            for s in range(c * r, (c + 1) * r):
-                row[:] = np.float32(0.0)
-                for u in range(c * r, s + 1):
-                    weight = C[b, c, t]
-                    t += 1
+            weights, rows, variance, t = C[b, c], q[b, c], found[b, c], 0
+            variance[:] = np.float32(0.0)
+            for d in range(r):
+                row[:], this = np.float32(0.0), rows[d]
+                for u in range(d + 1):
+                    weight, other = weights[t + u], rows[u]
                     for p in range(P):
-                        row[p] += weight * q[b, u, p]
+                        row[p] += weight * other[p]
+                t += d + 1
                 for p in range(P):
-                    variance[p] += row[p] * q[b, s, p]
+                    variance[p] += row[p] * this[p]
             for p in range(P):
-                spread[b, c, p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
+                variance[p] = np.sqrt(np.float32(3.0) * max(variance[p], np.float32(0.0)))
+    return found
 
 
 _ROOT_3 = np.float32(3.0**0.5)

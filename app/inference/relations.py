@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import relation_kernels as kernels
-from app.inference.mean_field import SWEEPS, sigmoid
+from app.inference.elementary import sigmoid
 
 if TYPE_CHECKING:
     from app.inference.weights import Weights
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 Places = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+SWEEPS: Final = 10
+"""Of a mean field: enough to settle on the machines we ship; fixed, so that answers repeat."""
 
 NO_UNIT: Final = np.float32(-30.0)
 """No log-odds of a relation is below."""
@@ -39,6 +42,9 @@ NEVER: Final = np.float32(-1e4)
 Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 
 NOTHING: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
+
+# Pairs are filled up to a multiple of it: loops take so many numbers in one turn.
+_WHOLE: Final = 32
 
 # Of the variance of a logit on average, how much the directions F_a leave out. A probability
 # changes by a twentieth of what its variance loses. Of the 33 directions of `indoor-triway` 11
@@ -482,16 +488,18 @@ class SharedUnits(RelationUnits):
         self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
     ) -> tuple[Floats, Floats]:
         """See `RelationUnits`."""
-        asked, (B, P), K = _asked(self._A, only), ends.i.shape, self._Y.shape[2]
-        R = asked.stop - asked.start
-        z, mean = np.empty((B, K, P), np.float32), np.empty((B, R, P), np.float32)
+        asked, (B, P) = _asked(self._A, only), ends.i.shape
+        Y = self._Y[asked]
+        width = -(-P // _WHOLE) * _WHOLE
+        z = np.zeros((B, Y.shape[2], width), np.float32)
+        mean = np.zeros((B, len(Y), width), np.float32)
         kernels.pair_terms(self._w, asked.start, ends, z, mean)
         mean += (self._of(asked, means, self._GT) + self._g[asked]) @ z
-        spread = np.zeros((B, R, P), np.float32)
-        if not known:
-            q = self._Y[asked].reshape(-1, K) @ z
-            kernels.spreads(self._of(asked, means * (1 - means), self._FF), q, spread)
-        return mean, spread
+        if known:
+            return mean[:, :, :P], np.zeros((B, len(Y), P), np.float32)
+        q = (Y.reshape(-1, Y.shape[2]) @ z).reshape(B, *Y.shape[:2], width)
+        spread = kernels.spreads(self._of(asked, means * (1 - means), self._FF), q)
+        return mean[:, :, :P], spread[:, :, :P]
 
     def _of(self, asked: slice, rows: Floats, columns: Floats) -> Floats:
         """Products of rows (B, H1) with the columns (H1, A n) of R relations, (B, R, n)."""

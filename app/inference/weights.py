@@ -1,4 +1,11 @@
-"""The weights of a trained machine: one layout of arrays for every variant."""
+"""The weights of a trained machine: one layout of arrays for every variant; the hidden layers.
+
+The hidden layers given objects, the second one at its mean field:
+
+    x = c1 + Q[t] + v'W + J m2,   m1 = sigmoid(beta x),   m2 = sigmoid(beta (c2 + m1'J))
+
+from m2 = sigmoid(beta c2) on, in turn; beta is one over the temperature. With one layer x is exact.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.inference.elementary import sigmoid
+from app.inference.relations import SWEEPS
 from app.inference.variants import MachineSpec
 
 WORD = 32
@@ -84,6 +93,19 @@ class Weights:
         """c1 + Q[t], (H1,); c1 where the room type is not known, or the machine has none."""
         bias: NDArray[Any] = self["c1"]
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
+
+    def with_second_layer(
+        self, base: NDArray[Any], beta: float = 1.0
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """x (B, H1) and m2 (B, H2) for base = c1 + Q[t] + v'W (B, H1)."""
+        if not self.spec.H2:
+            return base, np.zeros((len(base), 0), base.dtype)
+        J, c2 = self["J"], self["c2"]
+        m2 = np.broadcast_to(sigmoid(beta * c2), (len(base), len(c2)))
+        for _ in range(SWEEPS):
+            m1 = sigmoid(beta * (base + m2 @ J.T))
+            m2 = sigmoid(beta * (c2 + m1 @ J))
+        return base + m2 @ J.T, m2
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:

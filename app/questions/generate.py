@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.inference import MachineSpec, Weights
 from app.inference.chains import ConditionedChains, Conditions, Drawn, random_stream
-from app.inference.mean_field import softplus
+from app.inference.elementary import softplus
 from app.questions.answers import GeneratedScene
 from app.questions.outliers import outliers
 from app.questions.posterior import given_relations, present

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
-from app.inference.mean_field import sigmoid
+from app.inference.elementary import sigmoid
 from app.inference.relations import NO_UNIT
 from app.questions.answers import (
     EXPLAINED,

@@ -22,7 +22,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from app.inference.mean_field import sigmoid
+from app.inference.elementary import sigmoid
 from app.questions.answers import (
     EXPLAINED,
     Because,

@@ -1,17 +1,17 @@
 """Admission control: which requests begin when, and where the work of each model runs.
 
-`Backlog` bounds the requests that wait to be read. It starts at most `PACE` of them in a tick of
-the event loop, less those whose work is still pending, and refuses at most `REFUSALS` in a tick.
-Without it hundreds of simultaneous requests would hold up the event loop, and health checks with
-it. A request is refused when the backlog is full, when it would spend much of its time waiting, and
-when its deadline has passed.
+`Backlog` bounds the requests that wait to be read. In a tick of the event loop it starts so many as
+lately took `TICK` together, at most `PACE` less those whose work is still pending, and refuses at
+most `REFUSALS`. Without it hundreds of simultaneous requests would hold up the event loop, and
+health checks with it. A request is refused when the backlog is full, when it would spend much of
+its time waiting, and when its deadline has passed.
 
-`WorkQueue` holds the work of one model, bounded in rows. Jobs of one tick are computed in the next,
-each by itself, so an answer never depends on other requests. A cheap job runs on the event loop: a
-hop to a thread costs as much as most jobs. A job that is expected to take longer than `CHEAP`, or
+`WorkQueue` bounds the work of one model in rows. Each question is computed by itself, so an answer
+never depends on other requests. A cheap one is computed at once, on the event loop: a hop to a
+thread costs as much as most questions. A question that is expected to take longer than `CHEAP`, or
 whose kind was never measured, runs on the one worker thread of its model; compiled loops release
 the interpreter's lock. Drawings, which may take seconds, share one other thread. Questions of
-streams run after those of requests. A job whose deadline has passed, or whose client has left, is
+streams take turns, one a tick. A question whose deadline has passed, or whose client has left, is
 dropped when its turn comes.
 """
 
@@ -22,19 +22,22 @@ import math
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, thread_time
-from typing import Any, Final, Generic, TypeVar
+from typing import Final, Generic, TypeVar
 from weakref import WeakSet
 
 from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFullError
 
 T = TypeVar("T")
 
+TICK: Final = 8e-3
+"""Seconds that the requests begun in one tick may hold up the event loop."""
+
 PACE: Final = 32
-"""Requests begun in one tick, less those begun before whose work is still pending."""
+"""Most requests begun in one tick, less those begun before whose work is still pending."""
 
 REFUSALS: Final = 8
 """Requests refused in one tick."""
@@ -46,12 +49,10 @@ CHEAP: Final = 2e-3
 _PAUSE: Final = 5e-3
 # Share of its time that a request may expect to wait: the pace may still drop to a third.
 _PATIENCE: Final = 0.25
-# Share of the newest measurement in the measured pace.
+# Share of the newest measurement in the measured pace and in the time that a request takes.
 _NEWEST_PACE: Final = 0.1
 # Seconds between two checks of whether the client of costly work is still there.
 _LOOK: Final = 0.25
-# Seconds of computing in one tick before other tasks get their turn.
-_TICK: Final = 2e-3
 # Kinds and orders of size whose cost is remembered.
 _MAX_COSTS: Final = 4096
 # Share of the newest measurement in the expected cost.
@@ -68,7 +69,7 @@ class Backlog:
         limit: most requests that wait.
 
     Attributes:
-        pending: questions of requests that wait for a model or are computed now; drawings and
+        pending: questions of requests that wait for a thread or are computed by one; drawings and
             questions of streams are not counted.
         draining: nothing new is begun.
     """
@@ -78,7 +79,8 @@ class Backlog:
         self.pending = 0
         self.draining = False
         self._ticking = False
-        self._places = 0
+        self._places = self._begun = 0
+        self._began_at = self._seconds = 0.0
         self._interval = 0.0
         self._moved_at: float | None = None
         self._waiting: _Line = deque()
@@ -99,6 +101,7 @@ class Backlog:
             self._begin_tick()
         if not self._waiting and self._places:
             self._places -= 1
+            self._begun += 1
             return
         if self._is_full(allowed):
             count = len(self._waiting)
@@ -116,8 +119,14 @@ class Backlog:
         return len(self._waiting) >= self.limit or wait > _PATIENCE * allowed
 
     def _begin_tick(self) -> None:
-        self._places = max(0, PACE - self.pending)
-        begun = _wake(self._waiting, self._places) if self._waiting else 0
+        now = monotonic()
+        if self._begun and self._ticking:
+            took = (now - self._began_at) / self._begun
+            self._seconds += _NEWEST_PACE * (took - self._seconds)
+        self._began_at = now
+        fit = int(TICK / self._seconds) if PACE * self._seconds > TICK else PACE
+        self._places = max(0, max(1, fit) - self.pending)
+        begun = self._begun = _wake(self._waiting, self._places) if self._waiting else 0
         self._places -= begun
         if begun or self._moved_at is not None or self._waiting:
             self._measure_pace(begun)
@@ -206,13 +215,6 @@ class Done(Generic[T]):
     processor: float
 
 
-@dataclass(slots=True, eq=False)
-class _Job:
-    call: Callable[[], Done[Any]]
-    ticket: Ticket
-    future: asyncio.Future[Any]
-
-
 class _Costs:
     """Seconds that questions took so far, per unit of size, by kind and order of size.
 
@@ -277,12 +279,9 @@ class WorkQueue:
     threads: Threads
     backlog: Backlog
     rows: int = 0
-    _waiting: deque[_Job] = field(default_factory=deque)
-    _low_priority: deque[_Job] = field(default_factory=deque)
-    _draining: bool = False
     _costs: _Costs = field(default_factory=_Costs)
     _costly: Executor = field(init=False)
-    # One question of a stream at a time is in the thread: requests wait for one at most.
+    # One question of a stream at a time, so that requests wait for one at most.
     _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
@@ -315,46 +314,41 @@ class WorkQueue:
 
         Args:
             call: the work; it may run in another thread.
-            kind: jobs of one kind and about one size, at least 1, cost alike.
-            low_priority: it runs after all jobs of normal priority.
+            kind: questions of one kind and about one size, at least 1, cost alike.
+            low_priority: of streams; others run between two of them.
 
         Raises:
             DeadlinePassedError: the deadline passed first; the work is dropped, or its result.
             DisconnectedError: the client has left.
-            Exception: whatever the job raises.
+            Exception: whatever the work raises.
         """
         came = monotonic()
 
-        def measured() -> Done[T]:
-            # Measured here: the request of a job that took too long may have ended.
+        def measured(_: Callable[[], bool] | None = None) -> Done[T]:
+            # Measured here: the request of work that took too long may have ended.
             began, busy = monotonic(), thread_time()
             result = call()
             done = Done(result, began - came, monotonic() - began, thread_time() - busy)
             self._costs.learn(kind, size, done.processor)
             return done
 
-        counted = 0 if low_priority else 1
-        self.backlog.pending += counted
-        try:
+        async def compute() -> Done[T]:
             if self._costs.expected(kind, size) > CHEAP:
-                async with _turn(self._turn, ticket) if low_priority else nullcontext():
-                    return await _in_thread(lambda _: measured(), ticket, self._costly)
-            line = self._low_priority if low_priority else self._waiting
-            loop = asyncio.get_running_loop()
-            job = _Job(measured, ticket, loop.create_future())
-            line.append(job)
-            if not self._draining:
-                self._draining = True
-                loop.call_soon(self._drain)
-            try:
-                found: Done[T] = await job.future
-            finally:
-                del job  # see `_drain`
-            # Other jobs may have run meanwhile.
+                return await _in_thread(measured, ticket, self._costly)
             ticket.check()
-            return found
+            done = measured()
+            ticket.check()
+            return done
+
+        if low_priority:
+            async with _turn(self._turn, ticket):
+                await asyncio.sleep(0)
+                return await compute()
+        self.backlog.pending += 1
+        try:
+            return await compute()
         finally:
-            self.backlog.pending -= counted
+            self.backlog.pending -= 1
 
     async def draw(self, call: Callable[[Callable[[], bool]], T], ticket: Ticket) -> Done[T]:
         """Draw scenes.
@@ -374,25 +368,6 @@ class WorkQueue:
             return Done(result, began - came, monotonic() - began, thread_time() - busy)
 
         return await _in_thread(drawn, ticket, self.threads.drawing)
-
-    def _drain(self) -> None:
-        end = monotonic() + _TICK
-        while line := self._waiting or self._low_priority:
-            job = line.popleft()
-            try:
-                if not job.future.done():
-                    job.ticket.check()
-                    job.future.set_result(job.call())
-            except Exception as error:  # noqa: BLE001 - it belongs to the request, which raises it
-                job.future.set_exception(error)
-            finally:
-                # The error refers to this frame, and the future to the error: with the job in the
-                # frame they would keep the whole request until the collector runs.
-                del job
-            if (self._waiting or self._low_priority) and monotonic() > end:
-                asyncio.get_running_loop().call_soon(self._drain)
-                return
-        self._draining = False
 
 
 @asynccontextmanager
@@ -435,4 +410,6 @@ async def _in_thread(
     finally:
         given_up = True
         future.cancel()
-        del future  # see `WorkQueue._drain`
+        # The error refers to this frame, and the future to the error: they would keep the whole
+        # request until the collector runs.
+        del future

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
-from pydantic_core import from_json, to_json
+import orjson
+from pydantic_core import from_json, to_json, to_jsonable_python
 
 from app import questions
 from app.scene.relations import CANONICAL, canonicalise, opposite
@@ -247,13 +248,20 @@ def written(answer: Any) -> bytes:
     Raises:
         ValueError: a number in it is not finite.
     """
+    body = orjson.dumps(answer, default=_fields)
+    if b"null" not in body:
+        return body
+    # A number that is not finite, a field without a value, or a part of a name.
     body = to_json(answer, inf_nan_mode="constants", exclude_none=True)
-    if b"NaN" in body or b"Infinity" in body:  # as a number, or as part of a name
-        try:
-            from_json(body, allow_inf_nan=False)
-        except ValueError:
-            raise ValueError("a number of an answer is not finite") from None
+    try:
+        from_json(body, allow_inf_nan=False)
+    except ValueError:
+        raise ValueError("a number of an answer is not finite") from None
     return body
+
+
+def _fields(part: Any) -> Any:
+    return to_jsonable_python(part, exclude_none=True)
 
 
 def _because(

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.inference.mean_field import sigmoid
+from app.inference.elementary import sigmoid
 from app.inference.posterior import ClosedForm
 from app.questions.calibration import (
     exclusive,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from app.inference import chain_kernels, object_kernels, relation_kernels
+from app.inference import chain_kernels, relation_kernels
 from app.inference.chains import Conditions, random_stream
 from app.questions import generate
 from app.scene import CANONICAL
@@ -118,7 +118,7 @@ def test_loops_are_compiled_once():
     artifact = larger_artifact("triway-wide", scale=0.3)
     loops = [
         loop
-        for module in (chain_kernels, object_kernels, relation_kernels)
+        for module in (chain_kernels, relation_kernels)
         for loop in vars(module).values()
         if hasattr(loop, "signatures") and loop.__module__ == module.__name__
     ]

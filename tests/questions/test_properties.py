@@ -187,7 +187,10 @@ def test_disagreements_of_chosen_pairs_either_way_round():
     assert len(everything) > 3
     for d in everything:
         one = [(d.object, d.subject)]
-        assert relations(artifact, scene, pairs=one, top_k=4096)[1] == (d,)
+        (alone,) = relations(artifact, scene, pairs=one, top_k=4096)[1]
+        # Products of one row and of many may round differently.
+        assert alone[:4] == d[:4]
+        assert alone[4:] == pytest.approx(d[4:], rel=1e-5)
     things = tuple(d for d in everything if 5 not in (d.subject, d.object))
     assert len(things) < len(everything)
     assert relations(artifact, scene, top_k=4096)[1] == things

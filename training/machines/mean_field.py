@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from app.inference.mean_field import SWEEPS
+from app.inference.relations import SWEEPS
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 
