@@ -20,7 +20,7 @@ def test_the_wheel_holds_the_client_alone(repository: Path, tmp_path: Path):
     subprocess.run([*command, "-w", tmp_path, source], check=True, timeout=120)
     (wheel,) = tmp_path.glob("scene_client-*.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    modules = {path.name for path in (source / "scene_client").glob("*.py")}
-    assert {name.partition("/")[2] for name in names if name.endswith(".py")} == modules
+    modules = {str(path.relative_to(source)) for path in source.glob("scene_client/**/*.py")}
+    assert {name for name in names if name.endswith(".py")} == modules
     assert all(name.startswith("scene_client") for name in names)
     assert "scene_client/py.typed" in names
