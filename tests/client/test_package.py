@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -15,7 +16,9 @@ def test_the_blocking_client_is_up_to_date():
 
 
 def test_the_wheel_holds_the_client_alone(repository: Path, tmp_path: Path):
-    source = repository / "clients" / "python"
+    # A copy: pip leaves its build folder in the source, and takes old modules from it.
+    ignored = shutil.ignore_patterns("build", "*.egg-info")
+    source = shutil.copytree(repository / "clients" / "python", tmp_path / "source", ignore=ignored)
     command = (sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation")
     subprocess.run([*command, "-w", tmp_path, source], check=True, timeout=120)
     (wheel,) = tmp_path.glob("scene_client-*.whl")
