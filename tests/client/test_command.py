@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,8 +15,20 @@ from typer.testing import CliRunner, Result
 
 from scene_client import Client, __version__, tables
 from scene_client.command import app
+from scene_client.schemas import (
+    Disagreement,
+    MisplacedRelation,
+    MissingAnswer,
+    Outlier,
+    OutliersAnswer,
+    RelationsAnswer,
+)
 from tests.client.peers import answer, read_head
 
+ANSWERED: dict[str, Any] = {
+    "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
+    "request_id": "r",
+}
 SCENE = {"objects": ["bed", "lamp"], "relations": [], "top_k": 2}
 
 
@@ -268,51 +279,55 @@ def shown(renderable: Any) -> str:
 
 
 def test_offsets_reasons_and_disagreements_are_shown_where_an_answer_has_them() -> None:
-    point, spread = SimpleNamespace(x=0.1, y=-0.2, z=0.3), SimpleNamespace(x=0.01, y=0.02, z=0.03)
-    placement = SimpleNamespace(
-        relation="on-top",
-        object="desk",
-        probability=0.5,
-        offset=SimpleNamespace(mean=point, std=spread),
-    )
-    because = [SimpleNamespace(object="bed", log_odds_change=1.5)]
-    entry = SimpleNamespace(
-        label="lamp", probability=0.25, log_odds=-1.0, placements=[placement], because=because
-    )
-    text = shown(tables.missing(SimpleNamespace(missing=[entry])))  # type: ignore[arg-type]
+    placement = {
+        "relation": "on-top",
+        "object": "desk",
+        "probability": 0.5,
+        "offset": {
+            "mean": {"x": 0.1, "y": -0.2, "z": 0.3},
+            "std": {"x": 0.01, "y": 0.02, "z": 0.03},
+            "scenes": 9,
+        },
+    }
+    lamp = {
+        "label": "lamp",
+        "probability": 0.25,
+        "log_odds": -1.0,
+        "placements": [placement, {**placement, "offset": None}],
+        "because": [{"object": "bed", "log_odds_change": 1.5}],
+    }
+    text = shown(tables.missing(MissingAnswer(**ANSWERED, missing=[lamp])))
     assert "on-top desk 0.500 (x +0.10±0.01, y -0.20±0.02, z +0.30±0.03 m)" in text
     assert "bed +1.50" in text
-    doubt = SimpleNamespace(
-        subject="lamp",
-        object="desk",
-        observed=["left", "above"],
-        expected="on-top",
-        probability=0.9,
-        observed_probability=0.05,
-    )
-    given = SimpleNamespace(relations=[], disagreements=[doubt])
-    text = shown(tables.relations(given))  # type: ignore[arg-type]
+    doubt = Disagreement("lamp", "desk", ["left", "above"], "on-top", 0.9, 0.05)
+    answer = RelationsAnswer(**ANSWERED, relations=[], disagreements=[doubt])
+    text = shown(tables.relations(answer))
     assert "disagreements" in text
     assert "left, above" in text
     assert "on-top 0.900" in text
 
 
 def test_words_of_a_service_cannot_dress_themselves_up() -> None:
-    hostile = SimpleNamespace(object="[red]x[/red]", label=":bed:", probability=0.1, log_odds=0.0)
-    hostile.is_outlier, hostile.because = False, []
-    found = SimpleNamespace(outliers=[hostile], misplaced=[])
-    text = shown(tables.outliers(found))  # type: ignore[arg-type]
+    hostile = Outlier(
+        object="[red]x[/red]",
+        label=":bed:",
+        probability=0.1,
+        log_odds=0.0,
+        is_outlier=False,
+        because=[],
+    )
+    text = shown(tables.outliers(OutliersAnswer(**ANSWERED, outliers=[hostile], misplaced=[])))
     assert "[red]x[/red]" in text
 
 
 def test_of_many_given_relations_the_likeliest_to_be_wrong_are_shown() -> None:
     given = [
-        SimpleNamespace(subject=f"a_{i}", relation="left", object="b", probability=1 - i / 40)
+        MisplacedRelation(subject=f"a_{i}", relation="left", object="b", probability=1 - i / 40)
         for i in range(12)
     ]
-    text = shown(tables.outliers(SimpleNamespace(outliers=[], misplaced=given)))  # type: ignore[arg-type]
+    text = shown(tables.outliers(OutliersAnswer(**ANSWERED, outliers=[], misplaced=given)))
     assert "the 10 likeliest to be wrong of 12" in text
     assert "a_9" in text
     assert "a_10" not in text
-    few = SimpleNamespace(outliers=[], misplaced=given[:10])
-    assert "likeliest" not in shown(tables.outliers(few))  # type: ignore[arg-type]
+    few = OutliersAnswer(**ANSWERED, outliers=[], misplaced=given[:10])
+    assert "likeliest" not in shown(tables.outliers(few))

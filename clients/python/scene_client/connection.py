@@ -41,14 +41,7 @@ with the closing is lost."""
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Where the service is, and how it is asked.
-
-    Attributes:
-        url: of the service, with the path that a proxy strips, if there is one.
-        timeout: seconds for a whole call, further attempts and the pauses between them included.
-        api_key, admin_key: where the service asks for them.
-        model: asked where a request names none.
-        retries: further attempts at most, as far as there is time for them.
+    """Arguments of `AsyncClient`, checked; ``url`` with the path that a proxy strips, if any.
 
     Raises:
         InvalidRequestError: there is no service at such a URL, or no call takes so long.
