@@ -20,10 +20,11 @@ HEADER: Final = "# Written by `make format` from asynchronous.py; do not edit.\n
 NAMES: Final = {
     "AsyncBaseTransport": "BaseTransport",
     "AsyncClient": "Client",
-    "AsyncDeadlineTransport": "DeadlineTransport",
     "aclose": "close",
     "aiter_bytes": "iter_bytes",
     "anyio": "time",
+    "async_deadline": "deadline",
+    "async_transport": "DeadlineTransport",
 }
 
 

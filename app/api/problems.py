@@ -34,9 +34,8 @@ from app.serving.errors import (
     StoreNotWritableError,
     UnknownModelError,
 )
-from scene_client.faults import MAX_ERRORS, field_errors
-from scene_client.pointers import pointer
 from scene_client.schemas import Failure, FieldError, Problem
+from scene_client.validation import MAX_ERRORS, field_errors, pointer
 
 MEDIA_TYPE: Final = "application/problem+json"
 

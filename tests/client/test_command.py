@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,8 +16,20 @@ from typer.testing import CliRunner, Result
 
 from scene_client import Client, __version__, tables
 from scene_client.command import app
+from scene_client.schemas import (
+    Disagreement,
+    MisplacedRelation,
+    MissingAnswer,
+    Outlier,
+    OutliersAnswer,
+    RelationsAnswer,
+)
 from tests.client.peers import answer, read_head
 
+ANSWERED: dict[str, Any] = {
+    "model": {"name": "home", "version": "1.0.0", "variant": "rbm", "digest": "0"},
+    "request_id": "r",
+}
 SCENE = {"objects": ["bed", "lamp"], "relations": [], "top_k": 2}
 
 
@@ -49,51 +61,32 @@ def test_what_is_missing_is_a_table(scene: Any, url: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "method", "fields"),
+    ("line", "fields"),
     [
-        (("missing", "bed", "--candidate", "lamp"), "missing", {"candidates": ["lamp"]}),
+        ("missing bed --candidate lamp", {"candidates": ["lamp"]}),
+        ("missing bed --model plain", {"model": "plain"}),
         (
-            (
-                "relations",
-                "bed",
-                "garbage bin",
-                "--relation",
-                "garbage bin left bed",
-                "--opposites",
-            ),
-            "relations",
+            "relations bed 'garbage bin' --relation 'garbage bin left bed' --opposites",
             {"relations": [("garbage bin", "left", "bed")], "include_opposites": True},
         ),
-        (("outliers", "bed", "--room", "office"), "outliers", {"room_type": "office"}),
-        (("outliers", "bed", "--threshold", "0.2"), "outliers", {"threshold": 0.2}),
+        ("outliers bed --room office", {"room_type": "office"}),
+        ("outliers bed --threshold 0.2", {"threshold": 0.2}),
         (
-            (
-                "generate",
-                "bed",
-                "--count",
-                "2",
-                "--seed",
-                "5",
-                "--temperature",
-                "0.5",
-                "--steps",
-                "3",
-            ),
-            "generate",
+            "generate bed --count 2 --seed 5 --temperature 0.5 --steps 3",
             {"count": 2, "seed": 5, "temperature": 0.5, "steps": 3},
         ),
-        (("missing", "bed", "--model", "plain"), "missing", {"model": "plain"}),
     ],
 )
 def test_json_is_the_service_s_answer(
-    scene: Any, url: str, arguments: tuple[str, ...], method: str, fields: dict[str, Any]
+    scene: Any, url: str, line: str, fields: dict[str, Any]
 ) -> None:
-    done = scene(*arguments, "--json")
+    question, *arguments = shlex.split(line)
+    done = scene(question, *arguments, "--json")
     assert done.exit_code == 0, done.stderr
     found = json.loads(done.stdout)
     objects = ["bed", "garbage bin"] if "garbage bin" in arguments else ["bed"]
     with Client(url) as client:
-        expected = getattr(client, method)(objects, **fields)
+        expected = getattr(client, question)(objects, **fields)
     assert found == {
         **json.loads(expected.model_dump_json(exclude_none=True)),
         "request_id": found["request_id"],
@@ -117,26 +110,19 @@ def test_a_scene_may_come_from_a_file_or_a_pipe_and_options_go_before_it(
 
 
 @pytest.mark.parametrize(
-    "arguments", [("models",), ("vocabulary",), ("contexts",), ("outliers", "bed", "toilet")]
+    ("line", "words"),
+    [
+        ("models", ("home@1.0.0", "default", "triway", "ready")),
+        ("vocabulary", ("garbage bin", "trash can, waste basket", "structure")),
+        ("contexts", ("layer", "unit")),
+        ("outliers bed toilet", ("toilet", "because")),
+    ],
 )
-def test_everything_has_a_table(scene: Any, arguments: tuple[str, ...]) -> None:
-    done = scene(*arguments)
+def test_everything_has_a_table(scene: Any, line: str, words: tuple[str, ...]) -> None:
+    done = scene(*line.split())
     assert done.exit_code == 0
-    words = {
-        "models": ("home@1.0.0", "default", "triway", "ready"),
-        "vocabulary": ("garbage bin", "trash can, waste basket", "structure"),
-        "contexts": ("layer", "unit"),
-        "outliers": ("toilet", "because"),
-    }
-    for word in words[arguments[0]]:
+    for word in words:
         assert word in done.stdout
-
-
-def test_answers_without_a_service_are_the_same(scene: Any, shared_store: Path) -> None:
-    over_http = json.loads(scene("missing", "bed", "--json").stdout)
-    done = scene("missing", "bed", "--json", "--offline", str(shared_store))
-    offline = json.loads(done.stdout)
-    assert {**offline, "request_id": ""} == {**over_http, "request_id": ""}
 
 
 def test_scenes_are_drawn(scene: Any, tmp_path: Path) -> None:
@@ -268,51 +254,55 @@ def shown(renderable: Any) -> str:
 
 
 def test_offsets_reasons_and_disagreements_are_shown_where_an_answer_has_them() -> None:
-    point, spread = SimpleNamespace(x=0.1, y=-0.2, z=0.3), SimpleNamespace(x=0.01, y=0.02, z=0.03)
-    placement = SimpleNamespace(
-        relation="on-top",
-        object="desk",
-        probability=0.5,
-        offset=SimpleNamespace(mean=point, std=spread),
-    )
-    because = [SimpleNamespace(object="bed", log_odds_change=1.5)]
-    entry = SimpleNamespace(
-        label="lamp", probability=0.25, log_odds=-1.0, placements=[placement], because=because
-    )
-    text = shown(tables.missing(SimpleNamespace(missing=[entry])))  # type: ignore[arg-type]
+    placement = {
+        "relation": "on-top",
+        "object": "desk",
+        "probability": 0.5,
+        "offset": {
+            "mean": {"x": 0.1, "y": -0.2, "z": 0.3},
+            "std": {"x": 0.01, "y": 0.02, "z": 0.03},
+            "scenes": 9,
+        },
+    }
+    lamp = {
+        "label": "lamp",
+        "probability": 0.25,
+        "log_odds": -1.0,
+        "placements": [placement, {**placement, "offset": None}],
+        "because": [{"object": "bed", "log_odds_change": 1.5}],
+    }
+    text = shown(tables.missing(MissingAnswer(**ANSWERED, missing=[lamp])))
     assert "on-top desk 0.500 (x +0.10±0.01, y -0.20±0.02, z +0.30±0.03 m)" in text
     assert "bed +1.50" in text
-    doubt = SimpleNamespace(
-        subject="lamp",
-        object="desk",
-        observed=["left", "above"],
-        expected="on-top",
-        probability=0.9,
-        observed_probability=0.05,
-    )
-    given = SimpleNamespace(relations=[], disagreements=[doubt])
-    text = shown(tables.relations(given))  # type: ignore[arg-type]
+    doubt = Disagreement("lamp", "desk", ["left", "above"], "on-top", 0.9, 0.05)
+    answer = RelationsAnswer(**ANSWERED, relations=[], disagreements=[doubt])
+    text = shown(tables.relations(answer))
     assert "disagreements" in text
     assert "left, above" in text
     assert "on-top 0.900" in text
 
 
 def test_words_of_a_service_cannot_dress_themselves_up() -> None:
-    hostile = SimpleNamespace(object="[red]x[/red]", label=":bed:", probability=0.1, log_odds=0.0)
-    hostile.is_outlier, hostile.because = False, []
-    found = SimpleNamespace(outliers=[hostile], misplaced=[])
-    text = shown(tables.outliers(found))  # type: ignore[arg-type]
+    hostile = Outlier(
+        object="[red]x[/red]",
+        label=":bed:",
+        probability=0.1,
+        log_odds=0.0,
+        is_outlier=False,
+        because=[],
+    )
+    text = shown(tables.outliers(OutliersAnswer(**ANSWERED, outliers=[hostile], misplaced=[])))
     assert "[red]x[/red]" in text
 
 
 def test_of_many_given_relations_the_likeliest_to_be_wrong_are_shown() -> None:
     given = [
-        SimpleNamespace(subject=f"a_{i}", relation="left", object="b", probability=1 - i / 40)
+        MisplacedRelation(subject=f"a_{i}", relation="left", object="b", probability=1 - i / 40)
         for i in range(12)
     ]
-    text = shown(tables.outliers(SimpleNamespace(outliers=[], misplaced=given)))  # type: ignore[arg-type]
+    text = shown(tables.outliers(OutliersAnswer(**ANSWERED, outliers=[], misplaced=given)))
     assert "the 10 likeliest to be wrong of 12" in text
     assert "a_9" in text
     assert "a_10" not in text
-    few = SimpleNamespace(outliers=[], misplaced=given[:10])
-    assert "likeliest" not in shown(tables.outliers(few))  # type: ignore[arg-type]
+    few = OutliersAnswer(**ANSWERED, outliers=[], misplaced=given[:10])
+    assert "likeliest" not in shown(tables.outliers(few))

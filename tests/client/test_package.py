@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -15,12 +16,59 @@ def test_the_blocking_client_is_up_to_date():
 
 
 def test_the_wheel_holds_the_client_alone(repository: Path, tmp_path: Path):
-    source = repository / "clients" / "python"
+    # A copy: pip leaves its build folder in the source, and takes old modules from it.
+    ignored = shutil.ignore_patterns("build", "*.egg-info")
+    source = shutil.copytree(repository / "clients" / "python", tmp_path / "source", ignore=ignored)
     command = (sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation")
     subprocess.run([*command, "-w", tmp_path, source], check=True, timeout=120)
     (wheel,) = tmp_path.glob("scene_client-*.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    modules = {path.name for path in (source / "scene_client").glob("*.py")}
-    assert {name.partition("/")[2] for name in names if name.endswith(".py")} == modules
+    modules = {str(path.relative_to(source)) for path in source.glob("scene_client/**/*.py")}
+    assert {name for name in names if name.endswith(".py")} == modules
     assert all(name.startswith("scene_client") for name in names)
     assert "scene_client/py.typed" in names
+
+
+HEAVY = (
+    "fastapi",
+    "matplotlib",
+    "numba",
+    "numpy",
+    "prometheus_client",
+    "pydantic_settings",
+    "rapidfuzz",
+    "safetensors",
+    "starlette",
+    "torch",
+    "uvicorn",
+)
+
+PROGRAM = f"""
+import sys
+for module in {HEAVY!r}:
+    sys.modules[module] = None  # importing it raises ImportError
+import scene_client, scene_client.command, scene_client.schemas, scene_client.vision_msgs
+with scene_client.Client("http://127.0.0.1:9", retries=0) as scene:
+    assert not scene.is_ready()
+    try:
+        scene.missing(["bed"])
+    except scene_client.UnreachableError:
+        pass
+try:
+    scene_client.OfflineClient()
+except ImportError as error:
+    print(error)
+"""
+
+
+def test_the_client_works_where_nothing_of_the_service_is_installed(repository: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", PROGRAM],
+        cwd=repository,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    # Whoever wants answers without a service is told what that takes.
+    assert "pip install '.[service]' in the repository" in done.stdout

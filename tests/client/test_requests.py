@@ -16,7 +16,6 @@ from scene_client.schemas import (
     MissingRequest,
     Position,
     Relation,
-    RelationsRequest,
     SceneRequest,
 )
 
@@ -90,26 +89,33 @@ def test_short_and_long_forms_say_the_same(scene: Client, recorder: Recorder) ->
     assert bodies[0]["objects"] == ["desk", plain]
 
 
-def test_a_whole_request_is_sent_as_it_is(scene: Client, recorder: Recorder) -> None:
-    request = MissingRequest(objects=["bed"], candidates=["lamp"])
-    scene.missing(request)
-    assert recorder.body == {"objects": ["bed"], "candidates": ["lamp"]}
-    scene.missing({"objects": ["bed"], "candidates": ["lamp"]})
-    assert recorder.body == {"objects": ["bed"], "candidates": ["lamp"]}
-    scene.generate()
-    assert recorder.body == {"objects": []}
+LAMPS = {"objects": ["bed"], "candidates": ["lamp"]}
 
 
-def test_pairs_may_be_tuples(scene: Client, recorder: Recorder) -> None:
-    scene.relations(["bed", "lamp"], pairs=[("bed", "lamp")])
-    assert recorder.body["pairs"] == [{"subject": "bed", "object": "lamp"}]
-
-
-def test_batches_hold_scenes_of_every_form(scene: Client, recorder: Recorder) -> None:
-    scene.relations_batch([["bed"], {"objects": ["lamp"]}, RelationsRequest(objects=["desk"])])
-    scenes = [{"objects": ["bed"]}, {"objects": ["lamp"]}, {"objects": ["desk"]}]
-    assert recorder.body == {"scenes": scenes}
-    assert recorder.requests[-1].url.path == "/api/relations/batch"
+@pytest.mark.parametrize(
+    ("ask", "path", "body"),
+    [
+        (lambda scene: scene.missing(MissingRequest(**LAMPS)), "missing", LAMPS),
+        (lambda scene: scene.missing(LAMPS), "missing", LAMPS),
+        (lambda scene: scene.generate(), "generate", {"objects": []}),
+        (
+            lambda scene: scene.relations(["bed", "lamp"], pairs=[("bed", "lamp")]),
+            "relations",
+            {"objects": ["bed", "lamp"], "pairs": [{"subject": "bed", "object": "lamp"}]},
+        ),
+        (
+            lambda scene: scene.missing_batch([["bed"], LAMPS, MissingRequest(objects=["desk"])]),
+            "missing/batch",
+            {"scenes": [{"objects": ["bed"]}, LAMPS, {"objects": ["desk"]}]},
+        ),
+    ],
+)
+def test_scenes_of_every_form_are_sent_as_in_the_contract(
+    scene: Client, recorder: Recorder, ask: Callable[[Client], Any], path: str, body: Any
+) -> None:
+    ask(scene)
+    assert recorder.body == body
+    assert recorder.requests[-1].url.path == f"/api/{path}"
 
 
 def test_the_client_s_model_is_asked_where_a_request_names_none(recorder: Recorder) -> None:

@@ -21,7 +21,7 @@ from scene_client import (
     DeadlineError,
     UnreachableError,
     asynchronous,
-    deadline,
+    connection,
     sync,
 )
 from tests.client.conftest import OVER_HTTP
@@ -118,7 +118,7 @@ def test_nothing_is_sent_after_the_deadline(peer: Any, monkeypatch: pytest.Monke
         clock.stands += 3600.0  # the process was stopped between connecting and sending
         return stream
 
-    monkeypatch.setattr(deadline, "monotonic", lambda: clock.stands)
+    monkeypatch.setattr(connection, "monotonic", lambda: clock.stands)
     monkeypatch.setattr(httpcore.SyncBackend, "connect_tcp", connect_for_long)
     started = peer(listen)
     with Client(started.url, timeout=5.0) as scene:

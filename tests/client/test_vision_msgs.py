@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from app.registry import Store
 from scene_client.command import app
-from scene_client.label_maps import COCO
-from scene_client.ros_fields import MessageError
+from scene_client.ros_fields import COCO, MessageError
 from scene_client.schemas import SceneRequest
 from scene_client.vision_msgs import (
     MAX_OBJECTS,

@@ -2,44 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from time import monotonic
 from types import TracebackType
-from typing import Self, Unpack, overload
+from typing import Final, Self, Unpack, overload
 
 import anyio
 import httpx
 
-from scene_client import calls
-from scene_client.calls import Call, T
-from scene_client.deadline import AsyncDeadlineTransport
-from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
-from scene_client.exchange import (
-    MAX_ANSWER,
-    RETRIES,
-    Late,
-    Outcome,
-    Pause,
-    Received,
-    Send,
-    exchange,
-)
-from scene_client.fields import (
+from scene_client.calls import (
+    GENERATE,
+    MISSING,
+    OUTLIERS,
+    RELATIONS,
     AliasFields,
     Body,
+    Call,
     GenerateFields,
     MissingFields,
     Objects,
     OutliersFields,
     RelationsFields,
+    T,
+    ask,
+    ask_each,
+    promote,
+    segment,
 )
-from scene_client.options import Options
+from scene_client.connection import RETRIES, Options, async_deadline, async_transport
+from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
 from scene_client.schemas import (
     AliasAnswer,
     BatchAnswer,
     ContextsAnswer,
     GenerateAnswer,
     GenerateRequest,
+    Health,
     MissingAnswer,
     MissingRequest,
     ModelList,
@@ -52,6 +50,9 @@ from scene_client.schemas import (
     VersionDetails,
     VocabularyAnswer,
 )
+
+MAX_ANSWER: Final = 256 * 2**20
+"""Bytes; a batch of 256 scenes with 4,096 relations each stays below."""
 
 
 class AsyncClient:
@@ -94,7 +95,7 @@ class AsyncClient:
     ) -> None:
         self.options = Options(url, timeout, api_key, admin_key, model, retries)
         if transport is None:
-            transport = AsyncDeadlineTransport(self.options.ssl_context())
+            transport = async_transport(self.options.ssl_context())
         self._http = httpx.AsyncClient(transport=transport, trust_env=False)
 
     # ------------------------------------------------------------------------------ questions
@@ -107,8 +108,7 @@ class AsyncClient:
         **fields: Unpack[RelationsFields],
     ) -> RelationsAnswer:
         """How do these objects stand to each other?"""
-        model = self.options.model
-        return await self._call(calls.ask(calls.RELATIONS, objects, fields, model), timeout)
+        return await self._call(ask(RELATIONS, objects, fields, self.options.model), timeout)
 
     async def missing(
         self,
@@ -118,8 +118,7 @@ class AsyncClient:
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
         """What else should be here, and where?"""
-        model = self.options.model
-        return await self._call(calls.ask(calls.MISSING, objects, fields, model), timeout)
+        return await self._call(ask(MISSING, objects, fields, self.options.model), timeout)
 
     async def outliers(
         self,
@@ -129,8 +128,7 @@ class AsyncClient:
         **fields: Unpack[OutliersFields],
     ) -> OutliersAnswer:
         """What does not belong here, or stands in the wrong place?"""
-        model = self.options.model
-        return await self._call(calls.ask(calls.OUTLIERS, objects, fields, model), timeout)
+        return await self._call(ask(OUTLIERS, objects, fields, self.options.model), timeout)
 
     async def generate(
         self,
@@ -140,8 +138,7 @@ class AsyncClient:
         **fields: Unpack[GenerateFields],
     ) -> GenerateAnswer:
         """What would a scene like this look like?"""
-        model = self.options.model
-        return await self._call(calls.ask(calls.GENERATE, objects, fields, model), timeout)
+        return await self._call(ask(GENERATE, objects, fields, self.options.model), timeout)
 
     # -------------------------------------------------------------------------------- batches
 
@@ -152,9 +149,7 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
         """As `relations`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return await self._call(
-            calls.ask_each(calls.RELATIONS, scenes, self.options.model), timeout
-        )
+        return await self._call(ask_each(RELATIONS, scenes, self.options.model), timeout)
 
     async def missing_batch(
         self,
@@ -163,7 +158,7 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
         """As `missing`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return await self._call(calls.ask_each(calls.MISSING, scenes, self.options.model), timeout)
+        return await self._call(ask_each(MISSING, scenes, self.options.model), timeout)
 
     async def outliers_batch(
         self,
@@ -172,13 +167,13 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
         """As `outliers`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return await self._call(calls.ask_each(calls.OUTLIERS, scenes, self.options.model), timeout)
+        return await self._call(ask_each(OUTLIERS, scenes, self.options.model), timeout)
 
     # --------------------------------------------------------------------------------- models
 
     async def models(self, *, timeout: float | None = None) -> ModelList:
         """Models, versions and aliases."""
-        return await self._call(calls.models(), timeout)
+        return await self._call(Call("GET", "/models", ModelList), timeout)
 
     @overload
     async def model(self, name: str, *, timeout: float | None = None) -> ModelSummary: ...
@@ -192,25 +187,30 @@ class AsyncClient:
         self, name: str, version: str | None = None, *, timeout: float | None = None
     ) -> ModelSummary | VersionDetails:
         """The versions of a model, or all there is to know about one of them."""
+        path = f"/models/{segment(name)}"
         if version is None:
-            return await self._call(calls.model(name), timeout)
-        return await self._call(calls.version(name, version), timeout)
+            return await self._call(Call("GET", path, ModelSummary), timeout)
+        path += f"/versions/{segment(version)}"
+        return await self._call(Call("GET", path, VersionDetails), timeout)
 
     async def vocabulary(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> VocabularyAnswer:
         """The words of a model."""
-        return await self._call(calls.vocabulary(self.options.named(name)), timeout)
+        path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
+        return await self._call(Call("GET", path, VocabularyAnswer), timeout)
 
     async def contexts(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> ContextsAnswer:
         """The hidden units of a model by their strongest objects."""
-        return await self._call(calls.contexts(self.options.named(name)), timeout)
+        path = f"/models/{segment(name or self.options.model or 'default')}/contexts"
+        return await self._call(Call("GET", path, ContextsAnswer), timeout)
 
     async def refresh(self, *, timeout: float | None = None) -> RefreshAnswer:
         """Let the service take over what its store holds now; needs the admin key."""
-        return await self._call(calls.refresh(), timeout)
+        call = Call("POST", "/models/refresh", RefreshAnswer, administers=True)
+        return await self._call(call, timeout)
 
     async def promote(
         self,
@@ -229,7 +229,7 @@ class AsyncClient:
             model: ``name@version``, or ``name`` for its newest.
             **fields: ``expected``: where it must lead now; None: it must not exist yet.
         """
-        return await self._call(calls.promote(alias, {"model": model, **fields}), timeout)
+        return await self._call(promote(alias, {"model": model, **fields}), timeout)
 
     # --------------------------------------------------------------------------------- health
 
@@ -247,11 +247,11 @@ class AsyncClient:
         Raises:
             UnreachableError, DeadlineError, ProblemError: it does not, and so.
         """
-        await self._call(calls.health("ready"), timeout, retries=0)
+        await self._call(Call("GET", "/health/ready", Health), timeout, retries=0)
 
     async def _is(self, health: str, timeout: float | None) -> bool:
         try:
-            await self._call(calls.health(health), timeout, retries=0)
+            await self._call(Call("GET", f"/health/{health}", Health), timeout, retries=0)
         except (UnreachableError, DeadlineError):
             return False
         except ProblemError as problem:
@@ -260,47 +260,52 @@ class AsyncClient:
             return False
         return True
 
-    # ------------------------------------------------------------------------------- exchange
+    # ----------------------------------------------------------------------------------- a call
 
     async def _call(self, call: Call[T], timeout: float | None, retries: int | None = None) -> T:
+        """The answer of a call, after as many attempts as its time allows."""
         retries = self.options.retries if retries is None else retries
-        steps = exchange(call, self.options.limit(timeout), monotonic, retries=retries)
-        outcome: Outcome = None
-        while True:
+        limit = self.options.limit(timeout)
+        ends = monotonic() + limit
+        attempt = 0
+        while (left := ends - monotonic()) > 0:
             try:
-                to_do = steps.send(outcome)
-            except StopIteration as done:
-                answer: T = done.value
-                return answer
-            match to_do:
-                case Send(headers, left):
-                    outcome = await self._send(call, headers, left)
-                case Pause(seconds):
-                    await anyio.sleep(seconds)
-                    outcome = None
+                answer = await self._attempt(call, left)
+            except (TimeoutError, httpx.TimeoutException):
+                break
+            except (ProblemError, UnreachableError) as error:
+                pause = call.retry_pause(error, attempt)
+                if pause is None or attempt == retries or pause >= ends - monotonic():
+                    raise
+                attempt += 1
+                await anyio.sleep(pause)
+            else:
+                # Reading takes time, too. The caller does not wait for a later answer.
+                if monotonic() < ends:
+                    return answer
+        raise DeadlineError(f"No answer within {limit:g} s.")
 
-    async def _send(self, call: Call[T], headers: Mapping[str, str], left: float) -> Outcome:
-        options = self.options
-        body = bytearray()
-        try:
-            async with self._http.stream(
-                call.method,
-                options.address(call),
-                content=call.body,
-                headers={**options.headers(call), **headers},
-                timeout=left,
-            ) as response:
-                async for part in response.aiter_bytes():
-                    body += part
-                    if len(body) > MAX_ANSWER:
-                        raise AnswerError("The answer is too long.")
-        except httpx.TimeoutException:
-            return Late()
-        except (httpx.ConnectError, httpx.UnsupportedProtocol) as error:
-            return options.lost(error, sent=False)
-        except httpx.TransportError as error:
-            return options.lost(error, sent=True)
-        return Received(response.status_code, response.headers, bytes(body))
+    async def _attempt(self, call: Call[T], left: float) -> T:
+        """The answer of a call that is sent once, and may take so many seconds."""
+        options, body = self.options, bytearray()
+        with async_deadline(left):
+            try:
+                async with self._http.stream(
+                    call.method,
+                    options.address(call),
+                    content=call.body,
+                    headers=options.headers(call, left),
+                    timeout=left,
+                ) as response:
+                    async for part in response.aiter_bytes():
+                        body += part
+                        if len(body) > MAX_ANSWER:
+                            raise AnswerError("The answer is too long.")
+            except httpx.TimeoutException:
+                raise
+            except httpx.TransportError as error:
+                raise options.unreachable(error) from error
+        return call.read(response.status_code, response.headers, bytes(body))
 
     # ------------------------------------------------------------------------------- lifetime
 

@@ -1,44 +1,193 @@
-"""From what a caller says to what is sent: pure functions, the same for every client."""
+"""From a caller's arguments to the request that is sent, and from the response to the answer."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Generic, TypeVar
+from http import HTTPStatus
+from random import random
+from typing import Any, Final, Generic, TypeAlias, TypedDict, TypeVar
 from urllib.parse import quote
 
+import httpx
 from pydantic import BaseModel, ValidationError
 
-from scene_client.errors import InvalidRequestError
-from scene_client.faults import field_errors
+from scene_client.errors import (
+    AnswerError,
+    DeadlineError,
+    InvalidRequestError,
+    ProblemError,
+    UnreachableError,
+    problem_of,
+)
 from scene_client.schemas import (
     MAX_BATCH,
     AliasAnswer,
     AliasRequest,
+    Anchor,
     Answer,
     BatchAnswer,
-    ContextsAnswer,
+    Detection,
     FieldError,
     GenerateAnswer,
     GenerateRequest,
-    Health,
     MissingAnswer,
     MissingRequest,
-    ModelList,
-    ModelSummary,
     OutliersAnswer,
     OutliersRequest,
-    RefreshAnswer,
+    Pair,
+    Relation,
+    RelationName,
     RelationsAnswer,
     RelationsRequest,
     SceneRequest,
-    VersionDetails,
-    VocabularyAnswer,
+    Sensitivity,
+    Stamp,
+    UnknownLabels,
+    Viewpoint,
 )
+from scene_client.validation import field_errors
+
+FIRST_PAUSE: Final = 0.05
+LONGEST_PAUSE: Final = 2.0
+"""Seconds between attempts where the service names none; they double from the first on."""
+
+# ------------------------------------------------------------------------- arguments of a question
+
+Body: TypeAlias = Mapping[str, Any]
+"""Any part of a request, as in the HTTP contract."""
+
+Objects: TypeAlias = Iterable[str | Detection | Body]
+"""Labels, detections, or detections as in the HTTP contract."""
+
+
+class SceneFields(TypedDict, total=False):
+    """The fields of `SceneRequest`; relations and pairs may be plain tuples of names."""
+
+    relations: Iterable[Relation | Body | tuple[str, RelationName, str]]
+    relations_complete: bool
+    room_type: str
+    frame_id: str
+    stamp: Stamp | Body
+    viewpoint: Viewpoint | Body
+    model: str
+    seed: int
+    unknown_labels: UnknownLabels
+
+
+class RelationsFields(SceneFields, total=False):
+    """The fields of `RelationsRequest`."""
+
+    top_k: int
+    min_probability: float
+    pairs: Iterable[Pair | Body | tuple[str, str]]
+    include_opposites: bool
+
+
+class MissingFields(SceneFields, total=False):
+    """The fields of `MissingRequest`; ``at`` may be ``("on-top", "desk")``."""
+
+    coverage: float
+    top_k: int
+    candidates: Iterable[str]
+    at: Anchor | Body | tuple[RelationName, str]
+
+
+class OutliersFields(SceneFields, total=False):
+    """The fields of `OutliersRequest`."""
+
+    sensitivity: Sensitivity
+    threshold: float
+
+
+class GenerateFields(SceneFields, total=False):
+    """The fields of `GenerateRequest`."""
+
+    count: int
+    steps: int
+    temperature: float
+    context: Mapping[str, Sequence[int]]
+
+
+class AliasFields(TypedDict, total=False):
+    """The fields of `AliasRequest` beside the model."""
+
+    expected: str | None
+
+
+# ------------------------------------------------------------------------------------ one call
 
 T = TypeVar("T", bound=BaseModel)
 AnswerT = TypeVar("AnswerT", bound=Answer)
 RequestT = TypeVar("RequestT", bound=SceneRequest)
+
+
+@dataclass(frozen=True, slots=True)
+class Call(Generic[T]):
+    """One call of the HTTP contract.
+
+    Attributes:
+        method, path: with the path as it is sent.
+        answer: class of the answer.
+        body: JSON, if anything is sent.
+        administers: it needs the admin key.
+        repeatable: a second call changes nothing more than the first.
+    """
+
+    method: str
+    path: str
+    answer: type[T]
+    body: str | None = None
+    administers: bool = False
+    repeatable: bool = True
+
+    def read(self, status: int, headers: Mapping[str, str], body: bytes) -> T:
+        """The answer in a response.
+
+        Raises:
+            ProblemError, DeadlineError, AnswerError: the response holds none.
+        """
+        if status != HTTPStatus.OK:
+            problem = problem_of(status, headers, body)
+            if status == HTTPStatus.GATEWAY_TIMEOUT:
+                raise DeadlineError(problem.detail or problem.title, problem.request_id)
+            raise problem
+        try:
+            # A newer service may say more than this client knows.
+            return self.answer.model_validate_json(body, extra="ignore")
+        except ValidationError as error:
+            raise AnswerError(
+                f"The answer of {self.path} is not {self.answer.__name__}: "
+                f"{error.error_count()} faults. Is this the service's address?"
+            ) from None
+
+    def retry_pause(self, error: ProblemError | UnreachableError, attempt: int) -> float | None:
+        """Seconds before a further attempt; None where it cannot help, or may do harm.
+
+        Args:
+            attempt: 0 for the first.
+        """
+        pause = min(LONGEST_PAUSE, FIRST_PAUSE * 2**attempt) * random()  # noqa: S311 # nosec B311
+        if isinstance(error, ProblemError):
+            # Never earlier than asked for, and not all clients at once.
+            return pause + (error.retry_after or 0.0) if error.status in (429, 503) else None
+        sent = not isinstance(error.__cause__, httpx.ConnectError)
+        return pause if self.repeatable or not sent else None
+
+
+def segment(name: str) -> str:
+    """A name as one segment of a path.
+
+    Raises:
+        InvalidRequestError: no name is spelt so.
+    """
+    # Dots alone would be taken for a way up the path.
+    if not name or set(name) <= {"."}:
+        raise InvalidRequestError([FieldError(pointer="#", message="this is no name")])
+    return quote(name, safe="")
+
+
+# --------------------------------------------------------------------------------- four questions
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,26 +210,6 @@ OUTLIERS: Final = Question(
 GENERATE: Final = Question(
     "/generate", GenerateRequest, GenerateAnswer, BatchAnswer[GenerateAnswer]
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Call(Generic[T]):
-    """One call of the HTTP contract.
-
-    Attributes:
-        method, path: where to, with the path as it is sent.
-        answer: what is expected back.
-        body: JSON, if anything is sent.
-        administers: it needs the admin key.
-        repeatable: asking twice does no more than asking once.
-    """
-
-    method: str
-    path: str
-    answer: type[T]
-    body: str | None = None
-    administers: bool = False
-    repeatable: bool = True
 
 
 def ask(
@@ -122,42 +251,6 @@ def ask_each(
     return Call("POST", f"{question.path}/batch", question.batch, body)
 
 
-def models() -> Call[ModelList]:
-    """Models, versions and aliases."""
-    return Call("GET", "/models", ModelList)
-
-
-def model(name: str) -> Call[ModelSummary]:
-    """One model."""
-    return Call("GET", f"/models/{_segment(name)}", ModelSummary)
-
-
-def version(name: str, version: str) -> Call[VersionDetails]:
-    """One version of a model."""
-    path = f"/models/{_segment(name)}/versions/{_segment(version)}"
-    return Call("GET", path, VersionDetails)
-
-
-def vocabulary(name: str) -> Call[VocabularyAnswer]:
-    """The words of a model."""
-    return Call("GET", f"/models/{_segment(name)}/vocabulary", VocabularyAnswer)
-
-
-def contexts(name: str) -> Call[ContextsAnswer]:
-    """The hidden units of a model."""
-    return Call("GET", f"/models/{_segment(name)}/contexts", ContextsAnswer)
-
-
-def health(kind: str) -> Call[Health]:
-    """``live`` or ``ready``."""
-    return Call("GET", f"/health/{kind}", Health)
-
-
-def refresh() -> Call[RefreshAnswer]:
-    """Take over what the store holds."""
-    return Call("POST", "/models/refresh", RefreshAnswer, administers=True)
-
-
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
     """Let an alias lead elsewhere.
 
@@ -166,20 +259,13 @@ def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
     """
     return Call(
         "PUT",
-        f"/models/aliases/{_segment(alias)}",
+        f"/models/aliases/{segment(alias)}",
         AliasAnswer,
         _json(_validated(AliasRequest, dict(fields))),
         administers=True,
-        # Who expects the alias where it was would be told that it is there no more.
+        # A repeated move would fail on its own `expected`.
         repeatable=False,
     )
-
-
-def _segment(name: str) -> str:
-    # Dots alone would be taken for a way up the path.
-    if not name or set(name) <= {"."}:
-        raise InvalidRequestError([FieldError(pointer="#", message="this is no name")])
-    return quote(name, safe="")
 
 
 def _json(request: BaseModel) -> str:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Final, NoReturn, get_args
+from typing import Annotated, Any, Final, NoReturn, TypeVar, get_args
 
 import typer
 from pydantic import BaseModel
@@ -65,6 +65,9 @@ class _Group(TyperGroup):
         return parsed
 
 
+T = TypeVar("T")
+AnswerT = TypeVar("AnswerT", bound=BaseModel)
+
 app = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
@@ -78,7 +81,7 @@ app = typer.Typer(
 
 @dataclass(frozen=True)
 class Asked:
-    """What was said before or beside the question."""
+    """The options that hold for every question."""
 
     url: str
     model: str | None
@@ -86,26 +89,34 @@ class Asked:
     timeout: float
     as_json: bool
 
-    def open(self) -> Client:
-        """A client of whatever shall answer."""
+    def ask(self, question: Callable[[Client], T]) -> T:
+        """The answer of the service, or of the store; an error ends the program."""
+        with _failing(), self._client() as client:
+            return question(client)
+
+    def _client(self) -> Client:
         if self.store is not None:
             return OfflineClient(self.store, timeout=self.timeout, model=self.model)
         # Keys are not options: other users of a machine can read the options of a process.
         key = os.environ.get("SCENE_API_KEY") or None
         return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
 
-    def show(self, answer: BaseModel, table: Callable[[Any], RenderableType]) -> None:
-        """Print an answer: as JSON, or as a table with colours where a person looks at it."""
+    def show(
+        self, question: Callable[[Client], AnswerT], table: Callable[[AnswerT], RenderableType]
+    ) -> AnswerT:
+        """Ask, and print the answer: as JSON, or as a table with colours on a terminal."""
+        answer = self.ask(question)
         if self.as_json:
             print(answer.model_dump_json(exclude_none=True))
-            return
+            return answer
         console = Console(markup=False, highlight=False, emoji=False)
         if not console.is_terminal:
-            # Whoever reads on has no margin: nothing is cut or wrapped.
+            # A program reads on: nothing is cut or wrapped.
             console.width = 10_000
         console.print(table(answer))
         for note in tables.notes(answer):
             print(note, file=sys.stderr)
+        return answer
 
 
 def _version(wanted: bool) -> None:
@@ -183,18 +194,14 @@ def relations(
     unknown_labels: UnknownChoice = None,
 ) -> None:
     """How do these objects stand to each other?"""
+    scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
+    request = scene | _named(
+        top_k=top_k,
+        min_probability=min_probability,
+        include_opposites=opposites or None,
+    )
     asked: Asked = context.obj
-    with _failing(), asked.open() as client:
-        request = _request(
-            things,
-            relation,
-            room,
-            _treatment(ignore_unknown, unknown_labels),
-            top_k=top_k,
-            min_probability=min_probability,
-            include_opposites=opposites or None,
-        )
-        asked.show(client.relations(request), tables.relations)
+    asked.show(lambda client: client.relations(request), tables.relations)
 
 
 @app.command()
@@ -215,19 +222,15 @@ def missing(
     unknown_labels: UnknownChoice = None,
 ) -> None:
     """What else should be here, and where?"""
+    scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
+    request = scene | _named(
+        top_k=top_k,
+        coverage=coverage,
+        at=None if at is None else _anchor(at),
+        candidates=candidate or None,
+    )
     asked: Asked = context.obj
-    with _failing(), asked.open() as client:
-        request = _request(
-            things,
-            relation,
-            room,
-            _treatment(ignore_unknown, unknown_labels),
-            top_k=top_k,
-            coverage=coverage,
-            at=None if at is None else _anchor(at),
-            candidates=candidate or None,
-        )
-        asked.show(client.missing(request), tables.missing)
+    asked.show(lambda client: client.missing(request), tables.missing)
 
 
 @app.command()
@@ -246,17 +249,13 @@ def outliers(
     unknown_labels: UnknownChoice = None,
 ) -> None:
     """What does not belong here, or stands in the wrong place?"""
+    scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
+    request = scene | _named(
+        sensitivity=sensitivity,
+        threshold=threshold,
+    )
     asked: Asked = context.obj
-    with _failing(), asked.open() as client:
-        request = _request(
-            things,
-            relation,
-            room,
-            _treatment(ignore_unknown, unknown_labels),
-            sensitivity=sensitivity,
-            threshold=threshold,
-        )
-        asked.show(client.outliers(request), tables.outliers)
+    asked.show(lambda client: client.outliers(request), tables.outliers)
 
 
 @app.command()
@@ -279,22 +278,10 @@ def generate(
     """What would a scene like this look like?"""
     asked: Asked = context.obj
     if plot is not None and find_spec("matplotlib") is None:
-        needed = "--plot needs matplotlib: pip install matplotlib"
-        _fail(needed, MEANINGLESS)
-    with _failing(), asked.open() as client:
-        request = _request(
-            things,
-            relation,
-            room,
-            _treatment(ignore_unknown, unknown_labels),
-            from_nothing=True,
-            count=count,
-            seed=seed,
-            steps=steps,
-            temperature=temperature,
-        )
-        answer = client.generate(request)
-    asked.show(answer, tables.generate)
+        _fail("--plot needs matplotlib: pip install matplotlib", MEANINGLESS)
+    scene = _scene(things or [], relation, room, ignore_unknown, unknown_labels)
+    request = scene | _named(count=count, seed=seed, steps=steps, temperature=temperature)
+    answer = asked.show(lambda client: client.generate(request), tables.generate)
     if plot is not None:
         from scene_client.plot import draw
 
@@ -311,64 +298,59 @@ def generate(
 def models(context: typer.Context) -> None:
     """Which models there are."""
     asked: Asked = context.obj
-    with _failing(), asked.open() as client:
-        asked.show(client.models(), tables.models)
+    asked.show(Client.models, tables.models)
 
 
 @app.command()
 def vocabulary(context: typer.Context) -> None:
     """The words of the model."""
     asked: Asked = context.obj
-    with _failing(), asked.open() as client:
-        asked.show(client.vocabulary(), tables.vocabulary)
+    asked.show(Client.vocabulary, tables.vocabulary)
 
 
 @app.command()
 def contexts(context: typer.Context) -> None:
     """What the hidden units of the model stand for."""
     asked: Asked = context.obj
-    with _failing(), asked.open() as client:
-        asked.show(client.contexts(), tables.contexts)
+    asked.show(Client.contexts, tables.contexts)
 
 
 @app.command()
 def ready(context: typer.Context) -> None:
     """Whether the service answers; says nothing but by its exit status."""
     asked: Asked = context.obj
-    with _failing(), asked.open() as client:
-        client.check_ready()
+    asked.ask(Client.check_ready)
 
 
 # ------------------------------------------------------------------------------------ reading
 
 
-def _request(
+def _scene(
     things: list[str] | None,
     stated: list[str] | None,
     room: str | None,
+    ignore_unknown: bool,
     unknown_labels: UnknownLabels | None,
-    *,
-    from_nothing: bool = False,
-    **options: Any,
 ) -> dict[str, Any]:
-    """The body of a request; options override the fields of a file."""
-    files = [thing for thing in things or () if _is_file(thing)]
-    if files and things != files[:1]:
-        _fail(f"{files[0]} must stand alone: it is a whole scene", MEANINGLESS)
-    if not things and not from_nothing:
-        _fail("name what is there: labels, a file that ends in .json, or - to read it", MEANINGLESS)
-    request = _read(files[0]) if files else {"objects": things or []}
-    options["relations"] = [_relation(text) for text in stated] if stated else None
-    options["room_type"] = room
-    options["unknown_labels"] = unknown_labels
-    return request | {name: value for name, value in options.items() if value is not None}
-
-
-def _treatment(ignore_unknown: bool, unknown_labels: UnknownLabels | None) -> UnknownLabels | None:
-    """Of unknown labels: `--ignore-unknown` is short for `--unknown-labels ignore`."""
+    """The fields of a scene; options override the fields of a file."""
     if ignore_unknown and unknown_labels not in (None, "ignore"):
         _fail("--ignore-unknown and --unknown-labels disagree", MEANINGLESS)
-    return "ignore" if ignore_unknown else unknown_labels
+    if things is None:
+        _fail("name what is there: labels, a file that ends in .json, or - to read it", MEANINGLESS)
+    files = [thing for thing in things if _is_file(thing)]
+    if files and things != files[:1]:
+        _fail(f"{files[0]} must stand alone: it is a whole scene", MEANINGLESS)
+    scene = _read(files[0]) if files else {"objects": things}
+    return scene | _named(
+        relations=[_relation(text) for text in stated] if stated else None,
+        room_type=room,
+        unknown_labels="ignore" if ignore_unknown else unknown_labels,
+    )
+
+
+def _named(**options: Any) -> dict[str, Any]:
+    """The options that the command line names."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _is_file(thing: str) -> bool:

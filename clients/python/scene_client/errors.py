@@ -1,11 +1,17 @@
-"""What can go wrong with a call, each kind once."""
+"""The errors of a call, and the error of a response."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from http import HTTPStatus
 from typing import Any
 
-from scene_client.schemas import Failure, FieldError
+from pydantic import ValidationError
+
+from scene_client.schemas import Failure, FieldError, Problem
 
 
 class ClientError(Exception):
@@ -85,6 +91,54 @@ class DeadlineError(ClientError):
 
 class AnswerError(ClientError):
     """The service succeeded, and its answer is none that this client can read."""
+
+
+def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemError:
+    """The problem of a response other than 200.
+
+    Args:
+        headers: by their names in lower case.
+    """
+    retry_after = _seconds(headers.get("retry-after"))
+    with suppress(ValidationError):
+        problem = Problem.model_validate_json(body, extra="ignore")
+        return ProblemError(
+            problem.type,
+            status,
+            problem.title,
+            problem.detail,
+            errors=problem.errors or (),
+            failures=problem.failures or (),
+            request_id=problem.request_id,
+            retry_after=retry_after,
+        )
+    # Of a proxy or another server: the wording of such an answer may change at any time.
+    try:
+        title = HTTPStatus(status).phrase
+    except ValueError:
+        title = "Unknown status"
+    return ProblemError(
+        "about:blank",
+        status,
+        title,
+        "The answer is no problem document of the service.",
+        request_id=headers.get("x-request-id", ""),
+        retry_after=retry_after,
+    )
+
+
+def _seconds(retry_after: str | None) -> float | None:
+    """Retry-After (RFC 9110, section 10.2.3) in seconds from now."""
+    if retry_after is None:
+        return None
+    if retry_after.isascii() and retry_after.isdigit():
+        return float(retry_after)
+    with suppress(ValueError):
+        moment = parsedate_to_datetime(retry_after)
+        if moment.tzinfo is None:
+            moment = moment.replace(tzinfo=UTC)
+        return max(0.0, (moment - datetime.now(UTC)).total_seconds())
+    return None
 
 
 def _restored(kind: type[ClientError], args: tuple[Any, ...], state: dict[str, Any]) -> ClientError:

@@ -12,6 +12,7 @@ Plain Python: a client has no arrays.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, Literal, TypeAlias
 
 Box: TypeAlias = tuple[float, float, float, float]
@@ -37,6 +38,35 @@ def relation_between(box: Box, other: Box) -> Literal["left", "right", "above", 
     if abs(across) >= abs(down):
         return "left" if across < 0 else "right" if across > 0 else None
     return "above" if down < 0 else "below"
+
+
+def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[int, int]]:
+    """Pairs of neighbours, the left one first, those of boxes that come early in ``order`` first.
+
+    Args:
+        boxes: None for things without a box.
+        order: places in ``boxes``.
+    """
+    found = []
+    for rank, i in enumerate(order):
+        for j in order[:rank]:
+            first, second = boxes[i], boxes[j]
+            if first is None or second is None or not are_neighbours(first, second):
+                continue
+            relation = relation_between(first, second)
+            if relation == "left":
+                found.append((i, j))
+            elif relation == "right":
+                found.append((j, i))
+    return found
+
+
+def upright_box(centre: tuple[float, float], size: tuple[float, float], theta: float) -> Box:
+    """The upright box around a box that is turned by ``theta`` radians."""
+    cos, sin = abs(math.cos(theta)), abs(math.sin(theta))
+    across = (cos * size[0] + sin * size[1]) / 2
+    down = (sin * size[0] + cos * size[1]) / 2
+    return centre[0] - across, centre[1] - down, centre[0] + across, centre[1] + down
 
 
 def _unit(box: Box, other: Box) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scene_client.exchange import RETRIES
 from scene_client.sync import Client
 
 
@@ -42,6 +41,5 @@ class OfflineClient(Client):
             timeout=timeout,
             admin_key=transport.admin_key,
             model=model,
-            retries=RETRIES,
             transport=transport,
         )

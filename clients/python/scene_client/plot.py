@@ -1,7 +1,14 @@
-"""Pictures of generated scenes. Needs matplotlib, which comes with the group `training`."""
+"""Pictures of generated scenes, in which relations can be seen and no two objects overlap.
+
+Seen from the robot: left is left, near is below, and what lies on something is drawn above it. Of
+relations that cannot all be drawn the first ones are. Needs matplotlib, which comes with the group
+`training`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from math import ceil, sqrt
 from pathlib import Path
 from typing import Final
@@ -10,8 +17,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-from scene_client.layout import GAP, Box, arrange, extent
-from scene_client.schemas import GenerateAnswer, GeneratedScene
+from scene_client.schemas import GenerateAnswer, GeneratedScene, Relation
+
+HEIGHT: Final = 1.0
+GAP: Final = 0.6
+"""Between objects side by side, and between a hovering object and the one below it."""
 
 # Told apart by more than their colour: each has its own dashes. On-top is drawn as lying on top.
 _STYLES: Final = {
@@ -102,3 +112,156 @@ def _join(axes: Axes, subject: Box, object: Box, relation: str) -> None:
         alpha=0.5,
         zorder=1,
     )
+
+
+# ------------------------------------------------------------------------------------ layout
+
+# Each opposite as the relation that is drawn, whose subject and object change places.
+_OPPOSITES: Final = {"right": "left", "behind": "front", "under": "on-top", "below": "above"}
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Where one object is drawn: its lower left corner and its extents."""
+
+    label: str
+    x: float
+    y: float
+    width: float
+    height: float
+
+
+def extent(boxes: Sequence[Box]) -> tuple[float, float]:
+    """How far boxes reach to the right and up."""
+    right = max((box.x + box.width for box in boxes), default=0.0)
+    return right, max((box.y + box.height for box in boxes), default=0.0)
+
+
+class _Order:
+    """The order of the objects along one axis, without cycles."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._before: dict[str, set[str]] = {name: set() for name in names}
+
+    def add(self, first: str, second: str) -> None:
+        """``first`` comes before ``second``, unless that closes a cycle."""
+        if second == first or second in self._before[first]:
+            return
+        earlier = {first} | self._before[first]
+        for name, before in self._before.items():
+            if name == second or second in before:
+                before |= earlier
+
+    def ranks(self) -> dict[str, int]:
+        """How many must come before each, one after the other."""
+        ranks: dict[str, int] = {}
+        for name in sorted(self._before, key=lambda name: len(self._before[name])):
+            ranks[name] = max((ranks[other] + 1 for other in self._before[name]), default=0)
+        return ranks
+
+
+def arrange(objects: Sequence[str], relations: Iterable[Relation]) -> list[Box]:
+    """A box for each object, in no particular order; the lower left corner of all is (0, 0).
+
+    Args:
+        objects: names, each once.
+        relations: between them.
+    """
+    stated = [_drawn(relation) for relation in relations]
+    stated = [(a, name, b) for a, name, b in stated if a != b and a in objects and b in objects]
+    below = _supporters(stated)
+    roots = [name for name in objects if name not in below]
+    root = {name: _root(name, below) for name in objects}
+    piles = {name: _pile(name, below) for name in roots}
+
+    columns, rows = _Order(roots), _Order(roots)
+    for subject, relation, object in stated:
+        order = {"left": columns, "front": rows}.get(relation)
+        if order is not None and root[subject] != root[object]:
+            order.add(root[subject], root[object])
+    column, row = columns.ranks(), rows.ranks()
+
+    cells: dict[tuple[int, int], list[list[Box]]] = {}
+    for name in roots:
+        cells.setdefault((column[name], row[name]), []).append(piles[name])
+    shelved = {place: _shelved(members) for place, members in cells.items()}
+    lefts = _offsets({place[0]: extent(boxes)[0] for place, boxes in _widest(shelved, 0)})
+    floors = _offsets({place[1]: extent(boxes)[1] for place, boxes in _widest(shelved, 1)})
+    return [
+        box
+        for (at_column, at_row), boxes in shelved.items()
+        for box in _moved(boxes, lefts[at_column], floors[at_row])
+    ]
+
+
+def _drawn(relation: Relation) -> tuple[str, str, str]:
+    opposite = _OPPOSITES.get(relation.relation)
+    if opposite is not None:
+        return relation.object, opposite, relation.subject
+    return relation.subject, relation.relation, relation.object
+
+
+def _supporters(stated: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
+    """The object that each object stands on or hovers above; none stands on itself."""
+    below: dict[str, tuple[str, str]] = {}
+    for wanted in ("on-top", "above"):
+        for subject, relation, object in stated:
+            if relation == wanted and subject not in below and _root(object, below) != subject:
+                below[subject] = (object, relation)
+    return below
+
+
+def _root(name: str, below: dict[str, tuple[str, str]]) -> str:
+    while name in below:
+        name = below[name][0]
+    return name
+
+
+def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
+    """An object from (0, 0) on, and above it, side by side, everything that is on it."""
+    boxes: list[Box] = []
+    x = 0.0
+    for other, (supporter, relation) in below.items():
+        if supporter == name:
+            pile = _pile(other, below)
+            boxes += _moved(pile, x, HEIGHT + (GAP if relation == "above" else 0.0))
+            x += extent(pile)[0] + GAP
+    width = max(0.2 * len(name) + 0.6, x - GAP)
+    return [Box(name, 0.0, 0.0, width, HEIGHT), *boxes]
+
+
+def _shelved(piles: Sequence[list[Box]]) -> list[Box]:
+    """Piles that nothing sets apart, on shelves of about as many as there are shelves."""
+    boxes: list[Box] = []
+    length = ceil(sqrt(len(piles)))
+    y = 0.0
+    for start in range(0, len(piles), length):
+        x = 0.0
+        shelf: list[Box] = []
+        for pile in piles[start : start + length]:
+            shelf += _moved(pile, x, y)
+            x += extent(pile)[0] + GAP
+        boxes += shelf
+        y = extent(shelf)[1] + GAP
+    return boxes
+
+
+def _widest(
+    cells: dict[tuple[int, int], list[Box]], axis: int
+) -> list[tuple[tuple[int, int], list[Box]]]:
+    """The cells from narrow to wide (or low to high), so that the last of a column decides."""
+    return sorted(cells.items(), key=lambda cell: extent(cell[1])[axis])
+
+
+def _moved(boxes: Iterable[Box], x: float, y: float) -> list[Box]:
+    return [Box(box.label, box.x + x, box.y + y, box.width, box.height) for box in boxes]
+
+
+def _offsets(extents: dict[int, float]) -> dict[int, float]:
+    """Where each column (or row) begins."""
+    offsets: dict[int, float] = {}
+    at = 0.0
+    for rank in sorted(extents):
+        offsets[rank] = at
+        at += extents[rank] + 2 * GAP
+    return offsets

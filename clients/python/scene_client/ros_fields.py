@@ -3,6 +3,10 @@
 rclpy and the readers of bags give objects with attributes, rosbridge gives dictionaries in which
 NaN and infinity are null. A field that is not there, or not of its kind, is None here: what
 follows from that is the reader's decision.
+
+Detectors report classes as text, and many of them as numbers in text ("56"). A label map says what
+a number means: a mapping, a list in the order of the numbers, a vision_msgs/LabelInfo message, or
+the name of a well-known list.
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from numbers import Real
-from typing import Any
+from typing import Any, Final, TypeAlias
 
 
 class MessageError(ValueError):
@@ -83,3 +87,84 @@ def text(field: Any) -> str:
 def is_plain(value: str, longest: int) -> bool:
     """Whether the service takes a text as a name or a label."""
     return 0 < len(value) <= longest and value.isprintable()
+
+
+def frame_of(header: Any) -> str:
+    """The frame of a header; empty where it names none."""
+    frame = take(header, "frame_id")
+    # tf2 knows no leading slash; older drivers still send one.
+    return frame.strip().lstrip("/") if isinstance(frame, str) else ""
+
+
+def time_of(stamp: Any) -> dict[str, int] | None:
+    """A time of ROS 2, or of ROS 1, as the service takes it; None where it is no valid time."""
+    seconds = integer(take(stamp, "sec"))
+    seconds = integer(take(stamp, "secs")) if seconds is None else seconds
+    rest = integer(take(stamp, "nanosec"))
+    rest = integer(take(stamp, "nsecs")) if rest is None else rest
+    if seconds is None or rest is None:
+        return None
+    if not (-(2**31) <= seconds < 2**31 and 0 <= rest < 1_000_000_000):
+        return None
+    return {"sec": seconds, "nanosec": rest}
+
+
+# -------------------------------------------------------------------------------- class ids
+
+LabelMap: TypeAlias = Mapping[Any, str | None] | Sequence[str] | str | object
+
+COCO: Final = (
+    *("person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat"),
+    *("traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat"),
+    *("dog", "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack"),
+    *("umbrella", "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball"),
+    *("kite", "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket"),
+    *("bottle", "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple"),
+    *("sandwich", "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair"),
+    *("couch", "potted plant", "bed", "dining table", "toilet", "tv", "laptop", "mouse"),
+    *("remote", "keyboard", "cell phone", "microwave", "oven", "toaster", "sink"),
+    *("refrigerator", "book", "clock", "vase", "scissors", "teddy bear", "hair drier"),
+    "toothbrush",
+)
+"""The 80 classes of COCO's boxes as most detectors number them: without gaps, from 0."""
+
+_WELL_KNOWN: Final = {"coco": COCO}
+
+
+def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
+    """Class id, as text, to label; a class that is mapped to None is left out of scenes.
+
+    Args:
+        label_map: a mapping from class ids (text or numbers); labels in the order of the numbers;
+            a vision_msgs/LabelInfo, as a message or as JSON; "coco"; or None, an empty map.
+
+    Raises:
+        MessageError: none of these.
+    """
+    if label_map is None:
+        return {}
+    if isinstance(label_map, str):
+        if label_map not in _WELL_KNOWN:
+            known = ", ".join(sorted(_WELL_KNOWN))
+            raise MessageError(f"no label map is called {label_map!r}; known: {known}")
+        label_map = _WELL_KNOWN[label_map]
+    elif (classes := take(label_map, "class_map")) is not None:
+        label_map = {
+            take(entry, "class_id"): take(entry, "class_name")
+            for entry in items(classes, "class_map")
+            if isinstance(take(entry, "class_id"), int | str)
+        }
+    if isinstance(label_map, Mapping):
+        pairs = list(label_map.items())
+    elif isinstance(label_map, Sequence):
+        pairs = list(enumerate(label_map))
+    else:
+        raise MessageError(
+            "label_map must be a mapping, a list of labels, a vision_msgs/LabelInfo or a name"
+        )
+    labels: dict[str, str | None] = {}
+    for class_id, label in pairs:
+        if not (label is None or isinstance(label, str)):
+            raise MessageError("every entry of label_map must be a label or None")
+        labels[str(class_id).strip()] = label
+    return labels

@@ -15,8 +15,7 @@ from pydantic import BaseModel
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
-from scene_client.errors import ClientError, ProblemError, UnreachableError
-from scene_client.exchange import Received, problem_of
+from scene_client.errors import ClientError, ProblemError, UnreachableError, problem_of
 from scene_client.schemas import Detection, Problem
 from scene_client.stream_messages import (
     EVENTS,
@@ -308,8 +307,7 @@ class StreamClient:
         except InvalidStatus as refused:
             answer = refused.response
             headers = {name.lower(): value for name, value in answer.headers.raw_items()}
-            body = bytes(answer.body or b"")
-            raise problem_of(Received(answer.status_code, headers, body)) from None
+            raise problem_of(answer.status_code, headers, bytes(answer.body or b"")) from None
         except (OSError, InvalidHandshake) as error:
             raise UnreachableError(f"no stream at {self._address}: {error}") from error
 

@@ -4,43 +4,41 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from time import monotonic
 from types import TracebackType
-from typing import Self, Unpack, overload
+from typing import Final, Self, Unpack, overload
 
 import httpx
 
-from scene_client import calls
-from scene_client.calls import Call, T
-from scene_client.deadline import DeadlineTransport
-from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
-from scene_client.exchange import (
-    MAX_ANSWER,
-    RETRIES,
-    Late,
-    Outcome,
-    Pause,
-    Received,
-    Send,
-    exchange,
-)
-from scene_client.fields import (
+from scene_client.calls import (
+    GENERATE,
+    MISSING,
+    OUTLIERS,
+    RELATIONS,
     AliasFields,
     Body,
+    Call,
     GenerateFields,
     MissingFields,
     Objects,
     OutliersFields,
     RelationsFields,
+    T,
+    ask,
+    ask_each,
+    promote,
+    segment,
 )
-from scene_client.options import Options
+from scene_client.connection import RETRIES, DeadlineTransport, Options, deadline
+from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
 from scene_client.schemas import (
     AliasAnswer,
     BatchAnswer,
     ContextsAnswer,
     GenerateAnswer,
     GenerateRequest,
+    Health,
     MissingAnswer,
     MissingRequest,
     ModelList,
@@ -53,6 +51,9 @@ from scene_client.schemas import (
     VersionDetails,
     VocabularyAnswer,
 )
+
+MAX_ANSWER: Final = 256 * 2**20
+"""Bytes; a batch of 256 scenes with 4,096 relations each stays below."""
 
 
 class Client:
@@ -108,8 +109,7 @@ class Client:
         **fields: Unpack[RelationsFields],
     ) -> RelationsAnswer:
         """How do these objects stand to each other?"""
-        model = self.options.model
-        return self._call(calls.ask(calls.RELATIONS, objects, fields, model), timeout)
+        return self._call(ask(RELATIONS, objects, fields, self.options.model), timeout)
 
     def missing(
         self,
@@ -119,8 +119,7 @@ class Client:
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
         """What else should be here, and where?"""
-        model = self.options.model
-        return self._call(calls.ask(calls.MISSING, objects, fields, model), timeout)
+        return self._call(ask(MISSING, objects, fields, self.options.model), timeout)
 
     def outliers(
         self,
@@ -130,8 +129,7 @@ class Client:
         **fields: Unpack[OutliersFields],
     ) -> OutliersAnswer:
         """What does not belong here, or stands in the wrong place?"""
-        model = self.options.model
-        return self._call(calls.ask(calls.OUTLIERS, objects, fields, model), timeout)
+        return self._call(ask(OUTLIERS, objects, fields, self.options.model), timeout)
 
     def generate(
         self,
@@ -141,8 +139,7 @@ class Client:
         **fields: Unpack[GenerateFields],
     ) -> GenerateAnswer:
         """What would a scene like this look like?"""
-        model = self.options.model
-        return self._call(calls.ask(calls.GENERATE, objects, fields, model), timeout)
+        return self._call(ask(GENERATE, objects, fields, self.options.model), timeout)
 
     # -------------------------------------------------------------------------------- batches
 
@@ -153,7 +150,7 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
         """As `relations`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return self._call(calls.ask_each(calls.RELATIONS, scenes, self.options.model), timeout)
+        return self._call(ask_each(RELATIONS, scenes, self.options.model), timeout)
 
     def missing_batch(
         self,
@@ -162,7 +159,7 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
         """As `missing`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return self._call(calls.ask_each(calls.MISSING, scenes, self.options.model), timeout)
+        return self._call(ask_each(MISSING, scenes, self.options.model), timeout)
 
     def outliers_batch(
         self,
@@ -171,13 +168,13 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
         """As `outliers`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return self._call(calls.ask_each(calls.OUTLIERS, scenes, self.options.model), timeout)
+        return self._call(ask_each(OUTLIERS, scenes, self.options.model), timeout)
 
     # --------------------------------------------------------------------------------- models
 
     def models(self, *, timeout: float | None = None) -> ModelList:
         """Models, versions and aliases."""
-        return self._call(calls.models(), timeout)
+        return self._call(Call("GET", "/models", ModelList), timeout)
 
     @overload
     def model(self, name: str, *, timeout: float | None = None) -> ModelSummary: ...
@@ -189,23 +186,28 @@ class Client:
         self, name: str, version: str | None = None, *, timeout: float | None = None
     ) -> ModelSummary | VersionDetails:
         """The versions of a model, or all there is to know about one of them."""
+        path = f"/models/{segment(name)}"
         if version is None:
-            return self._call(calls.model(name), timeout)
-        return self._call(calls.version(name, version), timeout)
+            return self._call(Call("GET", path, ModelSummary), timeout)
+        path += f"/versions/{segment(version)}"
+        return self._call(Call("GET", path, VersionDetails), timeout)
 
     def vocabulary(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> VocabularyAnswer:
         """The words of a model."""
-        return self._call(calls.vocabulary(self.options.named(name)), timeout)
+        path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
+        return self._call(Call("GET", path, VocabularyAnswer), timeout)
 
     def contexts(self, name: str | None = None, *, timeout: float | None = None) -> ContextsAnswer:
         """The hidden units of a model by their strongest objects."""
-        return self._call(calls.contexts(self.options.named(name)), timeout)
+        path = f"/models/{segment(name or self.options.model or 'default')}/contexts"
+        return self._call(Call("GET", path, ContextsAnswer), timeout)
 
     def refresh(self, *, timeout: float | None = None) -> RefreshAnswer:
         """Let the service take over what its store holds now; needs the admin key."""
-        return self._call(calls.refresh(), timeout)
+        call = Call("POST", "/models/refresh", RefreshAnswer, administers=True)
+        return self._call(call, timeout)
 
     def promote(
         self,
@@ -224,7 +226,7 @@ class Client:
             model: ``name@version``, or ``name`` for its newest.
             **fields: ``expected``: where it must lead now; None: it must not exist yet.
         """
-        return self._call(calls.promote(alias, {"model": model, **fields}), timeout)
+        return self._call(promote(alias, {"model": model, **fields}), timeout)
 
     # --------------------------------------------------------------------------------- health
 
@@ -242,11 +244,11 @@ class Client:
         Raises:
             UnreachableError, DeadlineError, ProblemError: it does not, and so.
         """
-        self._call(calls.health("ready"), timeout, retries=0)
+        self._call(Call("GET", "/health/ready", Health), timeout, retries=0)
 
     def _is(self, health: str, timeout: float | None) -> bool:
         try:
-            self._call(calls.health(health), timeout, retries=0)
+            self._call(Call("GET", f"/health/{health}", Health), timeout, retries=0)
         except (UnreachableError, DeadlineError):
             return False
         except ProblemError as problem:
@@ -255,47 +257,52 @@ class Client:
             return False
         return True
 
-    # ------------------------------------------------------------------------------- exchange
+    # ----------------------------------------------------------------------------------- a call
 
     def _call(self, call: Call[T], timeout: float | None, retries: int | None = None) -> T:
+        """The answer of a call, after as many attempts as its time allows."""
         retries = self.options.retries if retries is None else retries
-        steps = exchange(call, self.options.limit(timeout), monotonic, retries=retries)
-        outcome: Outcome = None
-        while True:
+        limit = self.options.limit(timeout)
+        ends = monotonic() + limit
+        attempt = 0
+        while (left := ends - monotonic()) > 0:
             try:
-                to_do = steps.send(outcome)
-            except StopIteration as done:
-                answer: T = done.value
-                return answer
-            match to_do:
-                case Send(headers, left):
-                    outcome = self._send(call, headers, left)
-                case Pause(seconds):
-                    time.sleep(seconds)
-                    outcome = None
+                answer = self._attempt(call, left)
+            except (TimeoutError, httpx.TimeoutException):
+                break
+            except (ProblemError, UnreachableError) as error:
+                pause = call.retry_pause(error, attempt)
+                if pause is None or attempt == retries or pause >= ends - monotonic():
+                    raise
+                attempt += 1
+                time.sleep(pause)
+            else:
+                # Reading takes time, too. The caller does not wait for a later answer.
+                if monotonic() < ends:
+                    return answer
+        raise DeadlineError(f"No answer within {limit:g} s.")
 
-    def _send(self, call: Call[T], headers: Mapping[str, str], left: float) -> Outcome:
-        options = self.options
-        body = bytearray()
-        try:
-            with self._http.stream(
-                call.method,
-                options.address(call),
-                content=call.body,
-                headers={**options.headers(call), **headers},
-                timeout=left,
-            ) as response:
-                for part in response.iter_bytes():
-                    body += part
-                    if len(body) > MAX_ANSWER:
-                        raise AnswerError("The answer is too long.")
-        except httpx.TimeoutException:
-            return Late()
-        except (httpx.ConnectError, httpx.UnsupportedProtocol) as error:
-            return options.lost(error, sent=False)
-        except httpx.TransportError as error:
-            return options.lost(error, sent=True)
-        return Received(response.status_code, response.headers, bytes(body))
+    def _attempt(self, call: Call[T], left: float) -> T:
+        """The answer of a call that is sent once, and may take so many seconds."""
+        options, body = self.options, bytearray()
+        with deadline(left):
+            try:
+                with self._http.stream(
+                    call.method,
+                    options.address(call),
+                    content=call.body,
+                    headers=options.headers(call, left),
+                    timeout=left,
+                ) as response:
+                    for part in response.iter_bytes():
+                        body += part
+                        if len(body) > MAX_ANSWER:
+                            raise AnswerError("The answer is too long.")
+            except httpx.TimeoutException:
+                raise
+            except httpx.TransportError as error:
+                raise options.unreachable(error) from error
+        return call.read(response.status_code, response.headers, bytes(body))
 
     # ------------------------------------------------------------------------------- lifetime
 

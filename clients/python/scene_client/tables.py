@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Final
+from typing import Final
 
+from pydantic import BaseModel
 from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 
 from scene_client.schemas import (
+    Answer,
     Because,
     ContextsAnswer,
     GenerateAnswer,
@@ -34,12 +36,11 @@ def relations(answer: RelationsAnswer) -> RenderableType:
             entry.relation,
             entry.object,
             _share(entry.probability),
-            "observed" if getattr(entry, "observed", False) else "",
+            "observed" if entry.observed else "",
         )
         for entry in answer.relations
     ]
     stated = _table("subject", "relation", "object", "probability", "", rows=rows)
-    # A service of an earlier version says nothing of them.
     doubted = [
         (
             entry.subject,
@@ -48,7 +49,7 @@ def relations(answer: RelationsAnswer) -> RenderableType:
             _share(entry.observed_probability),
             f"{entry.expected} {_share(entry.probability)}",
         )
-        for entry in getattr(answer, "disagreements", None) or ()
+        for entry in answer.disagreements
     ]
     if not doubted:
         return stated
@@ -64,7 +65,7 @@ def missing(answer: MissingAnswer) -> RenderableType:
             _share(entry.probability),
             f"{entry.log_odds:+.2f}",
             "\n".join(map(_placement, entry.placements)),
-            _reasons(getattr(entry, "because", None) or ()),
+            _reasons(entry.because),
         )
         for entry in answer.missing
     ]
@@ -81,7 +82,7 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
             f"{entry.log_odds:+.2f}",
             "outlier" if entry.is_outlier else "",
             _reasons(entry.because),
-            ", ".join(getattr(entry, "usually_with", None) or ()),
+            ", ".join(entry.usually_with),
         )
         for entry in answer.outliers
     ]
@@ -95,7 +96,7 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
             entry.relation,
             entry.object,
             _share(entry.probability),
-            "misplaced" if getattr(entry, "is_misplaced", False) else "",
+            "misplaced" if entry.is_misplaced else "",
         )
         for entry in answer.misplaced[:MOST_MISPLACED]
     ]
@@ -106,15 +107,16 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
     return Group(found, _table(*columns, rows=wrong, title=title))
 
 
-def notes(answer: Any) -> list[str]:
+def notes(answer: BaseModel) -> list[str]:
     """What an answer says of its scene: labels that were mapped, and warnings."""
+    if not isinstance(answer, Answer):
+        return []
     mapped = [
         f"{entry.label}: taken for {entry.class_} (similarity {entry.similarity:.2f})"
-        for entry in getattr(answer, "mapped", None) or ()
+        for entry in answer.mapped
     ]
     warnings = [
-        f"{entry.code}: {', '.join(entry.objects)}: {entry.message}"
-        for entry in getattr(answer, "warnings", None) or ()
+        f"{entry.code}: {', '.join(entry.objects)}: {entry.message}" for entry in answer.warnings
     ]
     return mapped + warnings
 
@@ -192,7 +194,7 @@ def _share(probability: float) -> str:
 def _placement(placement: Placement) -> str:
     told = f"{placement.relation} {placement.object} {_share(placement.probability)}"
     # A model that was trained without positions cannot say how far.
-    offset: Any = getattr(placement, "offset", None)
+    offset = placement.offset
     if offset is None:
         return told
     axes = (

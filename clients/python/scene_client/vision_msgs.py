@@ -14,21 +14,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, get_args
 
-from scene_client.image_plane import Box, are_neighbours, relation_between
-from scene_client.label_maps import LabelMap, read_label_map
+from scene_client.image_plane import Box, left_pairs, upright_box
 from scene_client.ros_fields import (
+    LabelMap,
     MessageError,
+    frame_of,
     has,
-    integer,
     is_plain,
     items,
     number,
     numbers,
+    read_label_map,
     take,
     text,
+    time_of,
 )
+from scene_client.schemas import UnknownLabels
 
 MAX_OBJECTS: Final = 256
 MAX_RELATIONS: Final = 4096
@@ -89,7 +92,7 @@ def from_detection3d_array(
     min_score: float = 0.0,
     boxes: bool = True,
     viewpoint: Viewpoint | None = None,
-    unknown_labels: Literal["error", "ignore", "nearest"] = "ignore",
+    unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
     """Objects with poses; the service derives their relations in the axes of ``frame_id``.
 
@@ -123,7 +126,7 @@ def from_detection2d_array(
     label_map: LabelMap | None = None,
     *,
     min_score: float = 0.0,
-    unknown_labels: Literal["error", "ignore", "nearest"] = "ignore",
+    unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
     """Objects without poses, and which of two neighbours in the image is left of the other.
 
@@ -149,7 +152,7 @@ def from_message(
     min_score: float = 0.0,
     boxes: bool = True,
     viewpoint: Viewpoint | None = None,
-    unknown_labels: Literal["error", "ignore", "nearest"] = "ignore",
+    unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
     """The fields of either message, told apart by its boxes.
 
@@ -293,14 +296,14 @@ class _Reader:
     def _frame(self) -> str | None:
         """The frame of the message, or of its first detection that names one."""
         for header in (self.header, *(take(seen.detection, "header") for seen in self.sightings)):
-            if frame := _frame_id(header):
+            if frame := frame_of(header):
                 if not is_plain(frame, _MAX_FRAME):
                     raise MessageError("frame_id is no plain text")
                 return frame
         return None
 
     def _is_elsewhere(self, seen: _Sighting) -> bool:
-        return _frame_id(take(seen.detection, "header")) not in ("", self.frame)
+        return frame_of(take(seen.detection, "header")) not in ("", self.frame)
 
     def object(self, seen: _Sighting) -> dict[str, Any]:
         return {
@@ -342,17 +345,7 @@ class _Reader:
         boxes = [self._image_box(seen) for seen in self.sightings]
         # Where there are more than a request holds, those of the surest things.
         order = sorted(range(len(ids)), key=lambda i: -self.sightings[i].confidence)
-        found = []
-        for rank, i in enumerate(order):
-            for j in order[:rank]:
-                first, second = boxes[i], boxes[j]
-                if first is None or second is None or not are_neighbours(first, second):
-                    continue
-                relation = relation_between(first, second)
-                if relation == "left":
-                    found.append((i, j))
-                elif relation == "right":
-                    found.append((j, i))
+        found = left_pairs(boxes, order)
         if len(found) > MAX_RELATIONS:
             self.note(None, "too-many", f"{len(found) - MAX_RELATIONS} relations were left out")
         return [
@@ -376,27 +369,20 @@ class _Reader:
         if not (width > 0 and height > 0):
             self.note(seen.place, "no-box", "its box has no extent")
             return None
-        cos, sin = abs(math.cos(theta or 0.0)), abs(math.sin(theta or 0.0))
-        across, down = (cos * width + sin * height) / 2, (sin * width + cos * height) / 2
-        return middle[0] - across, middle[1] - down, middle[0] + across, middle[1] + down
+        return upright_box((middle[0], middle[1]), (width, height), theta or 0.0)
 
     def finish(self, fields: dict[str, Any], unknown_labels: str) -> SceneFields:
         """Add frame and time of the header."""
-        if unknown_labels not in ("error", "ignore", "nearest"):
+        if unknown_labels not in get_args(UnknownLabels):
             raise MessageError("unknown_labels must be 'error', 'ignore' or 'nearest'")
         fields["unknown_labels"] = unknown_labels
         if self.frame is not None:
             fields["frame_id"] = self.frame
         stamp = take(self.header, "stamp")
-        if stamp is not None:
-            seconds, rest = (
-                integer(take(stamp, name) if take(stamp, name) is not None else take(stamp, old))
-                for name, old in (("sec", "secs"), ("nanosec", "nsecs"))
-            )
-            if _is_time(seconds, rest):
-                fields["stamp"] = {"sec": seconds, "nanosec": rest}
-            else:
-                self.note(None, "no-stamp", "its stamp is no valid time")
+        if (time := time_of(stamp)) is not None:
+            fields["stamp"] = time
+        elif stamp is not None:
+            self.note(None, "no-stamp", "its stamp is no valid time")
         order = sorted(
             self.notes, key=lambda note: -1 if note.detection is None else note.detection
         )
@@ -418,12 +404,6 @@ def _is_flat(message: Any) -> bool:
     )
 
 
-def _frame_id(header: Any) -> str:
-    frame = take(header, "frame_id")
-    # tf2 knows no leading slash; older drivers still send one.
-    return frame.strip().lstrip("/") if isinstance(frame, str) else ""
-
-
 def _is_number(label: str) -> bool:
     return label.removeprefix("-").isdecimal()
 
@@ -432,12 +412,6 @@ def _is_unset(pose: Any) -> bool:
     """Whether a pose is missing or was never filled in."""
     position = take(pose, "position")
     return position is None or numbers(position, "xyz") == (0.0, 0.0, 0.0)
-
-
-def _is_time(seconds: int | None, rest: int | None) -> bool:
-    if seconds is None or rest is None:
-        return False
-    return -(2**31) <= seconds < 2**31 and 0 <= rest < 1_000_000_000
 
 
 def _viewpoint(viewpoint: Viewpoint) -> dict[str, float]:

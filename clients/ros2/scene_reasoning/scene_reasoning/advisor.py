@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from scene_client.label_maps import LabelMap, read_label_map
+from scene_client.ros_fields import LabelMap, read_label_map
 from scene_client.schemas import Answer
 from scene_client.vision_msgs import SceneFields, Viewpoint, from_message
 

@@ -1,4 +1,4 @@
-"""The core of the clients, on a clock that only the test moves."""
+"""Attempts, pauses and deadlines of a call, on a clock that only the test moves."""
 
 from __future__ import annotations
 
@@ -7,38 +7,34 @@ import pickle
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
+from types import SimpleNamespace
 from typing import Any
 
+import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from scene_client import (
     AnswerError,
+    Client,
     DeadlineError,
     InvalidRequestError,
     ProblemError,
     UnreachableError,
     calls,
+    sync,
 )
-from scene_client.calls import Call
-from scene_client.exchange import (
-    LONGEST_PAUSE,
-    RETRIES,
-    Late,
-    Lost,
-    Outcome,
-    Pause,
-    Received,
-    Send,
-    exchange,
-    problem_of,
-)
-from scene_client.schemas import FieldError, Health
+from scene_client.calls import LONGEST_PAUSE, Call
+from scene_client.connection import RETRIES
+from scene_client.errors import problem_of
+from scene_client.schemas import FieldError, ModelList
 
-CALL = calls.health("ready")
-ONCE: Call[Any] = calls.promote("default", {"model": "home"})
-FINE = Received(200, {}, b'{"status": "ready"}')
+Received = tuple[int, dict[str, str], bytes]
+Outcome = Received | Exception
+FINE: Received = (200, {}, b'{"models": [], "aliases": {}}')
+REFUSED = httpx.ConnectError("refused")
+BROKEN = httpx.ReadError("broke")
 
 
 def refusal(status: int, retry_after: str | None = None) -> Received:
@@ -52,11 +48,11 @@ def refusal(status: int, retry_after: str | None = None) -> Received:
         "errors": [{"pointer": "#/objects/0", "message": "unknown", "suggestions": ["bed"]}],
     }
     headers = {} if retry_after is None else {"retry-after": retry_after}
-    return Received(status, headers, json.dumps(problem).encode())
+    return status, headers, json.dumps(problem).encode()
 
 
 class World:
-    """Carries out what the core wants done; every sending takes ``seconds``.
+    """A service and a clock; every attempt takes ``seconds``.
 
     ``outcomes`` are handed out in turn, the last for ever.
     """
@@ -65,44 +61,57 @@ class World:
         self.outcomes = list(outcomes)
         self.seconds = seconds
         self.clock = 100.0
-        self.sent: list[Send] = []
+        self.told: list[int] = []  # milliseconds, per attempt
+        self.left: list[float] = []
         self.pauses: list[float] = []
+
+    def _answer(self, request: httpx.Request) -> httpx.Response:
+        left = request.extensions["timeout"]["read"]
+        self.left.append(left)
+        self.told.append(int(request.headers["X-Request-Timeout-Ms"]))
+        outcome = self.outcomes.pop(0) if len(self.outcomes) > 1 else self.outcomes[0]
+        self.clock += min(self.seconds, left)
+        if self.seconds > left:
+            raise httpx.ReadTimeout("late")
+        if isinstance(outcome, Exception):
+            raise outcome
+        status, headers, body = outcome
+        return httpx.Response(status, headers=headers, content=body)
+
+    def _sleep(self, seconds: float) -> None:
+        self.pauses.append(seconds)
+        self.clock += seconds
 
     def run(
         self,
-        call: Call[Any] = CALL,
+        ask: Callable[[Client], Any] = Client.models,
         timeout: float = 10.0,
-        jitter: Callable[[], float] = lambda: 0.5,
-        **options: Any,
+        jitter: float = 0.5,
+        retries: int = RETRIES,
     ) -> Any:
-        steps = exchange(call, timeout, lambda: self.clock, jitter=jitter, **options)
-        outcome: Outcome = None
-        while True:
-            try:
-                to_do = steps.send(outcome)
-            except StopIteration as done:
-                return done.value
-            match to_do:
-                case Pause(seconds):
-                    self.pauses.append(seconds)
-                    self.clock += seconds
-                    outcome = None
-                case Send():
-                    self.sent.append(to_do)
-                    outcome = self.outcomes.pop(0) if len(self.outcomes) > 1 else self.outcomes[0]
-                    if self.seconds > to_do.timeout:
-                        outcome = Late()
-                    self.clock += min(self.seconds, to_do.timeout)
+        transport = httpx.MockTransport(self._answer)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sync, "monotonic", lambda: self.clock)
+            patch.setattr(sync, "time", SimpleNamespace(sleep=self._sleep))
+            patch.setattr(calls, "random", lambda: jitter)
+            with Client(
+                "http://robot", timeout=timeout, retries=retries, transport=transport
+            ) as client:
+                return ask(client)
+
+
+def promote(client: Client) -> Any:
+    return client.promote("default", "home")
 
 
 def test_an_answer_is_read_into_its_class() -> None:
     world = World(FINE)
-    assert world.run() == Health(status="ready")
-    assert len(world.sent) == 1
+    assert world.run() == ModelList(models=[], aliases={})
+    assert len(world.told) == 1
 
 
 def test_an_answer_of_a_newer_service_may_say_more() -> None:
-    assert World(Received(200, {}, b'{"status": "ready", "mood": "fine"}')).run().status == "ready"
+    assert World((200, {}, b'{"models": [], "aliases": {}, "mood": "fine"}')).run().models == []
     # Parts of answers that are parts of requests too are as patient.
     scene = {"objects": ["bed"], "log_score": -1.0, "context": {}, "mood": "fine"}
     scene["relations"] = [{"subject": "a", "relation": "left", "object": "b", "probability": 0.5}]
@@ -112,41 +121,39 @@ def test_an_answer_of_a_newer_service_may_say_more() -> None:
         "seed": 1,
         "scenes": [scene],
     }
-    call = calls.ask(calls.GENERATE, (), {})
-    read = World(Received(200, {}, json.dumps(answer).encode())).run(call)
+    read = World((200, {}, json.dumps(answer).encode())).run(Client.generate)
     assert read.scenes[0].relations[0].subject == "a"
 
 
-@pytest.mark.parametrize("body", [b"", b"<html>", b"{}", b"[]", b'{"status": "dead"}'])
+@pytest.mark.parametrize("body", [b"", b"<html>", b"{}", b"[]", b'{"models": 1}'])
 def test_success_that_cannot_be_read_is_said_to_be_so(body: bytes) -> None:
-    world = World(Received(200, {}, body))
-    with pytest.raises(AnswerError, match="/health/ready is not Health"):
+    world = World((200, {}, body))
+    with pytest.raises(AnswerError, match="/models is not ModelList"):
         world.run()
-    assert len(world.sent) == 1
+    assert len(world.told) == 1
 
 
 @pytest.mark.parametrize("status", [429, 503])
 def test_who_is_busy_is_asked_again_when_it_says(status: int) -> None:
     world = World(refusal(status, "2"), refusal(status, "3"), FINE)
-    assert world.run().status == "ready"
+    assert world.run().models == []
     # Never before the time named, and not everybody at that very moment.
     assert [round(pause, 3) for pause in world.pauses] == [2.025, 3.05]
-    told = [int(send.headers["X-Request-Timeout-Ms"]) for send in world.sent]
-    assert told == pytest.approx([10000, 7975, 4925], abs=1)
+    assert world.told == pytest.approx([10000, 7975, 4925], abs=1)
 
 
 def test_retry_after_may_be_a_date() -> None:
     moment = format_datetime(datetime.now(UTC) + timedelta(seconds=60), usegmt=True)
-    found = problem_of(refusal(503, moment)).retry_after
+    found = problem_of(*refusal(503, moment)).retry_after
     assert found is not None
     assert 50 < found <= 60
     past = format_datetime(datetime.now(UTC) - timedelta(seconds=60), usegmt=True)
-    assert problem_of(refusal(503, past)).retry_after == 0
+    assert problem_of(*refusal(503, past)).retry_after == 0
 
 
 @pytest.mark.parametrize("value", ["", "soon", "-1", "1.5", "٣", "Mon, 99 Foo 2026"])
 def test_a_retry_after_that_makes_no_sense_is_none(value: str) -> None:
-    assert problem_of(refusal(503, value)).retry_after is None
+    assert problem_of(*refusal(503, value)).retry_after is None
 
 
 def test_who_asks_for_more_time_than_is_left_is_not_waited_for() -> None:
@@ -154,7 +161,7 @@ def test_who_asks_for_more_time_than_is_left_is_not_waited_for() -> None:
     with pytest.raises(ProblemError) as raised:
         world.run(timeout=1.0)
     assert raised.value.retry_after == 2
-    assert (len(world.sent), world.pauses) == (1, [])
+    assert (len(world.told), world.pauses) == (1, [])
 
 
 @pytest.mark.parametrize("status", [301, 400, 401, 404, 409, 413, 415, 422, 500, 502])
@@ -163,7 +170,7 @@ def test_what_another_attempt_cannot_mend_is_not_attempted(status: int) -> None:
     with pytest.raises(ProblemError) as raised:
         world.run()
     assert raised.value.status == status
-    assert len(world.sent) == 1
+    assert len(world.told) == 1
 
 
 def test_a_problem_carries_everything_the_service_said() -> None:
@@ -180,7 +187,7 @@ def test_a_problem_carries_everything_the_service_said() -> None:
 @pytest.mark.parametrize(
     "error",
     [
-        problem_of(refusal(422, "3")),
+        problem_of(*refusal(422, "3")),
         InvalidRequestError([FieldError(pointer="#/a", message="b")]),
         DeadlineError("late", "r1"),
         UnreachableError("gone"),
@@ -195,12 +202,12 @@ def test_errors_survive_the_way_between_processes(error: Exception) -> None:
 
 def test_an_error_that_is_no_problem_document_is_one_all_the_same() -> None:
     with pytest.raises(ProblemError) as raised:
-        World(Received(502, {"x-request-id": "p7"}, b"<html>Bad Gateway</html>")).run()
+        World((502, {"x-request-id": "p7"}, b"<html>Bad Gateway</html>")).run()
     problem = raised.value
     assert (problem.type, problem.status, problem.title) == ("about:blank", 502, "Bad Gateway")
     assert problem.request_id == "p7"
     with pytest.raises(ProblemError, match="799"):
-        World(Received(799, {}, b"")).run()
+        World((799, {}, b"")).run()
 
 
 def test_the_service_s_own_deadline_is_the_caller_s() -> None:
@@ -208,26 +215,26 @@ def test_the_service_s_own_deadline_is_the_caller_s() -> None:
     with pytest.raises(DeadlineError) as raised:
         world.run()
     assert raised.value.request_id == "r1"
-    assert len(world.sent) == 1
+    assert len(world.told) == 1
 
 
 def test_a_broken_connection_is_tried_again_with_growing_pauses() -> None:
-    world = World(Lost("refused", sent=False))
+    world = World(REFUSED)
     with pytest.raises(UnreachableError, match="refused"):
-        world.run(timeout=600.0, jitter=lambda: 1.0, retries=8)
-    assert len(world.sent) == 9
+        world.run(timeout=600.0, jitter=1.0, retries=8)
+    assert len(world.told) == 9
     assert world.pauses == [0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 2.0, 2.0]
 
 
 def test_what_must_not_be_done_twice_is_asked_again_only_if_it_was_not_sent() -> None:
-    world = World(Lost("broke", sent=True), FINE)
+    world = World(BROKEN, FINE)
     with pytest.raises(UnreachableError):
-        world.run(ONCE)
-    assert len(world.sent) == 1
-    world = World(Lost("refused", sent=False))
+        world.run(promote)
+    assert len(world.told) == 1
+    world = World(REFUSED)
     with pytest.raises(UnreachableError):
-        world.run(ONCE)
-    assert len(world.sent) == RETRIES + 1
+        world.run(promote)
+    assert len(world.told) == RETRIES + 1
 
 
 def test_no_answer_in_time_is_a_passed_deadline() -> None:
@@ -237,40 +244,48 @@ def test_no_answer_in_time_is_a_passed_deadline() -> None:
     assert world.clock == pytest.approx(100.5)
 
 
-def test_an_answer_that_is_complete_after_the_deadline_is_none() -> None:
-    clock = 100.0
-    steps = exchange(CALL, 0.5, lambda: clock)
-    assert isinstance(steps.send(None), Send)
-    clock = 100.5  # as of a process that was stopped while its answer came
+def test_an_answer_that_is_complete_after_the_deadline_is_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(FINE)
+    read = Call.read
+
+    def read_for_long(*arguments: Any) -> Any:
+        world.clock += 0.5  # as of a process that was stopped while its answer came
+        return read(*arguments)
+
+    monkeypatch.setattr(Call, "read", read_for_long)
     with pytest.raises(DeadlineError, match=r"0\.5 s"):
-        steps.send(FINE)
+        world.run(timeout=0.5)
 
 
-answers = st.sampled_from([refusal(429, "1"), refusal(503), refusal(503, "0")]) | st.builds(
-    Lost, st.just("lost"), st.booleans()
-)
+failures = [refusal(429, "1"), refusal(503), refusal(503, "0"), REFUSED, BROKEN]
 
 
 @given(
-    outcomes=st.lists(answers | st.just(FINE), min_size=1, max_size=12),
+    outcomes=st.lists(st.sampled_from([*failures, FINE]), min_size=1, max_size=12),
     seconds=st.floats(0, 1),
     timeout=st.floats(0.001, 5),
     retries=st.integers(0, 10),
     jitter=st.floats(0, 1, exclude_max=True),
 )
 def test_no_call_outlasts_its_deadline_whatever_happens(
-    outcomes: list[Outcome], seconds: float, timeout: float, retries: int, jitter: float
+    outcomes: list[Outcome],
+    seconds: float,
+    timeout: float,
+    retries: int,
+    jitter: float,
 ) -> None:
     world = World(*outcomes, seconds=seconds)
     try:
-        answer = world.run(timeout=timeout, retries=retries, jitter=lambda: jitter)
+        answer = world.run(timeout=timeout, retries=retries, jitter=jitter)
     except (ProblemError, UnreachableError, DeadlineError):
         pass
     else:
-        assert answer.status == "ready"
+        assert answer.models == []
     assert world.clock - 100.0 <= timeout + 1e-9
-    assert len(world.sent) <= retries + 1
-    for send in world.sent:
+    assert len(world.told) <= retries + 1
+    for told, left in zip(world.told, world.left, strict=True):
         # What the service is told is never more than what is left; it knows no less than 1 ms.
-        assert 1 <= int(send.headers["X-Request-Timeout-Ms"]) <= max(1, send.timeout * 1e3)
+        assert 1 <= told <= max(1, left * 1e3)
     assert all(0 <= pause <= 1 + LONGEST_PAUSE for pause in world.pauses)

@@ -5,13 +5,18 @@ from __future__ import annotations
 import struct
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scene_client.layout import HEIGHT, Box, arrange
 from scene_client.schemas import GenerateAnswer, GeneratedScene, ModelReference, Relation
+
+plot = pytest.importorskip("scene_client.plot", exc_type=ImportError)
+
+if TYPE_CHECKING:
+    from scene_client.plot import Box
 
 NAMES = ["bed", "desk", "lamp", "book", "a rather long name", "x", "chair", "mug"]
 RELATIONS = ["left", "right", "front", "behind", "on-top", "under", "above", "below"]
@@ -24,7 +29,7 @@ def stated(*relations: tuple[str, str, str]) -> list[Relation]:
 
 
 def boxes(objects: list[str], *relations: tuple[str, str, str]) -> dict[str, Box]:
-    return {box.label: box for box in arrange(objects, stated(*relations))}
+    return {box.label: box for box in plot.arrange(objects, stated(*relations))}
 
 
 objects = st.lists(st.sampled_from(NAMES), unique=True, max_size=8)
@@ -35,7 +40,7 @@ triples = st.tuples(st.sampled_from(NAMES), st.sampled_from(RELATIONS), st.sampl
 def test_every_object_is_drawn_once_and_none_overlaps_another(
     objects: list[str], relations: list[tuple[str, str, str]]
 ) -> None:
-    found = arrange(objects, stated(*relations))
+    found = plot.arrange(objects, stated(*relations))
     assert sorted(box.label for box in found) == sorted(objects)
     for place, one in enumerate(found):
         assert one.x >= 0
@@ -72,10 +77,10 @@ def test_what_lies_on_something_is_drawn_on_it() -> None:
     )
     desk = found["desk"]
     for name in ("lamp", "book"):
-        assert found[name].y == desk.y + HEIGHT
+        assert found[name].y == desk.y + plot.HEIGHT
         assert desk.x <= found[name].x
         assert found[name].x + found[name].width <= desk.x + desk.width
-    assert boxes(["desk", "lamp"], ("lamp", "above", "desk"))["lamp"].y > desk.y + HEIGHT
+    assert boxes(["desk", "lamp"], ("lamp", "above", "desk"))["lamp"].y > desk.y + plot.HEIGHT
 
 
 def test_of_what_contradicts_itself_the_first_said_is_drawn() -> None:
@@ -96,7 +101,6 @@ def scene(objects: list[str], *relations: tuple[str, str, str]) -> GeneratedScen
 
 @pytest.mark.parametrize("count", [1, 3, 16])
 def test_every_scene_is_in_the_picture(tmp_path: Path, count: int) -> None:
-    plot = pytest.importorskip("scene_client.plot")
     room = scene(
         ["desk", "lamp", "$chair$"], ("lamp", "on-top", "desk"), ("lamp", "left", "$chair$")
     )
@@ -108,7 +112,6 @@ def test_every_scene_is_in_the_picture(tmp_path: Path, count: int) -> None:
 
 
 def test_a_picture_of_the_largest_answer_stays_within_bounds(tmp_path: Path) -> None:
-    plot = pytest.importorskip("scene_client.plot")
     names = [f"thing {number}" for number in range(200)]
     row = [(a, "left", b) for a, b in pairwise(names)]
     path = tmp_path / "scenes.png"

@@ -1,0 +1,103 @@
+"""Validation errors of a request, in words and with JSON pointers; for the service and its clients.
+
+Pointers are URI fragments (RFC 6901, section 6).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import Any, Final
+from urllib.parse import quote
+
+from pydantic_core import ErrorDetails
+
+from scene_client import schemas
+from scene_client.schemas import OBJECT_TAGS, FieldError
+
+MAX_ERRORS: Final = 100
+"""Errors that are listed per request."""
+
+_FIELDS: Final = sorted(
+    {
+        name
+        for value in vars(schemas).values()
+        if isinstance(value, type) and issubclass(value, schemas.Request)
+        for name in value.model_fields
+    }
+)
+# Where pydantic's own words would puzzle a reader who does not write Python.
+_MESSAGES: Final = {
+    "extra_forbidden": "unknown field",
+    "missing": "required",
+    "model_attributes_type": "must be an object",
+    "model_type": "must be an object",
+    "dict_type": "must be an object",
+    "list_type": "must be an array",
+}
+# A pointer repeats member names of the request. Only short plain ones are repeated, so that a
+# request cannot choose the words of an error; a pointer to anything else stops at its parent.
+_PLAIN: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_MARKS: Final = frozenset({*OBJECT_TAGS, "[key]"})
+
+
+def field_errors(
+    errors: Sequence[ErrorDetails],
+    body: Any,
+    *,
+    at: tuple[str | int, ...] = (),
+    skip: int = 0,
+) -> list[FieldError]:
+    """The first `MAX_ERRORS` of pydantic's errors.
+
+    Args:
+        errors: of the validation.
+        body: the validated value.
+        at: where in the request ``body`` stands.
+        skip: leading steps of every location that lead to ``body``.
+    """
+    found = []
+    # Only of those that are listed: suggestions for 100,000 members take a minute.
+    for error in errors[:MAX_ERRORS]:
+        location = error["loc"][skip:]
+        unknown = str(location[-1]) if error["type"] == "extra_forbidden" else ""
+        found.append(
+            FieldError(
+                pointer=pointer(at) + pointer(location, body)[1:],
+                message=_MESSAGES.get(error["type"], error["msg"]),
+                suggestions=_like(unknown) if unknown else [],
+            )
+        )
+    return found
+
+
+def _like(unknown: str) -> list[str]:
+    """Fields of requests with such a name; one that is a field elsewhere does not mean itself."""
+    return [name for name in get_close_matches(unknown[:64], _FIELDS) if name != unknown]
+
+
+def pointer(location: tuple[str | int, ...], body: Any = None) -> str:
+    """The JSON pointer of a location, ``#`` for the whole body.
+
+    Args:
+        location: field names and list positions from the root, with pydantic's marks for members
+            of unions and for keys.
+        body: the parsed request, if at hand: a bare label has no members, so a location inside it
+            points at the label itself.
+    """
+    steps: list[str] = []
+    value = body
+    for step in location:
+        if step in _MARKS:
+            continue
+        if isinstance(value, str) or not _PLAIN.fullmatch(str(step)):
+            break
+        steps.append(quote(str(step)))
+        if isinstance(value, dict):
+            value = value.get(step)
+        elif isinstance(value, list) and isinstance(step, int) and step < len(value):
+            value = value[step]
+        else:
+            value = None
+    return "#" + "".join(f"/{step}" for step in steps)
