@@ -115,6 +115,7 @@ class ClosedForm:
             raise ValueError("a closed form needs the local form and moderate weights in float32")
         self._weights = weights
         self.W, self.b = weights["W"], weights["b"]
+        self._c1, self._Q = weights["c1"], weights["Q"]
         self.units = weights.spec.kind.units(weights)
         self._group = group_size(self.W)
 
@@ -142,8 +143,12 @@ class ClosedForm:
             room: index of the room type; None where it is not known.
             pull: how strongly the given relations act.
         """
-        x = self._weights.room_bias(room) + presence @ self.W[classes]
-        x, through = self._second_layer(x.astype(np.float32), classes, presence)
+        x: Floats = self._c1 + presence @ self.W[classes]
+        if room is not None and len(self._Q):
+            x += self._Q[room]
+        through = None
+        if self._weights.spec.H2:
+            x, through = self._second_layer(x, classes, presence)
         scene = classes, presence, log_counts
         if given is None or not len(given.a):
             none = _NO_SLOPES
@@ -159,10 +164,8 @@ class ClosedForm:
 
     def _second_layer(
         self, base: Floats, classes: Places, presence: Floats
-    ) -> tuple[Floats, Floats | None]:
-        """x, and what each class adds to it through the second layer, if there is one."""
-        if not self._weights.spec.H2:
-            return base, None
+    ) -> tuple[Floats, Floats]:
+        """x, and what each class adds to it through the second layer."""
         without = base - presence[:, None] * self.W[classes]
         bases = np.concatenate([base[None], without]).astype(np.float32)
         x, _ = self._weights.with_second_layer(bases)

@@ -5,28 +5,14 @@ What there are dozens of in an answer is a named tuple, which takes a third of t
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Final, NamedTuple, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
-
-from app.questions.ranking import strongest
+from typing import Final, NamedTuple
 
 REASONS: Final = 3
 """How many objects an answer names as reasons."""
 
 EXPLAINED: Final = 32
 """Reasons are given for so many entries of an answer at most, its first."""
-
-TupleT = TypeVar("TupleT", bound=tuple[Any, ...])
-
-
-def entries(kind: type[TupleT], *columns: Iterable[Any]) -> list[TupleT]:
-    """Named tuples from their fields, column by column: in half the time that calls would take."""
-    return list(map(partial(tuple.__new__, kind), zip(*columns, strict=True)))
 
 
 class RelationAnswer(NamedTuple):
@@ -196,24 +182,3 @@ class ContextUnit:
     objects: tuple[tuple[str, float], ...]
     relations: tuple[tuple[tuple[str, str, str], float], ...]
     room_types: tuple[tuple[str, float], ...]
-
-
-def strongest_reasons(
-    first: NDArray[np.int64],
-    change: NDArray[np.floating[Any]],
-    rows: NDArray[np.int64] | None = None,
-) -> list[tuple[Because, ...]]:
-    """The classes that change the log-odds of N others most, strongest first, for each of these.
-
-    Of either sign; instances of a class are spoken of by the first.
-
-    Args:
-        first: (n,) the first object of each class present.
-        change: (N, n) by each class present.
-        rows: (N,) places of the explained classes among the n; None for absent classes.
-    """
-    rows = np.zeros(0, np.int64) if rows is None else rows
-    places, values = strongest(change, rows, REASONS)
-    found = entries(Because, first[places.reshape(-1)].tolist(), values.reshape(-1).tolist())
-    kept = places.shape[1]
-    return [tuple(found[k * kept : (k + 1) * kept]) for k in range(len(change))]

@@ -65,11 +65,6 @@ def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
     return forward / total, backward / total
 
 
-def missing_logits(calibration: Calibration, log_odds: Floats, listed: int) -> Floats:
-    """Logits of "this class is there unlisted", with so many classes listed."""
-    return calibration.missing.log_odds(log_odds, listed)
-
-
 def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int) -> Floats:
     """log p(relation | both are there), calibrated as placements are, from that of the machine.
 
@@ -93,7 +88,7 @@ def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, lis
     Args:
         log_p: log of the second factor, calibrated.
     """
-    both = log_p - np.logaddexp(0.0, -missing_logits(calibration, log_odds, listed))
+    both = log_p - np.logaddexp(0.0, -calibration.missing.log_odds(log_odds, listed))
     found: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
     return found
 

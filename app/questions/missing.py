@@ -18,23 +18,19 @@ from app.questions.answers import (
     MissingAnswer,
     Offset,
     Placement,
-    entries,
-    strongest_reasons,
 )
-from app.questions.calibration import (
-    missing_logits,
-    placed_logits,
-    placement_log_p,
-)
+from app.questions.calibration import placed_logits, placement_log_p
 from app.questions.posterior import Posterior, posterior
-from app.questions.ranking import best, likeliest_places
+from app.questions.ranking import best, entries, likeliest_places, strongest_reasons
 from app.registry.artifact import Artifact
 from app.registry.offsets import NOTHING, Offsets, look_up
 from app.scene.frames import Axes, viewer_axes
 from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP, RELATIONS, canonicalise, opposite
 from app.scene.scene import Scene
 
-_VIEWER = viewer_axes()
+VIEWER = viewer_axes()
+"""Axes of a viewer at the origin who looks along x."""
+
 _BLOCK: Final = 32
 
 PLACES: Final = 3
@@ -53,7 +49,7 @@ def missing(
     candidates: Sequence[int] | None = None,
     at: tuple[str, int] | None = None,
     coverage: float | None = None,
-    axes: Axes | None = _VIEWER,
+    axes: Axes | None = VIEWER,
     details: bool = True,
 ) -> tuple[MissingAnswer, ...]:
     """Unlisted classes by the probability that they are there all the same, likeliest first.
@@ -83,19 +79,21 @@ def missing(
     coverage = calibration.coverage if coverage is None else coverage
     if not 0 <= coverage <= 1:
         raise ValueError(f"coverage must be in [0, 1], not {coverage}")
-    place = _place(scene, spec.A, at)
+    place = None if at is None else _place(scene, spec.A, at)
     given = posterior(artifact, scene)
     structure = artifact.vocabulary.structure
     usable = ~structure
     usable[given.present.classes] = False
     absent = np.flatnonzero(usable)
-    chosen = _chosen(absent, spec.V, candidates)
+    chosen = np.ones(len(absent), np.bool_)
+    if candidates is not None:
+        chosen = _chosen(absent, spec.V, candidates)
     if not chosen.any():
         return ()
     log_odds = given.absent_posterior(absent, coverage)
     listed = max(1, int(np.count_nonzero(~structure[given.present.classes])))
     if place is None:
-        logits = missing_logits(calibration, log_odds, listed)
+        logits = calibration.missing.log_odds(log_odds, listed)
     else:
         logits = _at_place(artifact, given, place, absent, chosen, log_odds, listed, top_k)
     # By logit: probabilities near 0 or 1 may all round to one number.
@@ -138,7 +136,7 @@ def _at_place(
     """
     relation, anchor, outgoing = place
     row = int(given.present.row[anchor])
-    there = missing_logits(artifact.calibration, log_odds, listed)
+    there = artifact.calibration.missing.log_odds(log_odds, listed)
     logits = np.full_like(there, -np.inf)
     order = np.flatnonzero(chosen)
     order = order[np.argsort(-there[order], kind="stable")]
@@ -161,12 +159,8 @@ def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, 
     return reasons + [()] * (len(found) - len(explained))
 
 
-def _place(
-    scene: Scene, relations: int, at: tuple[str, int] | None
-) -> tuple[int, int, bool] | None:
+def _place(scene: Scene, relations: int, at: tuple[str, int]) -> tuple[int, int, bool]:
     """(canonical relation, object, whether the missing thing is the relation's subject)."""
-    if at is None:
-        return None
     name, anchor = at
     if not 0 <= anchor < len(scene.objects):
         raise ValueError(f"anchor {anchor} is none of the {len(scene.objects)} objects")
@@ -177,11 +171,9 @@ def _place(
 
 
 def _chosen(
-    absent: NDArray[np.int64], classes: int, candidates: Sequence[int] | None
+    absent: NDArray[np.int64], classes: int, candidates: Sequence[int]
 ) -> NDArray[np.bool_]:
     """(N,) bool over the absent classes."""
-    if candidates is None:
-        return np.ones(len(absent), dtype=np.bool_)
     for index in candidates:
         if not 0 <= index < classes:
             raise ValueError(f"candidate {index} must be a class index below V = {classes}")

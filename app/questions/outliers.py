@@ -29,12 +29,10 @@ from app.questions.answers import (
     MisplacedAnswer,
     OutlierAnswer,
     OutliersFound,
-    entries,
-    strongest_reasons,
 )
 from app.questions.calibration import false_log_odds, intruder_line
 from app.questions.posterior import Posterior, posterior
-from app.questions.ranking import best
+from app.questions.ranking import best, entries, strongest_reasons
 from app.registry.artifact import Artifact
 from app.registry.description import Calibration, Thresholds
 from app.scene.relations import CANONICAL

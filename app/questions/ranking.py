@@ -1,12 +1,35 @@
-"""Compiled loops from log-odds to the best of what an answer can list; ties go by position."""
+"""Compiled loops from log-odds to the best of what an answer can list; ties go by position.
+
+And from numbers to the digits that an answer shows.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import Any, Final, TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.inference.relations import NO_UNIT
+from app.questions.answers import REASONS, Because
 from app.questions.calibration import exclusive, relation_probability
+
+DIGITS: Final = 6
+"""Significant digits of probabilities, log-odds and metres."""
+
+# Exact doubles: a whole number divided by one of them is the double nearest to the decimal number.
+_POWERS: Final = np.array([10.0**power for power in range(23)])
+
+
+TupleT = TypeVar("TupleT", bound=tuple[Any, ...])
+
+
+def entries(kind: type[TupleT], *columns: Iterable[Any]) -> list[TupleT]:
+    """Named tuples from their fields, column by column: in half the time that calls would take."""
+    return list(map(partial(tuple.__new__, kind), zip(*columns, strict=True)))
 
 
 @compiled
@@ -168,6 +191,27 @@ def strongest(change, rows, count):
     return places, values
 
 
+def strongest_reasons(
+    first: NDArray[np.int64],
+    change: NDArray[np.floating[Any]],
+    rows: NDArray[np.int64] | None = None,
+) -> list[tuple[Because, ...]]:
+    """The classes that change the log-odds of N others most, strongest first, for each of these.
+
+    Of either sign; instances of a class are spoken of by the first.
+
+    Args:
+        first: (n,) the first object of each class present.
+        change: (N, n) by each class present.
+        rows: (N,) places of the explained classes among the n; None for absent classes.
+    """
+    rows = np.zeros(0, np.int64) if rows is None else rows
+    places, values = strongest(change, rows, REASONS)
+    found = entries(Because, first[places.reshape(-1)].tolist(), values.reshape(-1).tolist())
+    kept = places.shape[1]
+    return [tuple(found[k * kept : (k + 1) * kept]) for k in range(len(change))]
+
+
 @compiled
 def observed_pairs(triples, row, asked, classes, relations):
     """Pairs of objects between which something holds, (P,) each of what follows.
@@ -246,3 +290,28 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
             ratio[k] = likely[0, k] / observed
     where = best(ratio, usable, count)
     return where, expected[where], likely[0][where], likely[1][where]
+
+
+def significant(numbers: Sequence[float]) -> list[float]:
+    """The same numbers to `DIGITS` significant digits."""
+    values = np.array(numbers, dtype=np.float64)
+    exact = _round(values)
+    rounded: list[float] = values.tolist()
+    if not exact:
+        return [float(f"{value:.{DIGITS}g}") for value in rounded]
+    return rounded
+
+
+@compiled
+def _round(values: NDArray[np.float64]) -> bool:
+    """Round numbers in place; False if one is too small or too large for exact powers of ten."""
+    exact = True
+    for k in range(len(values)):
+        size = np.abs(values[k])
+        if 1e-16 < size < 1e5:
+            shift = DIGITS - 1 - np.int64(np.floor(np.log10(size)))
+            scale = _POWERS[shift]
+            values[k] = np.rint(values[k] * scale) / scale
+        elif size != 0.0:
+            exact = False
+    return exact

@@ -19,9 +19,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from app.questions.answers import Disagreement, RelationAnswer, entries
+from app.questions.answers import Disagreement, RelationAnswer
 from app.questions.posterior import Posterior, Present, posterior, relations_given
-from app.questions.ranking import disagreeing, likeliest_relations, observed_pairs
+from app.questions.ranking import disagreeing, entries, likeliest_relations, observed_pairs
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, OPPOSITES, canonicalise
 from app.scene.scene import Scene

@@ -59,7 +59,7 @@ class Artifact:
     offsets: Offsets | None = None
     oracle: Callable[[Artifact, Scene], Any] | None = None
 
-    @property
+    @cached_property
     def spec(self) -> MachineSpec:
         """The shape of the machine."""
         return self.weights.spec

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Final, Self
 
 import numpy as np
@@ -28,7 +29,7 @@ NOTHING: Final = -1
 """In place of a number of scenes: training saw none of the relation."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Offsets:
     """Normal offsets, axis by axis; A canonical relations, V classes, P pairs that were seen.
 
@@ -110,7 +111,7 @@ class Offsets:
         found = look_up(self.tables, relation, subject, other)
         return found
 
-    @property
+    @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:
         """As `look_up` takes them."""
         return (

@@ -6,11 +6,11 @@ import math
 from dataclasses import replace
 
 from app import questions
+from app.questions.ranking import significant
 from app.registry import Artifact
 from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
-from app.serving.rounding import significant
 
 STEPS = 1
 """Gibbs sweeps of the drawing: more take their time and warm nothing further."""

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from app import questions
+from app.questions.ranking import significant
 from app.registry import Artifact, Store
 from app.serving.reading import Limits, read_scene
-from app.serving.rounding import significant
 from benchmarks.load.connections import prepared
 from scene_client.schemas import MissingRequest
 from tests.chaos.load import ConstantLoad

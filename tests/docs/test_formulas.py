@@ -23,7 +23,6 @@ from app.questions.calibration import (
     exclusive,
     false_log_odds,
     intruder_line,
-    missing_logits,
     placed_logits,
     relation_probability,
 )
@@ -537,7 +536,7 @@ def unlisted_objects() -> None:
 def missing_objects() -> None:
     found, odds = calibration(), np.array([0.3, -1.2, 2.0, 0.1])
     entry = found.missing
-    logits = missing_logits(found, odds, 7)
+    logits = found.missing.log_odds(odds, 7)
     p = sigmoid(logits)
     constant = entry.intercept + entry.log_count * math.log(7)
     assert p == near([sigma(constant + entry.slope * z) for z in odds])
@@ -547,7 +546,7 @@ def missing_objects() -> None:
 def missing_at_a_place() -> None:
     found = calibration()
     odds, log_p = np.array([0.3, -1.2]), np.array([-0.5, -2.0])
-    there = [sigma(x) for x in missing_logits(found, odds, 7)]
+    there = [sigma(x) for x in found.missing.log_odds(odds, 7)]
     p = [sigma(x) for x in placed_logits(found, odds, log_p, 7)]
     assert p == near([a * math.exp(b) for a, b in zip(there, log_p, strict=True)])
 

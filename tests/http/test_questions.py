@@ -11,8 +11,8 @@ from typing import Any
 import httpx
 import pytest
 
+from app.questions.ranking import significant
 from app.scene.relations import CANONICAL, opposite
-from app.serving.rounding import significant
 from scene_client.schemas import (
     GenerateAnswer,
     MissingAnswer,

@@ -1,0 +1,86 @@
+"""What would a scene like this look like?"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Sequence
+
+from app import questions
+from app.serving.answers import (
+    OBJECT_BYTES,
+    RELATION_BYTES,
+    Answer,
+    envelope,
+    require_size,
+    rounded,
+)
+from app.serving.errors import Reason
+from app.serving.models import ServedModel
+from app.serving.reading import Faults
+from app.serving.request import Request
+from scene_client.schemas import GenerateRequest
+
+DRAWN_SEED_BITS = 53
+"""Every JSON reader can hand such a seed back: a double holds it exactly."""
+
+_UNIT_BYTES = 12  # the number of a hidden unit
+
+
+async def generate(request: Request, asked: GenerateRequest) -> Answer:
+    """See `scene_client.schemas.GenerateAnswer`."""
+    model, reading = request.read(asked, may_be_empty=True)
+    _check_context(asked, model)
+    seed = secrets.randbits(DRAWN_SEED_BITS) if asked.seed is None else asked.seed
+
+    def draw(stop: Callable[[], bool]) -> tuple[questions.GeneratedScene, ...]:
+        return questions.generate(
+            model.artifact,
+            reading.scene,
+            count=asked.count,
+            seed=seed,
+            steps=asked.steps,
+            temperature=asked.temperature,
+            context=asked.context,
+            stop=stop,
+        )
+
+    drawn = await request.draw(asked.count, model, "generate", draw)
+    require_size(_size(drawn), reading, request.limits.answer_bytes, "count")
+    answer = envelope(asked, request.id, model.reference, reading)
+    answer["seed"] = seed
+    answer["scenes"] = [
+        {
+            "objects": scene.objects,
+            "relations": [
+                {"subject": subject, "relation": relation, "object": other}
+                for subject, relation, other in scene.relations
+            ],
+            "log_score": rounded(scene.log_score),
+            "context": scene.context,
+        }
+        for scene in drawn
+    ]
+    return answer
+
+
+def _check_context(asked: GenerateRequest, model: ServedModel) -> None:
+    faults = Faults()
+    for layer, units in (asked.context or {}).items():
+        size = model.context_sizes.get(layer)
+        if size is None:
+            layers = tuple(model.context_sizes)
+            faults.add(Reason.INVALID, ("context", layer), "the model has no such layer", layers)
+            continue
+        for place, unit in enumerate(units):
+            if unit >= size:
+                message = f"the layer has units 0 to {size - 1}"
+                faults.add(Reason.INVALID, ("context", layer, place), message)
+    faults.raise_any()
+
+
+def _size(drawn: Sequence[questions.GeneratedScene]) -> Callable[[int], int]:
+    objects = sum([len(scene.objects) for scene in drawn])
+    relations = sum([len(scene.relations) for scene in drawn])
+    units = sum([len(layer) for scene in drawn for layer in scene.context.values()])
+    fixed = len(drawn) * OBJECT_BYTES + relations * RELATION_BYTES + units * _UNIT_BYTES
+    return lambda name: fixed + (objects + 2 * relations) * name

@@ -1,0 +1,133 @@
+"""What else should be here, and where?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+from app import questions
+from app.questions.missing import VIEWER
+from app.questions.ranking import significant
+from app.scene.frames import Axes, viewer_axes
+from app.scene.relations import opposite
+from app.serving.answers import (
+    CAUSE_BYTES,
+    OBJECT_BYTES,
+    RELATION_BYTES,
+    Answer,
+    envelope,
+    reasons,
+    require_size,
+)
+from app.serving.errors import Reason
+from app.serving.models import ServedModel
+from app.serving.reading import Faults, Reading
+from app.serving.request import Request
+from scene_client.schemas import Anchor, MissingRequest
+
+_OFFSET_BYTES = 250
+
+
+async def missing(request: Request, asked: MissingRequest) -> Answer:
+    """See `scene_client.schemas.MissingAnswer`."""
+    model, reading = request.read(asked)
+    faults = Faults()
+    # The default is for vocabularies of any size; a client's own number is never cut silently.
+    if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
+        message = f"must not be above {len(model.vocabulary)}, the size of the model's vocabulary"
+        faults.add(Reason.INVALID, ("top_k",), message)
+    candidates = at = None
+    if asked.candidates is not None:
+        reading = replace(reading, unknown=reading.unknown.copy())
+        candidates = _candidates(asked.candidates, model, reading, faults)
+    if asked.at is not None:
+        at = _place(asked.at, model, reading, faults)
+    if faults.found:
+        faults.raise_any()
+    found = await request.ask(
+        model,
+        questions.missing,
+        reading.scene,
+        top_k=asked.top_k,
+        candidates=candidates,
+        at=at,
+        axes=_axes(asked),
+        coverage=asked.coverage,
+    )
+    require_size(_size(found), reading, request.limits.answer_bytes, "top_k")
+    answer = envelope(asked, request.id, model.reference, reading)
+    coverage = asked.coverage
+    answer["coverage"] = model.artifact.calibration.coverage if coverage is None else coverage
+    ids = reading.ids
+    numbers: list[float] = []
+    for _, probability, log_odds, placements, because in found:
+        numbers += probability, log_odds
+        for _, _, share, offset in placements:
+            numbers.append(share)
+            if offset is not None:
+                numbers += offset[0]
+                numbers += offset[1]
+        numbers += [change for _, change in because]
+    numbered = iter(significant(numbers))
+    answer["missing"] = [
+        {
+            "label": label,
+            "probability": next(numbered),
+            "log_odds": next(numbered),
+            "placements": [_placement(place, ids, numbered) for place in placements],
+            "because": reasons(because, ids, numbered),
+        }
+        for label, _, _, placements, because in found
+    ]
+    return answer
+
+
+def _candidates(
+    labels: list[str], model: ServedModel, reading: Reading, faults: Faults
+) -> list[int]:
+    """Classes to rank."""
+    indices: dict[int, None] = {}
+    for place, label in enumerate(labels):
+        index = model.vocabulary.index(label)
+        if index is None:
+            index = reading.unknown.resolve(label, label, ("candidates", place), faults)
+        if index is not None:
+            indices[index] = None
+    return list(indices)
+
+
+def _place(
+    at: Anchor, model: ServedModel, reading: Reading, faults: Faults
+) -> tuple[str, int] | None:
+    canonical = model.artifact.manifest.vocabulary.relations
+    if at.relation not in {*canonical, *map(opposite, canonical)}:
+        faults.add(Reason.INVALID, ("at", "relation"), "the model does not know this relation")
+    anchor = reading.names.find(at.object, ("at", "object"), faults)
+    return None if anchor is None else (at.relation, anchor)
+
+
+def _axes(asked: MissingRequest) -> Axes | None:
+    """The viewer's axes, in the frame that offsets are answered in."""
+    if asked.frame_id is None and asked.viewpoint is None:
+        return VIEWER
+    return viewer_axes(asked.frame_id, None if asked.viewpoint is None else asked.viewpoint.yaw)
+
+
+def _size(found: Sequence[questions.MissingAnswer]) -> Callable[[int], int]:
+    places = causes = 0
+    for entry in found:
+        places += len(entry.placements)
+        causes += len(entry.because)
+    fixed = places * (RELATION_BYTES + _OFFSET_BYTES) + causes * CAUSE_BYTES
+    fixed += len(found) * OBJECT_BYTES
+    return lambda name: fixed + (places + causes + len(found)) * name
+
+
+def _placement(place: questions.Placement, ids: Sequence[str], numbered: Iterator[float]) -> Answer:
+    relation, object_, _, offset = place
+    entry: Answer = {"relation": relation, "object": ids[object_], "probability": next(numbered)}
+    if offset is not None:
+        mean = {"x": next(numbered), "y": next(numbered), "z": next(numbered)}
+        std = {"x": next(numbered), "y": next(numbered), "z": next(numbered)}
+        entry["offset"] = {"mean": mean, "std": std, "scenes": offset.scenes}
+    return entry

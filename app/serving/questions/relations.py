@@ -1,0 +1,93 @@
+"""How do these objects stand to each other?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from app import questions
+from app.questions.ranking import significant
+from app.scene.relations import canonicalise, opposite
+from app.serving.answers import RELATION_BYTES, Answer, envelope, require_size, rounded
+from app.serving.errors import Location, Reason
+from app.serving.reading import Faults, Reading
+from app.serving.request import Request
+from scene_client.schemas import RelationsRequest
+
+
+async def relations(request: Request, asked: RelationsRequest) -> Answer:
+    """See `scene_client.schemas.RelationsAnswer`."""
+    model, reading = request.read(asked)
+    found, disagreements = await request.ask(
+        model,
+        questions.relations,
+        reading.scene,
+        top_k=asked.top_k,
+        # A little lower: the rounded probability decides which relations are left out.
+        min_probability=asked.min_probability * (1 - 1e-5),
+        pairs=None if asked.pairs is None else _pairs(asked, reading),
+        include_opposites=asked.include_opposites,
+    )
+    require_size(_size(found, disagreements), reading, request.limits.answer_bytes, "top_k")
+    answer = envelope(asked, request.id, model.reference, reading)
+    ids = reading.ids
+    probabilities = significant([entry.probability for entry in found])
+    answer["relations"] = [
+        {
+            "subject": ids[x],
+            "relation": relation,
+            "object": ids[y],
+            "probability": probability,
+            "observed": observed,
+        }
+        for (x, relation, y, _, observed), probability in zip(found, probabilities, strict=True)
+        if probability >= asked.min_probability
+    ]
+    answer["disagreements"] = [_disagreement(entry, reading) for entry in disagreements]
+    return answer
+
+
+def _pairs(asked: RelationsRequest, reading: Reading) -> list[tuple[int, int]]:
+    faults = Faults()
+    names = reading.names
+    pairs: dict[tuple[int, int], None] = {}
+    for place, pair in enumerate(asked.pairs or ()):
+        location: Location = ("pairs", place)
+        if names.is_ignored(pair.subject) or names.is_ignored(pair.object):
+            continue
+        subject = names.find(pair.subject, (*location, "subject"), faults)
+        other = names.find(pair.object, (*location, "object"), faults)
+        if subject is None or other is None:
+            continue
+        if subject == other:
+            faults.add(Reason.INVALID, location, "a pair needs two objects")
+            continue
+        pairs[subject, other] = None
+    faults.raise_any()
+    return list(pairs)
+
+
+def _size(
+    found: Sequence[questions.RelationAnswer], disagreements: Sequence[questions.Disagreement]
+) -> Callable[[int], int]:
+    entries = len(found) + 2 * len(disagreements)
+    return lambda name: entries * (RELATION_BYTES + 2 * name)
+
+
+def _disagreement(entry: questions.Disagreement, reading: Reading) -> Answer:
+    """A disagreement from the end that the request spelled its relation from."""
+    subject, object_, observed, expected, probability, observed_probability = entry
+    triples = {canonicalise(subject, relation, object_) for relation in observed}
+    # Canonical triples of the pair from this end are flipped if the request spelled the other end.
+    from_here = {(triple[1] == subject) != (triple in reading.flipped) for triple in triples}
+    if from_here == {False} and reading.flipped:
+        subject, object_ = object_, subject
+        observed, expected = tuple(map(opposite, observed)), opposite(expected)
+    ids = reading.ids
+    return {
+        "subject": ids[subject],
+        "object": ids[object_],
+        "observed": list(observed),
+        "expected": expected,
+        "probability": rounded(probability),
+        "observed_probability": rounded(observed_probability),
+    }
