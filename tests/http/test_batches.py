@@ -8,6 +8,8 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.services import Replace, defect
+
 pytestmark = pytest.mark.anyio
 
 ENTRIES: list[Any] = [
@@ -66,22 +68,18 @@ async def test_a_batch_holds_1_to_256_scenes(client: httpx.AsyncClient, scenes: 
 
 @pytest.mark.parametrize("fault", ["raised", math.nan])
 async def test_a_defect_spoils_one_entry_only(
-    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch, fault: Any
+    client: httpx.AsyncClient, replace: Replace, fault: Any
 ) -> None:
-    from app.serving import questions
+    def fail_on_sofas(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
+        found = outliers(artifact, scene, **parameters)
+        if all(thing.label != "sofa" for thing in scene.objects):
+            return found
+        if fault == "raised":
+            defect()
+        first, *others = found.outliers
+        return found._replace(outliers=(first._replace(log_odds=fault), *others))
 
-    real = questions.questions.outliers
-
-    def fail_on_sofas(artifact: Any, scene: Any, **parameters: Any) -> Any:
-        if any(thing.label == "sofa" for thing in scene.objects):
-            if fault == "raised":
-                raise ZeroDivisionError("secret detail")
-            found = real(artifact, scene, **parameters)
-            first, *others = found.outliers
-            return found._replace(outliers=(first._replace(log_odds=fault), *others))
-        return real(artifact, scene, **parameters)
-
-    monkeypatch.setattr(questions.questions, "outliers", fail_on_sofas)
+    replace("outliers", fail_on_sofas)
     scenes = [{"objects": ["bed"]}, {"objects": ["sofa"]}, {"objects": ["lamp"]}]
     response = await client.post("/outliers/batch", json={"scenes": scenes})
     assert [entry["status"] for entry in response.json()["results"]] == [200, 500, 200]

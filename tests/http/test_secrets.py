@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.http.streams import hear, opened, talk
-from tests.services import ADMIN_KEY, LiveService, launch
+from tests.services import ADMIN_KEY, DEFECTIVE, LiveService, launch
 
 pytestmark = pytest.mark.system
 
@@ -21,21 +21,10 @@ API_KEY = "incorrect-zebra-capacitor-nail"
 # What a client sends by mistake is a secret too, if perhaps of another service.
 MISTAKEN = "mistaken-walrus-umbrella-fork"
 SECRETS = (ADMIN_KEY, API_KEY, MISTAKEN)
+ROOM = {"room_type": "bedroom"}
 
-# The service with a defect whose own words quote a key: `python -c` in place of `python -m app`.
-DEFECTIVE = f"""
-import sys
-from types import SimpleNamespace
-from app.__main__ import main
-from app.serving import questions
-
-def fail(*_, **__):
-    raise ValueError("no class for {API_KEY}, {ADMIN_KEY}")
-
-# Not in the module itself, or the models would be refused when they are warmed up.
-questions.questions = SimpleNamespace(**{{**vars(questions.questions), "missing": fail}})
-sys.exit(main())
-"""
+# A defect whose own words quote a key.
+QUOTING = DEFECTIVE.format(message=f"no class for {API_KEY}, {ADMIN_KEY}")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +35,7 @@ def defective(
     with launch(
         shared_store,
         tmp_path_factory.mktemp("defective") / "log",
-        program=("-c", DEFECTIVE),
+        program=("-c", QUOTING),
         SCENE_API_KEY=API_KEY,
         SCENE_LOG_LEVEL="debug",
     ) as service:
@@ -76,7 +65,7 @@ def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> N
                 ("POST", f"/relations?api_key={key}", {"objects": [key], "model": key}),
                 ("POST", "/relations", {"objects": ["bed"], key: key}),
                 ("POST", "/relations", {"objects": [{"id": key, "label": "bed"}]}),
-                ("POST", "/missing", {"objects": [{"id": key, "label": "bed"}]}),
+                ("POST", "/missing", {"objects": [{"id": key, "label": "bed"}], **ROOM}),
                 ("POST", "/models/refresh", None),
                 ("PUT", f"/models/aliases/{key}", {"model": key}),
                 ("DELETE", f"/relations?{key}", None),
@@ -125,7 +114,7 @@ def test_nothing_that_was_sent_or_set_is_in_the_log(defective: LiveService) -> N
 
     log = defective.stop()
     # It did tell of the defect, and of requests: there was something to find a key in.
-    assert "ValueError: no class for **********, **********" in log
+    assert "ZeroDivisionError: no class for **********, **********" in log
     assert "GET /health/live 200" in log
     for secret in SECRETS:
         assert secret not in log
