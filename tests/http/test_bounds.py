@@ -26,7 +26,7 @@ def hold(replace: Replace) -> Iterator[Callable[[], threading.Event]]:
 
     def slow(generate: Any, *args: Any, **parameters: Any) -> Any:
         release.wait(30)
-        return generate(*args, **parameters)
+        return generate(*args, **{**parameters, "count": 1, "steps": 1})
 
     def begin() -> threading.Event:
         replace("generate", slow)
