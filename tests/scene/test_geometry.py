@@ -186,13 +186,6 @@ def test_what_holds_of_a_pair(
     assert names(derive_relations(positions, sizes)) == (holds, observed)
 
 
-def test_things_without_a_position_are_not_observed() -> None:
-    found = derive_relations([[0, 0, 0], [NAN] * 3, [0, 0.5, 0]], np.full((3, 3), NAN))
-    assert not found.observed[:, 1].any()
-    assert not found.observed[:, :, 1].any()
-    assert names(found, 2, 0)[0] == {"left"}
-
-
 def test_a_scene_of_none_and_of_one() -> None:
     assert derive_relations([], []).holds.shape == (4, 0, 0)
     assert not derive_relations([[0, 0, 0]], [[1, 1, 1]]).observed.any()
