@@ -196,25 +196,6 @@ async def test_nobody_waits_past_the_deadline_for_a_turn(queue: WorkQueue) -> No
     assert (await ask(lambda: "fine", ENDLESS)).result == "fine"
 
 
-async def test_nobody_who_asks_waits_for_a_drawing(queue: WorkQueue) -> None:
-    release = threading.Event()
-    drawing = asyncio.ensure_future(drawn(queue, lambda: release.wait(30)))
-    # Only their answers let it end.
-    assert (await in_tick(queue, lambda: "cheap")).result == "cheap"
-    assert (await in_thread(queue, lambda: "costly")).result == "costly"
-    release.set()
-    assert (await drawing).result
-
-
-async def test_rows_are_bounded_and_given_back(queue: WorkQueue) -> None:
-    queue.take(7)
-    with pytest.raises(QueueFullError):
-        queue.take(2)
-    queue.take(1)
-    queue.give_back(8)
-    assert queue.rows == 0
-
-
 @pytest.mark.parametrize("ask", WAYS)
 async def test_work_whose_deadline_has_passed_is_never_begun(queue: WorkQueue, ask: Any) -> None:
     begun: list[int] = []
@@ -438,12 +419,6 @@ async def test_requests_of_one_moment_begin_a_few_in_a_tick_and_in_order() -> No
     assert max(steps) <= PACE
     # Without others a request begins at once.
     assert await enter(backlog, begun) == "begun"
-
-
-async def test_a_full_backlog_refuses() -> None:
-    backlog = Backlog(10)
-    outcomes = await asyncio.gather(*(enter(backlog, []) for _ in range(PACE + 10 + 5)))
-    assert outcomes == ["begun"] * (PACE + 10) + [FULL] * 5
 
 
 async def test_no_more_requests_begin_than_the_models_keep_up_with() -> None:
