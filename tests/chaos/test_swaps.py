@@ -90,10 +90,6 @@ def flipped(version: Path) -> None:
     weights.write_bytes(bytes(data))
 
 
-def without_manifest(version: Path) -> None:
-    (version / "manifest.json").unlink()
-
-
 def with_a_stranger(version: Path) -> None:
     (version / "notes.txt").write_text("not part of an artifact")
 
@@ -101,7 +97,6 @@ def with_a_stranger(version: Path) -> None:
 SPOILERS: tuple[Callable[[Path], None], ...] = (
     truncated,
     flipped,
-    without_manifest,
     with_a_stranger,
 )
 
