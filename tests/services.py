@@ -12,8 +12,9 @@ import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,25 @@ CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed"
 NAMED = {"allowed_hosts": ["service"]}
 """Settings of a service in process, which its clients call http://service."""
 
-Serve = Callable[..., AbstractAsyncContextManager[httpx.AsyncClient]]
+Replace = Callable[[str, Callable[..., Any]], None]
+
+DEFECTIVE = """
+import sys
+from app import questions
+from app.__main__ import main
+
+missing = questions.missing
+
+def fail(artifact, scene, **parameters):
+    # In no other scene, or the models would be refused when they are warmed up.
+    if scene.room_type is None:
+        return missing(artifact, scene, **parameters)
+    raise ZeroDivisionError({message!r})
+
+questions.missing = fail
+sys.exit(main())
+"""
+"""A program for `launch`: a service that cannot say what is missing in a room of a known type."""
 
 
 @asynccontextmanager
@@ -74,6 +93,28 @@ async def client(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.
 def admin() -> dict[str, str]:
     """The headers of an administrator."""
     return {"X-Admin-Key": ADMIN_KEY}
+
+
+@pytest.fixture
+def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
+    """Put a function in place of one of the four questions; the question is its first argument."""
+    from app import questions
+
+    def replace(name: str, function: Callable[..., Any]) -> None:
+        question = getattr(questions, name)
+
+        @wraps(question)
+        def replaced(*args: Any, **parameters: Any) -> Any:
+            return function(question, *args, **parameters)
+
+        monkeypatch.setattr(questions, name, replaced)
+
+    return replace
+
+
+def defect(*_: Any, **__: Any) -> Any:
+    """In place of a question."""
+    raise ZeroDivisionError("secret detail")
 
 
 @dataclass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import AsyncIterator, Awaitable, Callable
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,23 @@ from typing import Any
 import httpx
 import pytest
 
-from app.serving import answers
 from scene_client.schemas import MAX_BATCH
 from tests.http.stores import VOCABULARY
+from tests.http.test_problems import problem
 from tests.services import launch, serve
 
 pytestmark = pytest.mark.anyio
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 LIMIT = 16 * 2**20
+SMALL = 2**16
+
+
+@pytest.fixture(scope="module")
+async def limited(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.AsyncClient]:
+    """A client of a service whose answers are small."""
+    async with serve(shared_store, max_answer_bytes=SMALL) as client:
+        yield client
 
 
 def scene(objects: int, letter: str = "x", **parameters: Any) -> dict[str, Any]:
@@ -43,10 +52,10 @@ async def test_the_answer_to_a_batch_has_a_limit(client: httpx.AsyncClient) -> N
     results = answer.json()["results"]
     assert [entry["status"] for entry in results[:8]] == [200] * 8
     assert {entry["status"] for entry in results[16:]} == {422}
-    problem = results[-1]["problem"]
-    assert problem["type"] == "/problems/answer-too-large"
-    assert problem["errors"][0]["pointer"] == f"#/scenes/{MAX_BATCH - 1}/top_k"
-    assert "lower `top_k`" in problem["errors"][0]["message"]
+    last = results[-1]["problem"]
+    assert last["type"] == "/problems/answer-too-large"
+    assert last["errors"][0]["pointer"] == f"#/scenes/{MAX_BATCH - 1}/top_k"
+    assert "lower `top_k`" in last["errors"][0]["message"]
 
 
 async def test_a_batch_within_the_limit_is_answered_as_before(client: httpx.AsyncClient) -> None:
@@ -72,42 +81,58 @@ def crowd(objects: int, letter: str = "😀") -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("question", "body", "parameter"),
+    ("question", "letter", "options", "parameter"),
     [
-        ("relations", scene(256, "😀", **LARGEST), "top_k"),
-        ("missing", crowd(64), "top_k"),
-        ("outliers", scene(256, "😀"), "objects"),
-        ("generate", scene(64, count=64), "count"),
+        ("relations", "😀", LARGEST, "top_k"),
+        ("missing", "😀", {}, "top_k"),
+        ("outliers", "😀", {}, "objects"),
+        ("outliers", "x", {"frame_id": "f" * 256}, "objects"),
     ],
 )
+@pytest.mark.parametrize("model", ["home", "plain", "deep"])
 async def test_single_answers_have_the_same_limit(
-    shared_store: Path, question: str, body: dict[str, Any], parameter: str
+    limited: httpx.AsyncClient,
+    question: str,
+    letter: str,
+    options: dict[str, Any],
+    parameter: str,
+    model: str,
 ) -> None:
-    async with serve(shared_store, max_answer_bytes=2**16) as client:
-        answer = await client.post(f"/{question}", json=body)
-        assert answer.status_code == 422, len(answer.content)
-        problem = answer.json()
-        assert problem["type"] == "/problems/answer-too-large"
-        assert problem["errors"][0]["pointer"] == f"#/{parameter}"
-        assert len(answer.content) < 2**12
+    """Whatever it is made of: the largest scene that is answered has an answer within the limit."""
+
+    async def ask(objects: int) -> httpx.Response:
+        body = {**crowd(objects, letter), **options, "model": model}
+        return await limited.post(f"/{question}", json=body)
+
+    await check_the_largest(ask, 128, parameter)
 
 
-@pytest.mark.parametrize("question", ["relations", "missing", "outliers", "generate"])
-@pytest.mark.parametrize("body", [scene(40), crowd(24), {"objects": LABELS}])
-async def test_no_answer_is_larger_than_estimated(
-    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch, question: str, body: dict[str, Any]
+async def test_drawn_scenes_have_the_same_limit(limited: httpx.AsyncClient) -> None:
+    async def ask(count: int) -> httpx.Response:
+        body = {"objects": LABELS[:8], "count": count, "steps": 2, "seed": 0}
+        return await limited.post("/generate", json=body)
+
+    await check_the_largest(ask, 64, "count")
+
+
+async def check_the_largest(
+    ask: Callable[[int], Awaitable[httpx.Response]], refused: int, parameter: str
 ) -> None:
-    sizes: list[int] = []
-
-    def note(size: Any, reading: Any, *_: Any) -> None:
-        sizes.append(answers.estimated_size(size, reading, reading.longest_name()))
-
-    monkeypatch.setattr(answers, "require_size", note)
-    for variant in ("", "plain", "deep"):
-        asked = {**body, **({"model": variant} if variant else {}), "frame_id": "f" * 256}
-        answer = await client.post(f"/{question}", json=asked)
-        assert answer.status_code == 200, answer.text
-        assert len(answer.content) <= sizes.pop()
+    """Of a size that is answered has an answer within the limit, and not far below it."""
+    document = problem(await ask(refused), 422, "answer-too-large")
+    assert document["errors"][0]["pointer"] == f"#/{parameter}"
+    answered, largest = 1, await ask(1)
+    while refused - answered > 1:
+        middle = (answered + refused) // 2
+        answer = await ask(middle)
+        if answer.is_success:
+            answered, largest = middle, answer
+        else:
+            problem(answer, 422, "answer-too-large")
+            assert len(answer.content) < 2**12
+            refused = middle
+    assert largest.is_success
+    assert SMALL / 8 < len(largest.content) <= SMALL
 
 
 @pytest.mark.slow

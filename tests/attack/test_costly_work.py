@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,9 @@ import httpx
 import pytest
 from pydantic import ValidationError
 
-from app import questions
 from app.settings import Settings
 from tests.http.stores import VOCABULARY
-from tests.services import launch, serve
+from tests.services import Replace, launch, serve
 
 LABELS = [entry.label for entry in VOCABULARY.objects if not entry.structure]
 DEEP = {"objects": LABELS[:4], "model": "deep"}
@@ -27,18 +25,16 @@ HOME = {"objects": LABELS[:4]}
 
 
 @pytest.fixture
-def blocked(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], threading.Event]]:
+def blocked(replace: Replace) -> Iterator[Callable[[], threading.Event]]:
     """Let /outliers wait from now on until the event it returns is set, or for five seconds."""
     release = threading.Event()
-    original = questions.outliers
 
-    @wraps(original)
-    def outliers(*args: Any, **kwargs: Any) -> Any:
+    def slow(outliers: Any, *args: Any, **parameters: Any) -> Any:
         release.wait(5)
-        return original(*args, **kwargs)
+        return outliers(*args, **parameters)
 
     def block() -> threading.Event:
-        monkeypatch.setattr(questions, "outliers", outliers)
+        replace("outliers", slow)
         return release
 
     yield block

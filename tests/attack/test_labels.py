@@ -12,10 +12,12 @@ import pytest
 
 from app.scene.nearest import LONGEST
 from app.scene.vocabulary import Vocabulary
-from app.serving.reading import MAX_MAPPED, MAX_SUGGESTED
 from tests.http.stores import VOCABULARY
 
 pytestmark = pytest.mark.anyio
+
+# Labels of one request that are looked up: to suggest some like them, and to take them for others.
+MAX_SUGGESTED, MAX_MAPPED = 32, 256
 
 
 def words(count: int, length: int) -> list[str]:

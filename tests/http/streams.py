@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import httpx
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from tests.http.stores import VOCABULARY
@@ -61,6 +62,29 @@ def answered(message: dict[str, Any]) -> dict[str, Any]:
     assert "problems" not in message
     questions = message.keys() - {"type", "seq", "superseded"}
     return {name: {**message[name], "request_id": ""} for name in questions}
+
+
+def is_problem(message: dict[str, Any], status: int, slug: str, seq: int | None = None) -> None:
+    """Check a message for a problem."""
+    assert message["type"] == "problem", message
+    assert message.get("seq") == seq
+    is_document(message["problem"], status, slug)
+
+
+def is_document(document: dict[str, Any], status: int, slug: str) -> None:
+    """Check a problem in a message or a refusal."""
+    assert document["type"] == f"/problems/{slug}"
+    assert document["status"] == status
+    assert document["request_id"]
+
+
+def closed(stream: Any) -> tuple[int, str]:
+    """How a stream was closed; what was still sent is read."""
+    try:
+        while True:
+            stream.recv(timeout=30)
+    except ConnectionClosed as ended:
+        return (1006, "") if ended.rcvd is None else (ended.rcvd.code, ended.rcvd.reason)
 
 
 def updates(count: int, seed: int, *, poses: bool = True) -> Iterator[tuple[dict, dict]]:

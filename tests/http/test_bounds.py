@@ -13,26 +13,23 @@ from typing import Any
 import httpx
 import pytest
 
-from app import questions
-from app.serving.admission import WorkQueue
 from tests.http.test_problems import problem
-from tests.services import launch, serve
+from tests.services import Replace, launch, serve
 
 SCENE = {"objects": ["bed", "chair", "lamp"]}
 
 
 @pytest.fixture
-def hold(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], threading.Event]]:
+def hold(replace: Replace) -> Iterator[Callable[[], threading.Event]]:
     """From the call on, drawing waits for the event that it returns, in the worker thread."""
     release = threading.Event()
-    draw = questions.generate
 
-    def slow(*args: Any, **kwargs: Any) -> Any:
+    def slow(generate: Any, *args: Any, **parameters: Any) -> Any:
         release.wait(30)
-        return draw(*args, **kwargs)
+        return generate(*args, **{**parameters, "count": 1, "steps": 1})
 
     def begin() -> threading.Event:
-        monkeypatch.setattr(questions, "generate", slow)
+        replace("generate", slow)
         return release
 
     yield begin
@@ -115,8 +112,8 @@ async def test_batches_give_their_rows_back(shared_store: Path) -> None:
             answer = await client.post("/outliers/batch", json={"scenes": scenes})
             statuses = [entry["status"] for entry in answer.json()["results"]]
             assert statuses == [200, 404, 422, 422, 200]
-        models = client.app.state.runtime.models  # type: ignore[attr-defined]
-        assert {served.queue.rows for served in models.served.values()} == {0}
+        full = {"scenes": [SCENE] * 256}
+        assert (await client.post("/missing/batch", json=full)).status_code == 200
 
 
 @pytest.mark.anyio
@@ -145,17 +142,16 @@ async def test_nothing_is_told_to_wait_once_it_has_ended(
 
 @pytest.mark.anyio
 async def test_a_batch_stops_where_its_deadline_passes(
-    shared_store: Path, monkeypatch: pytest.MonkeyPatch
+    shared_store: Path, replace: Replace
 ) -> None:
     """Each entry that was not begun says so itself."""
-    run = WorkQueue.run
 
-    async def slow(self: WorkQueue, *args: Any, **kwargs: Any) -> Any:
-        await asyncio.sleep(0.05)
-        return await run(self, *args, **kwargs)
+    def slow(missing: Any, *args: Any, **parameters: Any) -> Any:
+        time.sleep(0.05)
+        return missing(*args, **parameters)
 
-    monkeypatch.setattr(WorkQueue, "run", slow)
     async with serve(shared_store) as client:
+        replace("missing", slow)
         answer = await client.post(
             "/missing/batch",
             json={"scenes": [SCENE] * 20},

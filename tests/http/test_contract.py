@@ -14,7 +14,9 @@ from tests.services import LiveService, launch
 
 pytestmark = pytest.mark.system
 
-api = documented(examples=5)
+# Batches differ in their scenes alone, whose forms are those of single requests; `make chaos` asks
+# all of them.
+api = documented(examples=5).exclude(path=["/relations/batch", "/outliers/batch"])
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ from typing import Any
 import httpx
 import pytest
 
-from app.serving import questions
-from tests.services import LiveService
+from tests.services import LiveService, Replace, defect
 
 pytestmark = pytest.mark.anyio
 
@@ -52,12 +51,9 @@ async def test_what_is_computed_is_kept_nowhere_and_is_no_page(
 
 
 async def test_a_defect_is_answered_with_the_same_headers(
-    client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
+    client: httpx.AsyncClient, replace: Replace
 ) -> None:
-    def fail(*_: Any, **__: Any) -> Any:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(questions.questions, "missing", fail)
+    replace("missing", defect)
     response = await client.post("/missing", json={"objects": ["bed"]})
     assert response.status_code == 500
     check(response)

@@ -188,22 +188,6 @@ async def test_behind_a_prefix_the_same_is_open(shared_store: Path) -> None:
             assert (await behind.get("/robot/models", headers=headers)).status_code == 200
 
 
-async def test_a_websocket_without_a_key_is_closed_before_it_opens(
-    guarded: httpx.AsyncClient,
-) -> None:
-    sent: list[dict[str, Any]] = []
-
-    async def receive() -> dict[str, Any]:
-        return {"type": "websocket.connect"}
-
-    async def send(message: Any) -> None:
-        sent.append(message)
-
-    scope = {"type": "websocket", "path": "/stream", "headers": [], "query_string": b""}
-    await guarded.app(scope, receive, send)  # type: ignore[attr-defined]
-    assert sent == [{"type": "websocket.close", "code": 1008}]
-
-
 # ------------------------------------------------------------------------------------ OpenAPI
 
 

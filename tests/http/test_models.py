@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
+import errno
 import gc
 import json
 import math
+import os
 import shutil
+import threading
 import weakref
 from pathlib import Path
 from typing import Any
@@ -14,10 +18,11 @@ from typing import Any
 import httpx
 import pytest
 
+from app.registry import Store, StoreError
 from app.scene.relations import CANONICAL
 from tests.http.stores import VOCABULARY, corrupt, publish
 from tests.http.test_problems import problem
-from tests.services import ADMIN_KEY, serve
+from tests.services import ADMIN_KEY, Replace, defect, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -117,9 +122,6 @@ async def test_unknown_models_are_not_found(client: httpx.AsyncClient, path: str
     problem(await client.get(path), 404, "model-not-found")
 
 
-# --------------------------------------------------------------------------------- admin key
-
-
 # ----------------------------------------------------------------------------------- refresh
 
 
@@ -178,18 +180,14 @@ async def test_broken_aliases_change_nothing(store: Path, admin: dict[str, str])
 
 
 async def test_a_version_that_cannot_answer_is_refused(
-    store: Path, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    store: Path, admin: dict[str, str], replace: Replace
 ) -> None:
-    from app.serving import warm_up
-
-    real = warm_up.questions.outliers
-
-    def fails(artifact: Any, scene: Any, **parameters: Any) -> Any:
+    def fails(outliers: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
         if artifact.manifest.version == "2.0.0":
-            raise RuntimeError("secret detail")
-        return real(artifact, scene, **parameters)
+            defect()
+        return outliers(artifact, scene, **parameters)
 
-    monkeypatch.setattr(warm_up.questions, "outliers", fails)
+    replace("outliers", fails)
     async with serve(store) as client:
         publish(store, "home", "2.0.0", seed=2, alias="default")
         response = await client.post("/models/refresh", headers=admin)
@@ -201,21 +199,15 @@ async def test_a_version_that_cannot_answer_is_refused(
 
 
 async def test_a_model_whose_answers_are_not_finite_is_refused(
-    store: Path, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    store: Path, admin: dict[str, str], replace: Replace
 ) -> None:
-    import dataclasses
-
-    from app.serving import warm_up
-
-    real = warm_up.questions.missing
-
-    def not_finite(artifact: Any, scene: Any, **parameters: Any) -> Any:
-        found = real(artifact, scene, **parameters)
+    def not_finite(missing: Any, artifact: Any, scene: Any, **parameters: Any) -> Any:
+        found = missing(artifact, scene, **parameters)
         if artifact.manifest.version != "2.0.0":
             return found
-        return tuple(dataclasses.replace(entry, log_odds=float("inf")) for entry in found)
+        return tuple(dataclasses.replace(entry, log_odds=math.inf) for entry in found)
 
-    monkeypatch.setattr(warm_up.questions, "missing", not_finite)
+    replace("missing", not_finite)
     async with serve(store) as client:
         publish(store, "home", "2.0.0", seed=2)
         problem(await client.post("/models/refresh", headers=admin), 409, "refresh-refused")
@@ -224,20 +216,16 @@ async def test_a_model_whose_answers_are_not_finite_is_refused(
 async def test_requests_are_answered_while_the_store_is_read(
     store: Path, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import threading
-
-    from app.serving import runtime
-
     started, go_on = threading.Event(), threading.Event()
-    real = runtime.load_model_set
+    load = Store.load
 
     def slow(*args: Any) -> Any:
         started.set()
         assert go_on.wait(30)
-        return real(*args)
+        return load(*args)
 
     async with serve(store) as client:
-        monkeypatch.setattr(runtime, "load_model_set", slow)
+        monkeypatch.setattr(Store, "load", slow)
         publish(store, "home", "2.0.0", seed=2, alias="default")
         refresh = asyncio.create_task(client.post("/models/refresh", headers=admin))
         assert await asyncio.to_thread(started.wait, 30)
@@ -249,27 +237,51 @@ async def test_requests_are_answered_while_the_store_is_read(
         assert await default(client) == "home@2.0.0"
 
 
-async def test_a_request_keeps_the_models_it_started_with(store: Path) -> None:
+async def test_a_request_keeps_the_models_it_started_with(
+    store: Path, admin: dict[str, str], replace: Replace
+) -> None:
+    started, go_on = threading.Event(), threading.Event()
+
+    def slow(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
+        if artifact.manifest.version == "1.0.0":
+            started.set()
+            assert go_on.wait(30)
+        return missing(artifact, *args, **parameters)
+
     async with serve(store) as client:
-        runtime = client.app.state.runtime  # type: ignore[attr-defined]
-        request = runtime.request(math.inf, "x")
+        replace("missing", slow)
+        batch = {"scenes": [{"objects": ["bed"]}] * 3}
+        asking = asyncio.create_task(client.post("/missing/batch", json=batch))
+        assert await asyncio.to_thread(started.wait, 30)
         publish(store, "home", "2.0.0", seed=2, alias="default")
-        await runtime.refresh("y")
-        assert request.models.resolve("default").reference.version == "1.0.0"
-        assert runtime.request(math.inf, "z").models.resolve("default").reference.version == "2.0.0"
+        assert (await client.post("/models/refresh", headers=admin)).status_code == 200
+        assert await default(client) == "home@2.0.0"
+        go_on.set()
+        results = (await asking).json()["results"]
+        assert [entry["result"]["model"]["version"] for entry in results] == ["1.0.0"] * 3
 
 
-async def test_replaced_models_are_freed(store: Path, admin: dict[str, str]) -> None:
+async def test_replaced_models_are_freed(
+    store: Path, admin: dict[str, str], replace: Replace
+) -> None:
+    asked: list[weakref.ref[Any]] = []
+
+    def note(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
+        asked.append(weakref.ref(artifact.weights))
+        return missing(artifact, *args, **parameters)
+
     async with serve(store) as client:
-        runtime = client.app.state.runtime  # type: ignore[attr-defined]
-        replaced = weakref.ref(runtime.models.resolve("deep").artifact.weights)
-        kept = weakref.ref(runtime.models.resolve("home").artifact.weights)
+        replace("missing", note)
+        for model in ("deep", "home"):
+            await client.post("/missing", json={"objects": ["bed"], "model": model})
         shutil.rmtree(store / "deep")
         await client.post("/models/refresh", headers=admin)
         await client.post("/models/refresh", headers=admin)
+        await client.post("/missing", json={"objects": ["bed"], "model": "home"})
+        replaced, kept, again = asked
         assert replaced() is None
         # An unchanged artifact is verified again and not loaded twice.
-        assert runtime.models.resolve("home").artifact.weights is kept()
+        assert again() is kept() is not None
         assert gc.get_freeze_count() > 0
 
 
@@ -364,9 +376,6 @@ async def test_a_version_gone_from_the_store_takes_no_alias(store: Path) -> None
 async def test_a_store_that_cannot_be_written_is_said_so(
     store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import errno
-    import os
-
     real = os.open
 
     def read_only(path: Any, flags: int, *args: Any, **keywords: Any) -> int:
@@ -386,11 +395,11 @@ async def test_a_store_that_cannot_be_written_is_said_so(
 async def test_a_store_in_use_asks_to_come_back(
     store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from app.registry.locking import exclusive
-    from app.serving import runtime
+    """How long a writer waits, and for whom: tests/registry."""
 
-    monkeypatch.setattr(runtime, "_LOCK_TIMEOUT", 0.05)
+    def busy(*_: Any, **__: Any) -> None:
+        raise StoreError("locked", "another process writes")
+
     async with serve(store) as client:
-        with exclusive(store / ".lock", timeout=0):
-            problem(await put(client, "default", model="plain@1.0.0"), 503, "store-busy")
-        assert (await put(client, "default", model="plain@1.0.0")).status_code == 200
+        monkeypatch.setattr(Store, "set_alias", busy)
+        problem(await put(client, "default", model="plain@1.0.0"), 503, "store-busy")

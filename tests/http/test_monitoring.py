@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-import logging
-import os
+import re
+import shutil
+import threading
+import time
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +16,34 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from app.api import examples
-from app.serving.logs import JSONFormatter
+from tests.conftest import REPOSITORY
 from tests.http.stores import corrupt, publish
+from tests.http.streams import opened, talk
 from tests.http.test_problems import problem
-from tests.services import serve
+from tests.services import LiveService, Replace, defect, serve
 
 pytestmark = pytest.mark.anyio
 
 SCENE = {"objects": ["bed", "lamp"]}
+OPERATIONS = (REPOSITORY / "docs" / "operations.md").read_text("utf-8")
+
+
+def documented_metrics() -> dict[str, tuple[str, set[str], str]]:
+    """The kind, labels and meaning of every metric, as the documentation lists them."""
+    rows = re.findall(r"^\| `(scene_\w+)` \| (\w+) \|(.*?)\| (.+?) \|$", OPERATIONS, re.MULTILINE)
+    listed = {
+        name: (kind, set(re.findall(r"`(\w+)`", labels)), meaning)
+        for name, kind, labels, meaning in rows
+    }
+    assert len(listed) == len(rows)
+    return listed
 
 
 async def told(client: httpx.AsyncClient) -> dict[tuple[str, ...], float]:
     """(name, label values in the order of their names) → value."""
     response = await client.get("/metrics")
     assert response.status_code == 200
+    assert response.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
     return {
         (sample.name, *(sample.labels[name] for name in sorted(sample.labels))): sample.value
         for family in text_string_to_metric_families(response.text)
@@ -43,25 +60,15 @@ def requests(found: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float
     }
 
 
-async def test_the_text_is_what_prometheus_reads(client: httpx.AsyncClient) -> None:
-    response = await client.get("/metrics")
-    assert response.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
-    families = {family.name: family for family in text_string_to_metric_families(response.text)}
-    assert {f"scene_{kind}_duration_seconds" for kind in ("request", "queue", "compute")} <= set(
-        families
-    )
-    assert all(family.documentation for family in families.values())
-
-
 async def test_the_documented_example_is_of_this_service(shared_store: Path) -> None:
-    example = examples.ANSWERS["show_metrics"]
-    assert isinstance(example, str)
     async with serve(shared_store) as client:
+        document = (await client.get("/openapi.json")).json()
+        (ok,) = document["paths"]["/metrics"]["get"]["responses"]["200"]["content"].values()
         await client.post("/missing", json=SCENE)
         await client.post("/missing", json={"objects": ["nosuchthing"]})
         text = (await client.get("/metrics")).text
     # Line by line the same, but for the counts.
-    for line in example.splitlines():
+    for line in ok["example"].splitlines():
         assert line.rpartition(" ")[0] in text if line[0] != "#" else line in text
 
 
@@ -111,18 +118,16 @@ async def test_addresses_and_methods_that_are_made_up_add_no_series(
         await client.post("/missing", json={**SCENE, "model": f"m{number}"})
 
     await ask(0)
+    await told(client)
     before = set(await told(client))
     for number in range(1, 20):
         await ask(number)
     assert set(await told(client)) == before
 
 
-async def test_a_defect_is_told(shared_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise RuntimeError("broken")
-
+async def test_a_defect_is_told(shared_store: Path, replace: Replace) -> None:
     async with serve(shared_store) as client:
-        monkeypatch.setattr("app.questions.missing", fail)
+        replace("missing", defect)
         problem(await client.post("/missing", json=SCENE), 500, "internal-error")
         found = await told(client)
     assert requests(found) == {("POST", "internal-error", "/missing"): 1}
@@ -190,34 +195,132 @@ async def test_metrics_can_be_switched_off(shared_store: Path) -> None:
         assert "/metrics" not in (await client.get("/openapi.json")).json()["paths"]
 
 
+# ------------------------------------------------------------------------------- the models
+
+
+async def test_models_are_told_with_every_alias(store: Path, admin: dict[str, str]) -> None:
+    async with serve(store) as client:
+        await client.put("/models/aliases/night", json={"model": "home"}, headers=admin)
+        infos = {key[1:] for key in await told(client) if key[0] == "scene_model_info"}
+        expected = set()
+        for alias, name, variant, version in (
+            ("default", "home", "triway", "1.0.0"),
+            ("candidate", "home", "triway", "1.1.0"),
+            ("night", "home", "triway", "1.1.0"),
+            ("", "plain", "rbm", "1.0.0"),
+            ("", "deep", "gbm", "0.1.0"),
+        ):
+            listed = (await client.get(f"/models/{name}/versions/{version}")).json()
+            expected.add((alias, listed["digest"], name, variant, version))
+    assert infos == expected
+
+
+async def test_series_of_a_removed_model_go_away_and_stay_away(
+    store: Path, admin: dict[str, str], replace: Replace
+) -> None:
+    started, go_on = threading.Event(), threading.Event()
+
+    def slow(missing: Any, artifact: Any, *args: Any, **parameters: Any) -> Any:
+        if artifact.manifest.name == "plain":
+            started.set()
+            assert go_on.wait(30)
+        return missing(artifact, *args, **parameters)
+
+    async with serve(store) as client:
+
+        async def names(of: str) -> set[str]:
+            return {key[0] for key in await told(client) if of in key}
+
+        async def ask(model: str, objects: int = 2) -> int:
+            body = {"objects": ["bed"] * objects, "model": model}
+            return (await client.post("/missing", json=body)).status_code
+
+        assert await ask("plain") == await ask("home@1.0.0") == 200
+        everything = await names("home")
+        assert {"scene_pending_rows", "scene_batch_rows_sum", "scene_model_info"} <= everything
+        assert await names("plain") == everything
+        # A request that still holds the old snapshot reports late.
+        replace("missing", slow)
+        late = asyncio.ensure_future(ask("plain", 9))  # unmeasured, so on a thread
+        assert await asyncio.to_thread(started.wait, 30)
+        shutil.rmtree(store / "plain")
+        await client.post("/models/refresh", headers=admin)
+        assert await names("plain") == set()
+        assert await names("home") == everything
+        go_on.set()
+        assert await late == 200
+        assert await names("plain") == set()
+        publish(store, "plain", "1.0.0", variant="rbm")
+        await client.post("/models/refresh", headers=admin)
+        assert await ask("plain") == 200
+        assert (await told(client))["scene_batch_rows_count", "plain", "missing", "1.0.0"] == 1
+
+
+async def test_a_process_without_a_default_is_not_ready(
+    tmp_path: Path, admin: dict[str, str]
+) -> None:
+    async with serve(tmp_path) as client:
+        found = await told(client)
+        assert found["scene_start_time_seconds",] > 1.7e9
+        assert found["scene_ready_time_seconds",] == 0
+        publish(tmp_path, "home", "1.0.0", alias="default")
+        times = []
+        for _ in range(2):
+            assert (await client.post("/models/refresh", headers=admin)).status_code == 200
+            times.append((await told(client))["scene_ready_time_seconds",])
+    assert times[0] == times[1] >= found["scene_start_time_seconds",]
+
+
+@pytest.mark.system
+def test_the_documentation_lists_every_metric(live: LiveService) -> None:
+    live.client.post("/missing/batch", json={"scenes": [SCENE]})
+    live.client.get("/models")
+    with opened(live) as stream:
+        talk(stream, "open")
+        talk(stream, "update", seq=1, objects=["bed"])
+    text = live.client.get("/metrics").text
+    told = {}
+    for family in text_string_to_metric_families(text):
+        name = family.name + ("_total" if family.type == "counter" else "")
+        labels = {label for sample in family.samples for label in sample.labels} - {"le"}
+        told[name] = (family.type, labels, family.documentation)
+    assert documented_metrics() == told
+    explained = re.findall(r"^\| (`.+?) \|", OPERATIONS, re.MULTILINE)
+    assert {label for _, labels, _ in told.values() for label in labels} <= set(
+        re.findall(r"`(\w+)`", " ".join(explained))
+    )
+
+
 # ------------------------------------------------------------------------------------ logs
 
 
-def lines(caplog: pytest.LogCaptureFixture) -> list[dict[str, Any]]:
-    return [
-        json.loads(JSONFormatter().format(record))
-        for record in caplog.records
-        if record.name == "app.access"
-    ]
+def line(service: LiveService, method: str, path: str, **arguments: Any) -> dict[str, Any]:
+    """What the log tells of one request, in one line."""
+    identity = uuid.uuid4().hex
+    headers = {"X-Request-Id": identity}
+    service.client.request(method, path, headers=headers, **arguments)
+    # It is written after the answer.
+    for _ in range(500):
+        lines = map(json.loads, service.log.read_text().splitlines())
+        if found := [entry for entry in lines if entry.get("request_id") == identity]:
+            break
+        time.sleep(0.01)
+    (entry,) = found
+    assert entry.pop("process") == service.process.pid
+    for name in ("time", "message", "request_id"):
+        assert entry.pop(name)
+    return entry
 
 
-async def test_a_request_is_one_line(
-    client: httpx.AsyncClient, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.INFO, "app.access"):
-        await client.post("/missing", json=SCENE, headers={"X-Request-Id": "one"})
-        await client.get("/nowhere?key=secret")
-    first, second = lines(caplog)
-    assert first.pop("latency_ms") >= first.pop("compute_ms") > 0
-    assert first.pop("queue_ms") >= 0
-    for line in (first, second):
-        assert line.pop("process") == os.getpid()
-        assert line.pop("time")
-        assert line.pop("message")
-    assert first == {
+@pytest.mark.system
+def test_a_request_is_one_line(live: LiveService) -> None:
+    """What clients make up reaches no line: test_secrets.py."""
+    answered = line(live, "POST", "/missing", json=SCENE)
+    assert answered.pop("latency_ms") >= answered.pop("compute_ms") > 0
+    assert answered.pop("queue_ms") >= 0
+    assert answered == {
         "level": "info",
         "logger": "app.access",
-        "request_id": "one",
         "method": "POST",
         "route": "/missing",
         "status": 200,
@@ -225,33 +328,22 @@ async def test_a_request_is_one_line(
         "model": "home",
         "version": "1.0.0",
     }
-    assert (second["route"], second["status"], second["outcome"]) == ("-", 404, "not-found")
-    assert not {"model", "version", "compute_ms", "queue_ms"} & set(second)
+    refused = line(live, "GET", "/nowhere?key=secret")
+    assert refused.pop("latency_ms") > 0
+    assert refused == {
+        "level": "info",
+        "logger": "app.access",
+        "method": "GET",
+        "route": "-",
+        "status": 404,
+        "outcome": "not-found",
+    }
 
 
-async def test_a_batch_over_several_models_names_none(
-    client: httpx.AsyncClient, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.INFO, "app.access"):
-        for models in (["default", "home@1.0.0"], ["default", "plain"]):
-            scenes = [{**SCENE, "model": model} for model in models]
-            await client.post("/missing/batch", json={"scenes": scenes})
-    same, several = lines(caplog)
-    assert same["model"] == "home"
-    assert "model" not in several
-    assert several["compute_ms"] > 0
-
-
-async def test_lines_hold_nothing_a_client_made_up(
-    client: httpx.AsyncClient, caplog: pytest.LogCaptureFixture
-) -> None:
-    marker = "XYZZY"
-    with caplog.at_level(logging.DEBUG):
-        await client.post(
-            f"/missing?a={marker}",
-            json={"objects": [marker], "model": marker},
-            headers={"X-Admin-Key": marker, "X-Request-Id": f"{marker} no id", "Cookie": marker},
-        )
-        await client.request(marker, f"/{marker}")
-    assert len(lines(caplog)) == 2
-    assert marker not in json.dumps(lines(caplog))
+@pytest.mark.system
+def test_a_batch_over_several_models_names_none(live: LiveService) -> None:
+    for models, named in ((["default", "home@1.0.0"], "home"), (["default", "plain"], None)):
+        scenes = [{**SCENE, "model": model} for model in models]
+        told = line(live, "POST", "/missing/batch", json={"scenes": scenes})
+        assert told.get("model") == named
+        assert told["compute_ms"] > 0

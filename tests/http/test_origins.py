@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
 
-from app.serving import questions
 from tests.http.test_problems import problem
-from tests.services import serve
+from tests.services import Replace, defect, serve
 
 pytestmark = pytest.mark.anyio
 
@@ -97,13 +95,8 @@ async def test_another_origin_reads_nothing(shared: httpx.AsyncClient) -> None:
     assert "Origin" in response.headers["vary"]
 
 
-async def test_errors_can_be_read_too(
-    shared: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: Any, **__: Any) -> Any:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(questions.questions, "missing", fail)
+async def test_errors_can_be_read_too(shared: httpx.AsyncClient, replace: Replace) -> None:
+    replace("missing", defect)
     origin = {"Origin": LISTED}
     media = origin | {"Content-Type": "application/json"}
     for status, response in (

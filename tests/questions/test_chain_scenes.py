@@ -10,12 +10,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
-from app.inference import chain_kernels, relation_kernels
-from app.inference.chains import Conditions, random_stream
 from app.questions import generate
 from app.scene import CANONICAL
 from tests.enumeration.small_machines import enumerate_joint
@@ -113,24 +110,6 @@ def test_the_score_is_that_of_the_tensors(artifact, name):
         assert drawn.log_score == pytest.approx(float(expected), rel=1e-4, abs=1e-3)
 
 
-def test_loops_are_compiled_once():
-    """For whatever is asked: compiling takes seconds, and no request may wait for it."""
-    artifact = larger_artifact("triway-wide", scale=0.3)
-    loops = [
-        loop
-        for module in (chain_kernels, relation_kernels)
-        for loop in vars(module).values()
-        if hasattr(loop, "signatures") and loop.__module__ == module.__name__
-    ]
-    assert len(loops) > 10
-    # Other tests of this process may have called a loop by itself, with arrays of their own.
-    before = [set(loop.signatures) for loop in loops]
-    for scene, options in SCENES.values():
-        generate(artifact, scene, count=2, seed=1, steps=2, **options)
-    new = [set(loop.signatures) - known for loop, known in zip(loops, before, strict=True)]
-    assert [loop.__name__ for loop, added in zip(loops, new, strict=True) if len(added) > 1] == []
-
-
 def test_confidence_leaves_an_object_in_every_scene(artifact):
     """As a clamp, presence is not soft."""
     scene = scene_of([0, 3])
@@ -142,14 +121,15 @@ def test_confidence_leaves_an_object_in_every_scene(artifact):
 
 def test_other_threads_go_on_while_a_chain_runs(artifact):
     """A chain of many sweeps in a thread; meanwhile this one wakes up again and again."""
-    nothing = np.zeros(0, dtype=np.int64)
-    bare = Conditions(nothing, nothing.astype(np.float32), None, nothing, nothing)
-    chains = artifact.scene_chains.given(bare)
-    chains.draw(1, random_stream(0, 0))
+
+    def draw(steps):
+        generate(artifact, scene_of([]), count=1, seed=0, steps=steps)
+
+    draw(1)
     begin = time.perf_counter()
-    chains.draw(20_000, random_stream(0, 0))
+    draw(20_000)
     sweeps = int(20_000 / (time.perf_counter() - begin))  # about a second
-    thread = threading.Thread(target=lambda: chains.draw(sweeps, random_stream(0, 0)))
+    thread = threading.Thread(target=draw, args=(sweeps,))
     thread.start()
     turns = 0
     while thread.is_alive():

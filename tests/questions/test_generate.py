@@ -142,13 +142,13 @@ def label_sets(answers):
 @pytest.mark.parametrize("name", DRAWN)
 @pytest.mark.parametrize("given_classes", [[], [0]])
 def test_objects_are_drawn_from_the_model(name, given_classes):
-    """Frequencies of every set of classes within five standard errors of the joint, over 1,024
+    """Frequencies of every set of classes within five standard errors of the joint, over 512
     chains; each of at most 8 sets fails by chance with probability 6e-7."""
     artifact, joint = drawable(name)
     where = (joint.v[:, given_classes] > 0).all(1)
     p = torch.where(where, joint.p, 0.0)
     p = p / p.sum()
-    drawn = label_sets(generate(artifact, scene_of(given_classes), count=1024, seed=0, steps=40))
+    drawn = label_sets(generate(artifact, scene_of(given_classes), count=512, seed=0, steps=40))
     codes = (joint.v.long() << torch.arange(3)).sum(1)
     for code in range(8):
         classes = frozenset(i for i in range(3) if code >> i & 1)
@@ -179,7 +179,7 @@ def test_relations_are_drawn_from_the_model(name):
     wins = logit[0] >= logit[1]
     forward = on[0] & (~on[1] | wins)
     backward = on[1] & (~on[0] | ~wins)
-    drawn = generate(artifact, scene_of([0, 1]), count=1024, seed=3, steps=40)
+    drawn = generate(artifact, scene_of([0, 1]), count=512, seed=3, steps=40)
     found = [
         {r for r in scene.relations if r[1] == "left" and {r[0], r[2]} == {"bed", "lamp"}}
         for scene in drawn

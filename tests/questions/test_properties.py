@@ -48,14 +48,31 @@ def permuted(scene, order):
 
 @few
 @given(names, scenes())
-def test_missing_proposes_all_unlisted_things(name, scene):
-    artifact = ARTIFACTS[name]
-    answers = missing(artifact, scene, top_k=len(LABELS))
-    present = {thing.label for thing in scene.objects}
-    assert {answer.label for answer in answers} == set(LABELS) - present - STRUCTURE
+def test_missing(name, scene):
+    """All unlisted things, best first; of each at most three placements, best first, never at
+    structure, each relation and anchor once; and the strongest three reasons, one object for its
+    class."""
+    answers = missing(ARTIFACTS[name], scene, top_k=len(LABELS))
+    first = {thing.label: k for k, thing in reversed(list(enumerate(scene.objects)))}
+    assert {answer.label for answer in answers} == set(LABELS) - first.keys() - STRUCTURE
     assert all(0 <= answer.probability <= 1 for answer in answers)
-    probabilities = [answer.probability for answer in answers]
-    assert probabilities == sorted(probabilities, reverse=True)
+    assert is_descending(answer.probability for answer in answers)
+    for answer in answers:
+        places = answer.placements
+        assert len(places) == (3 if first.keys() - STRUCTURE else 0)
+        assert is_descending(place.probability for place in places)
+        assert len({(place.relation, place.object) for place in places}) == len(places)
+        assert not {scene.objects[place.object].label for place in places} & STRUCTURE
+        objects = [because.object for because in answer.because]
+        assert len(objects) == len(set(objects)) == min(3, len(first))
+        assert set(objects) <= set(first.values())
+        assert is_descending(abs(because.log_odds_change) for because in answer.because)
+        assert all(math.isfinite(because.log_odds_change) for because in answer.because)
+
+
+def is_descending(values):
+    values = list(values)
+    return values == sorted(values, reverse=True)
 
 
 @few
@@ -69,36 +86,6 @@ def test_candidates_and_top_k_choose_but_do_not_rescale(name, scene, candidates,
     for answer in some:
         assert answer.probability == everything[answer.label].probability
         assert answer.log_odds == everything[answer.label].log_odds
-
-
-@few
-@given(names, scenes())
-def test_placements(name, scene):
-    """At most three, best first, never at structure, each relation and anchor once."""
-    artifact = ARTIFACTS[name]
-    things = [t for t in scene.objects if t.label not in STRUCTURE]
-    for answer in missing(artifact, scene, top_k=3):
-        places = answer.placements
-        assert len(places) == (3 if things else 0)
-        probabilities = [place.probability for place in places]
-        assert probabilities == sorted(probabilities, reverse=True)
-        assert len({(place.relation, place.object) for place in places}) == len(places)
-        for place in places:
-            assert scene.objects[place.object].label not in STRUCTURE
-
-
-@few
-@given(names, scenes())
-def test_reasons_for_what_is_missing(name, scene):
-    """The strongest three first; one object speaks for its class."""
-    first = {thing.label: k for k, thing in reversed(list(enumerate(scene.objects)))}
-    for answer in missing(ARTIFACTS[name], scene):
-        objects = [because.object for because in answer.because]
-        assert len(objects) == len(set(objects)) == min(3, len(first))
-        assert set(objects) <= set(first.values())
-        sizes = [abs(because.log_odds_change) for because in answer.because]
-        assert sizes == sorted(sizes, reverse=True)
-        assert all(map(math.isfinite, sizes))
 
 
 @few
@@ -139,10 +126,11 @@ def test_relations(name, scene):
 
 @few
 @given(names, scenes(minimum=2), st.floats(0, 1), st.integers(1, 30))
-def test_relations_are_cut_by_top_k_and_probability(name, scene, least, top_k):
-    everything, _ = relations(ARTIFACTS[name], scene, top_k=4096)
-    some, _ = relations(ARTIFACTS[name], scene, top_k=top_k, min_probability=least)
-    assert some == tuple(a for a in everything if a.probability >= least)[:top_k]
+def test_both_answers_are_cut_by_top_k_and_probability(name, scene, least, top_k):
+    everything = relations(ARTIFACTS[name], scene, top_k=4096)
+    some = relations(ARTIFACTS[name], scene, top_k=top_k, min_probability=least)
+    for cut, whole in zip(some, everything, strict=True):
+        assert cut == tuple(a for a in whole if a.probability >= least)[:top_k]
 
 
 @few
@@ -164,16 +152,7 @@ def test_disagreements(name, scene):
         assert 1 >= d.probability > d.observed_probability > 0
         assert not {subject, object_} & STRUCTURE
     assert len({frozenset((d.subject, d.object)) for d in found}) == len(found)
-    ratios = [d.probability / d.observed_probability for d in found]
-    assert ratios == sorted(ratios, reverse=True)
-
-
-@few
-@given(names, scenes(minimum=2), st.floats(0, 1), st.integers(1, 3))
-def test_disagreements_are_cut_by_top_k_and_probability(name, scene, least, top_k):
-    _, everything = relations(ARTIFACTS[name], scene, top_k=4096)
-    _, some = relations(ARTIFACTS[name], scene, top_k=top_k, min_probability=least)
-    assert some == tuple(d for d in everything if d.probability >= least)[:top_k]
+    assert is_descending(d.probability / d.observed_probability for d in found)
 
 
 def test_disagreements_of_chosen_pairs_either_way_round():
@@ -188,9 +167,11 @@ def test_disagreements_of_chosen_pairs_either_way_round():
     for d in everything:
         one = [(d.object, d.subject)]
         (alone,) = relations(artifact, scene, pairs=one, top_k=4096)[1]
-        # Products of one row and of many may round differently.
-        assert alone[:4] == d[:4]
-        assert alone[4:] == pytest.approx(d[4:], rel=1e-5)
+        # Sums in float32, in an order that depends on how many pairs are asked about.
+        assert alone.probability == pytest.approx(d.probability, rel=1e-5)
+        assert alone.observed_probability == pytest.approx(d.observed_probability, rel=1e-5)
+        same = {"probability": 0.0, "observed_probability": 0.0}
+        assert alone._replace(**same) == d._replace(**same)
     things = tuple(d for d in everything if 5 not in (d.subject, d.object))
     assert len(things) < len(everything)
     assert relations(artifact, scene, top_k=4096)[1] == things
@@ -274,8 +255,7 @@ def test_outliers(name, scene):
     assert len(unlikely) == len(scene.relations or ())
     stated = {(CANONICAL[a], i, j) for a, i, j in scene.relations or ()}
     assert {(a.relation, a.subject, a.object) for a in unlikely} == stated
-    probabilities = [answer.probability for answer in unlikely]
-    assert probabilities == sorted(probabilities, reverse=True)
+    assert is_descending(answer.probability for answer in unlikely)
 
 
 @few

@@ -55,21 +55,6 @@ def test_overlap_and_gap_agree_with_polygon_clipping(a: Rectangle, b: Rectangle)
     assert gap == pytest.approx(expected, abs=1e-5)
 
 
-def test_known_rectangles() -> None:
-    unit = (0.0, 0.0, 1.0, 1.0, 0.0)
-    assert measure(unit, unit) == (1.0, 0.0)
-    assert measure(unit, (3.0, 0.0, 1.0, 1.0, 0.0)) == (0.0, 2.0)
-    assert measure(unit, (4.0, 5.0, 1.0, 1.0, 0.0)) == (0.0, 5.0)
-    # A diamond inscribed in the square of side 2.
-    diamond = (0.0, 0.0, math.sqrt(2), math.sqrt(2), math.pi / 4)
-    assert measure((0.0, 0.0, 2.0, 2.0, 0.0), diamond) == pytest.approx((1.0, 0.0))
-    # Two crossing bars have no corner in each other.
-    assert measure((0.0, 0.0, 4.0, 0.1, 0.3), (0.0, 0.0, 4.0, 0.1, -0.5))[1] == 0.0
-    # Equal rectangles that share their turn meet edge on edge.
-    turned = (0.3, -0.2, 1.0, 2.0, 0.7)
-    assert measure(turned, turned) == pytest.approx((1.0, 0.0))
-
-
 def test_a_footprint_too_small_for_its_area_is_a_point() -> None:
     """1e-300 m squared underflows to 0: it lies wholly in what it touches, else not at all."""
     tiny, table = np.full((2, 2), 1e-300), np.ones((2, 2))

@@ -15,7 +15,8 @@ from app.scene.relations import CANONICAL
 from tests.scene.pose_rules import Box, UndecidedError, relate
 
 NAN = math.nan
-TABLE = ((2.0, 0.0, 0.4), (1.0, 1.6, 0.8))
+Thing = tuple[tuple[float, ...], tuple[float, ...]]
+TABLE: Thing = ((2.0, 0.0, 0.4), (1.0, 1.6, 0.8))
 
 
 @st.composite
@@ -37,11 +38,6 @@ def names(found: PoseRelations, i: int = 0, j: int = 1) -> tuple[set[str], set[s
         {name for a, name in enumerate(CANONICAL) if found.holds[a, i, j]},
         {name for a, name in enumerate(CANONICAL) if found.observed[a, i, j]},
     )
-
-
-def pair(first: tuple, second: tuple, **options: bool) -> PoseRelations:
-    positions, sizes = zip(first, second, strict=True)
-    return derive_relations(positions, sizes, **options)
 
 
 def compare(found: PoseRelations, boxes: list[Box], *, horizontal: bool = True) -> Counter[str]:
@@ -78,7 +74,7 @@ def test_every_pair_obeys_the_rules(
 def test_every_pair_of_a_drawn_room_obeys_the_rules(n: int, turned: bool) -> None:
     rng = np.random.default_rng(n)
     seen: Counter[str] = Counter()
-    for _ in range(900 // n):
+    for _ in range(360 // n):
         positions = rng.uniform(-2, 2, (n, 3)) * [1, 1, 0.3]
         sizes, yaws = rng.uniform(0.05, 1.5, (n, 3)), np.zeros(n)
         if turned:
@@ -134,80 +130,60 @@ def _turn(point: np.ndarray, yaw: float) -> np.ndarray:
     return np.array([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1], point[2]])
 
 
-@pytest.mark.parametrize(
-    ("bottom", "holds"),
-    [
-        (0.74, {"front"}),  # 6 cm into the table: no support, the cup is nearer
-        (0.76, {"on-top"}),
-        (0.80, {"on-top"}),
-        (0.84, {"on-top"}),
-        (0.86, {"above"}),
-        (3.00, {"above"}),
-    ],
-)
-def test_vertical_relations_by_the_gap(bottom: float, holds: set[str]) -> None:
-    cup = ((1.7, 0.1, bottom + 0.05), (0.1, 0.1, 0.1))
-    found = pair(cup, TABLE)
-    assert names(found) == (holds, set(CANONICAL))
-    assert names(found, 1, 0)[0] == set()
+def cup(bottom: float) -> Thing:
+    """Near the middle of the table, a little nearer to the viewer."""
+    return (1.7, 0.1, bottom + 0.05), (0.1, 0.1, 0.1)
 
 
-@pytest.mark.parametrize(("y", "holds"), [(0.84, {"on-top"}), (0.86, {"left"})])
-def test_footprints_must_overlap_by_30_percent_of_the_smaller(y: float, holds: set[str]) -> None:
-    # A box 20 cm wide on a table whose edge is at 80 cm: 30 % stand on it at y = 84 cm.
-    assert names(pair(((2.0, y, 0.9), (0.2, 0.2, 0.2)), TABLE))[0] == holds
+def box(x: float, y: float, z: float, *size: float) -> Thing:
+    return (x, y, z), size or (0.05, 0.05, 0.5)
+
+
+UNSIZED = (NAN, NAN, NAN)
+CUBE = (1.0, 1.0, 1.0)
+SHEET = (0.2, 0.3, 0.01)
+ALL, HORIZONTAL, NOTHING = set(CANONICAL), {"left", "front"}, set[str]()
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "holds"),
+    ("subject", "anchor", "holds", "observed"),
     [
-        (2.0, 0.3, {"left"}),
-        (1.7, 0.0, {"front"}),
-        (1.8, 0.2, {"left"}),  # equal offsets count as sideways
-        (2.09, 0.09, set()),
-        (2.09, 0.11, {"left"}),
-        (2.3, 0.0, set()),
-        (2.0, -0.3, set()),
+        # By the gap: 6 cm into the table there is no support, and the cup is nearer.
+        (cup(0.74), TABLE, {"front"}, ALL),
+        (cup(0.76), TABLE, {"on-top"}, ALL),
+        (cup(0.84), TABLE, {"on-top"}, ALL),
+        (cup(0.86), TABLE, {"above"}, ALL),
+        (cup(3.00), TABLE, {"above"}, ALL),
+        (TABLE, cup(0.76), NOTHING, ALL),
+        # 30 % of a box 20 cm wide stand on a table whose edge is at 80 cm, at y = 84 cm.
+        (box(2.0, 0.84, 0.9, 0.2, 0.2, 0.2), TABLE, {"on-top"}, ALL),
+        (box(2.0, 0.86, 0.9, 0.2, 0.2, 0.2), TABLE, {"left"}, ALL),
+        # By the larger offset; equal ones count as sideways, and those under 10 cm not at all.
+        (box(2.0, 0.3, 0.5), box(2.0, 0.0, 0.5), {"left"}, ALL),
+        (box(1.7, 0.0, 0.5), box(2.0, 0.0, 0.5), {"front"}, ALL),
+        (box(1.8, 0.2, 0.5), box(2.0, 0.0, 0.5), {"left"}, ALL),
+        (box(2.09, 0.09, 0.5), box(2.0, 0.0, 0.5), NOTHING, ALL),
+        (box(2.09, 0.11, 0.5), box(2.0, 0.0, 0.5), {"left"}, ALL),
+        (box(2.3, 0.0, 0.5), box(2.0, 0.0, 0.5), NOTHING, ALL),
+        (box(2.0, -0.3, 0.5), box(2.0, 0.0, 0.5), NOTHING, ALL),
+        # Neighbours by the gap between footprints.
+        (box(0.0, 0.0, 0.5, *CUBE), box(1.99, 0.0, 0.5, *CUBE), {"front"}, ALL),
+        (box(0.0, 0.0, 0.5, *CUBE), box(2.01, 0.0, 0.5, *CUBE), NOTHING, NOTHING),
+        # Without sizes by centres, however much the heights differ, and nothing vertical.
+        (box(0.0, 1.49, 3.0, *UNSIZED), box(0.0, 0.0, 0.0, *CUBE), {"left"}, HORIZONTAL),
+        (box(0.0, 1.49, 3.0, 1.0, NAN, 1.0), box(0.0, 0.0, 0.0, *CUBE), {"left"}, HORIZONTAL),
+        (box(0.0, 1.51, 3.0, *UNSIZED), box(0.0, 0.0, 0.0, *CUBE), NOTHING, NOTHING),
+        # Thin things lie on each other one way.
+        (box(0.0, 0.0, 0.82, *SHEET), box(0.0, 0.0, 0.81, *SHEET), {"on-top"}, ALL),
+        (box(0.0, 0.0, 0.81, *SHEET), box(0.0, 0.0, 0.82, *SHEET), NOTHING, ALL),
+        (box(0.0, 0.0, 0.8, *SHEET), box(0.0, 0.05, 0.8, *SHEET), NOTHING, ALL),
     ],
 )
-def test_horizontal_relations_by_the_larger_offset(x: float, y: float, holds: set[str]) -> None:
-    small = (0.05, 0.05, 0.5)
-    found = pair(((x, y, 0.5), small), ((2.0, 0.0, 0.5), small))
-    assert names(found) == (holds, set(CANONICAL))
-
-
-@pytest.mark.parametrize(("x", "observed"), [(1.99, True), (2.01, False)])
-def test_neighbours_by_the_gap_between_footprints(x: float, observed: bool) -> None:
-    cube = (1.0, 1.0, 1.0)
-    found = pair(((x, 0.0, 0.5), cube), ((0.0, 0.0, 0.5), cube))
-    assert names(found, 1, 0) == (({"front"}, set(CANONICAL)) if observed else (set(), set()))
-
-
-@pytest.mark.parametrize("sizes", [(NAN, NAN, NAN), (1.0, NAN, 1.0)])
-@pytest.mark.parametrize(("y", "observed"), [(1.49, True), (1.51, False)])
-def test_without_sizes_neighbours_by_centres_and_nothing_vertical(
-    sizes: tuple[float, float, float], y: float, observed: bool
+def test_what_holds_of_a_pair(
+    subject: Thing, anchor: Thing, holds: set[str], observed: set[str]
 ) -> None:
-    # The heights differ by far more than 1.5 m: only the horizontal distance counts.
-    found = pair(((0.0, y, 3.0), sizes), ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
-    assert names(found) == (({"left"}, {"left", "front"}) if observed else (set(), set()))
-
-
-def test_things_without_a_position_are_not_observed() -> None:
-    found = derive_relations([[0, 0, 0], [NAN] * 3, [0, 0.5, 0]], np.full((3, 3), NAN))
-    assert not found.observed[:, 1].any()
-    assert not found.observed[:, :, 1].any()
-    assert names(found, 2, 0)[0] == {"left"}
-
-
-def test_thin_things_lie_on_each_other_one_way() -> None:
-    sheet = (0.2, 0.3, 0.01)
-    found = pair(((0.0, 0.0, 0.82), sheet), ((0.0, 0.0, 0.81), sheet))
-    assert names(found)[0] == {"on-top"}
-    assert names(found, 1, 0)[0] == set()
-    level = pair(((0.0, 0.0, 0.8), sheet), ((0.0, 0.05, 0.8), sheet))
-    assert not level.holds.any()
-    assert level.observed[:, 0, 1].all()
+    positions, sizes = zip(subject, anchor, strict=True)
+    assert names(derive_relations(positions, sizes)) == (holds, observed)
 
 
 def test_a_scene_of_none_and_of_one() -> None:

@@ -73,22 +73,6 @@ def test_typical_sizes_take_the_place_of_unknown_ones() -> None:
     assert observe(Scene((DESK, stranger)), typical_sizes=sizes).relations == without.relations
 
 
-def test_in_the_map_without_a_viewpoint_only_heights_count() -> None:
-    scene = Scene((DESK, MONITOR, CHAIR))
-    blind = observe(scene, frame_id="map")
-    assert blind.relations == ((ON_TOP, 1, 0),)
-    assert blind.poses is not None
-    assert not blind.poses.observed[[LEFT, FRONT]].any()
-    placed = observe(scene, frame_id="map", viewpoint=Viewpoint(2.0, 4.0, -math.pi / 2))
-    assert set(placed.relations or ()) == {(ON_TOP, 1, 0), (LEFT, 0, 2), (LEFT, 1, 2)} or set(
-        placed.relations or ()
-    ) == {(ON_TOP, 1, 0), (LEFT, 2, 0), (LEFT, 2, 1)}
-    # Facing -y, the right hand points to -x: the chair (smaller x) stands on the right.
-    assert (LEFT, 0, 2) in (placed.relations or ())
-    assert placed.objects[0].position == pytest.approx((4.0, 0.0, 0.4))
-    assert observe(scene, frame_id="base_link").relations == observe(scene).relations
-
-
 def test_given_relations_are_not_overruled() -> None:
     scene = Scene((DESK, MONITOR), relations=())
     assert observe(scene) is scene
