@@ -43,7 +43,7 @@ from training.cases import (
     told_pairs,
 )
 from training.datasets import EncodedScene
-from training.datasets.meanings import meaning_of
+from training.datasets.sources import meaning_of
 from training.evaluation.alarms import kept_in_each_source
 from training.oracle.units import NO_UNIT
 from training.trainer import subset

@@ -20,13 +20,14 @@ from app.registry import (
 )
 from app.scene import Vocabulary
 from training.calibrate import calibrate
+from training.config import DataConfig
+from training.datasets.sources import SOURCES
 from training.draft import as_stored, draft_artifact
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
 from training.offsets import fit_offsets
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
-from training.terms import TERMS, terms_of
 from training.trainer import TrainingData
 
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
@@ -139,16 +140,19 @@ def _training(run: FinishedRun, measured: tuple[FinishedRun, SplitScenes] | None
 
 def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
     """What the model was trained on, with digests and terms."""
-    return tuple(
-        DataSource(
-            source=source,
-            scenes=scenes.counts[source],
-            digest=scenes.digests[source],
-            terms=terms_of(source, scenes.data).words,
-            research_only=terms_of(source, scenes.data).research_only,
+    sources = []
+    for source, count in scenes.counts.items():
+        words, research_only = terms_of(source, scenes.data)
+        sources.append(
+            DataSource(
+                source=source,
+                scenes=count,
+                digest=scenes.digests[source],
+                terms=words,
+                research_only=research_only,
+            )
         )
-        for source in scenes.counts
-    )
+    return tuple(sources)
 
 
 def metrics(rows: list[Row]) -> tuple[Metric, ...]:
@@ -167,14 +171,23 @@ def metrics(rows: list[Row]) -> tuple[Metric, ...]:
     )
 
 
+def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
+    """Terms of use in words, and whether they allow research only.
+
+    Those of a known source, or those that the configuration states for the user's own files.
+    """
+    if source in SOURCES and source in data.sources:
+        return SOURCES[source].terms, SOURCES[source].research_only
+    words = data.terms or "scenes of the user's own, whose terms were not stated"
+    return words, data.research_only
+
+
 def terms(scenes: SplitScenes) -> str:
     """One sentence on what the weights may be used for."""
     every = {source: terms_of(source, scenes.data) for source in scenes.counts}
-    research = [source for source, found in every.items() if found.research_only]
-    if research:
+    if research := [source for source, (_, research_only) in every.items() if research_only]:
         return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."
-    own = {source: found.words for source, found in every.items() if source not in TERMS}
-    if own:
+    if own := {source: words for source, (words, _) in every.items() if source not in SOURCES}:
         return " ".join(
             f"Trained on {source}: {words.rstrip('.')}." for source, words in own.items()
         )

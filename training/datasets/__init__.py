@@ -1,7 +1,6 @@
 """Scenes from files and from the room generator, and what a model sees of them."""
 
 from training.datasets.encoding import EncodedScene, annotated_classes, encode
-from training.datasets.meanings import MEANINGS, Meaning, meaning_of
 from training.datasets.names import Names, curated_names
 from training.datasets.readers import READERS, Reader, read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
@@ -21,13 +20,11 @@ from training.datasets.vocabulary import (
 
 __all__ = [
     "FRACTIONS",
-    "MEANINGS",
     "READERS",
     "AnnotatedObject",
     "AnnotatedScene",
     "DatasetError",
     "EncodedScene",
-    "Meaning",
     "Names",
     "Reader",
     "annotated_classes",
@@ -37,7 +34,6 @@ __all__ = [
     "encode",
     "generate_rooms",
     "indoor_vocabulary",
-    "meaning_of",
     "read_scenes",
     "read_vocabulary",
     "rooms_vocabulary",

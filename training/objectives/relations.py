@@ -2,7 +2,7 @@
 
     - sum over scenes and known units of log p(r_e | v, E[h1 | v]),   logit_e = ℓ_e + δ[source, a]
 
-A unit is known where it holds or is known not to (`training.datasets.meanings`); all others drop
+A unit is known where it holds or is known not to (`training.datasets.sources`); all others drop
 out. People mention what is worth mentioning, and a procedural room lists all there is: so each
 source has an offset δ of its own for each relation. Offsets are learned and left out when serving.
 
