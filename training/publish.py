@@ -6,8 +6,12 @@ import importlib.metadata
 import json
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
+import torch
+
+from app.inference.posterior import ClosedForm
 from app.registry import (
     Artifact,
     Calibration,
@@ -22,10 +26,12 @@ from app.scene import Vocabulary
 from training.calibrate import calibrate
 from training.config import DataConfig
 from training.datasets.sources import SOURCES
-from training.draft import as_stored, draft_artifact
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
+from training.machines import BoltzmannMachine
+from training.machines.arrays import weights_of
 from training.offsets import fit_offsets
+from training.oracle.drawn import DrawnPosterior
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
 from training.trainer import TrainingData
@@ -117,6 +123,35 @@ def calibrated_draft(
         chosen,
     )
     return draft_artifact(machine, vocabulary, calibration, offsets)
+
+
+@torch.no_grad()
+def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
+    """The machine, its matrices rounded to half precision in place, as the store keeps them."""
+    for parameter in machine.parameters():
+        if parameter.dim() > 1:
+            parameter.copy_(parameter.half().float())
+    return machine.requires_grad_(False).eval()
+
+
+def draft_artifact(
+    machine: BoltzmannMachine,
+    vocabulary: Vocabulary,
+    calibration: Calibration | None = None,
+    offsets: Offsets | None = None,
+) -> Artifact:
+    """An artifact in memory alone, with the neutral calibration unless one is given."""
+    return Artifact(
+        manifest=None,  # type: ignore[arg-type]  # nothing that answers a question looks at it
+        weights=weights_of(machine),
+        vocabulary=vocabulary,
+        calibration=calibration or Calibration.neutral(machine.spec.A),
+        digest="",
+        card="",
+        path=Path(),
+        offsets=offsets,
+        oracle=None if ClosedForm.fits(weights_of(machine)) else DrawnPosterior,
+    )
 
 
 def _measure(artifact: Artifact, data: TrainingData, progress: Callable[[str], None]) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Fantasies as bits, and chains that start at those which suit their evidence."""
+"""ChainSamples as bits, and chains that start at those which suit their evidence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from training.machines import MachineSpec, build
-from training.machines.fantasies import Fantasies, pack_scenes, unpack_scenes, words
+from training.machines.chain_samples import ChainSamples, pack_scenes, unpack_scenes, words
 from training.machines.gibbs import FREE, Clamp, initial_state
 
 V = 35
@@ -45,7 +45,7 @@ def machine_of(N=6, H2=0, form="local", seed=0):
 
 
 def start_chains(machine, given, generator, clamp=FREE):
-    return Fantasies(machine).start(given, generator, clamp)
+    return ChainSamples(machine).start(given, generator, clamp)
 
 
 def evidence(*classes, chains=CHAINS):
@@ -110,7 +110,7 @@ def test_a_room_type_that_nobody_dreamt_of_takes_any_fantasy():
     machine = machine_of()
     machine.fantasy_rooms.fill_(0)
     clamp = Clamp(room=torch.full((200,), 1))
-    fantasies = Fantasies(machine)
+    fantasies = ChainSamples(machine)
     plain = fantasies.log_weight(evidence(3, chains=200))
     weight = fantasies.log_weight(evidence(3, chains=200), clamp)
     assert torch.allclose(weight - plain, (fantasies.h1 @ machine.Q[1]).expand(200, -1))

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from training.machines.presence import presence_product
+from training.machines.gibbs import presence_product
 
 
 @given(

@@ -13,7 +13,7 @@ from tests.training.evaluation.scenes import scene, tensors
 from training import objects
 from training.config import ObjectsConfig
 from training.machines import MachineSpec, build
-from training.machines.fantasies import unpack_scenes
+from training.machines.chain_samples import unpack_scenes
 from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples
 
 V = 4

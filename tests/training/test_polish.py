@@ -11,9 +11,9 @@ from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
 from tests.training.test_trainer import small_config
 from training.config import PolishConfig, with_settings
 from training.machines import MachineSpec, build
-from training.machines.fantasies import unpack_scenes
+from training.machines.chain_samples import unpack_scenes
+from training.objects import fine_tune as polish
 from training.pipeline import prepare
-from training.polish import polish
 from training.trainer import Trainer
 
 DATA = tensors(random_scenes(20), WIDE)
