@@ -203,12 +203,12 @@ CONDITIONS = {
     "relations": conditions([3, 17, 30], [(0, 0, 1, 1), (1, 1, 2, 1), (2, 2, 0, 0), (3, 0, 2, 1)]),
     "context": conditions([5], held=[2, 44]),
     "room": conditions([5], room=1),
-    "room without a fantasy": conditions([5], room=2),
+    "room without a sample": conditions([5], room=2),
 }
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
-def test_fantasies_are_weighed_as_the_tensors_weigh_them(wide, name):
+def test_samples_are_weighed_as_the_tensors_weigh_them(wide, name):
     condition, chains = CONDITIONS[name], SceneChains(weights_of(wide))
     mask, clamp = torch_clamp(wide, 1, condition)
     expected = ChainSamples(wide).log_weight(mask.float().unsqueeze(0), clamp).softmax(1)[0]
