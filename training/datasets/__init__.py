@@ -2,7 +2,7 @@
 
 from training.datasets.encoding import EncodedScene, annotated_classes, encode
 from training.datasets.names import Names, curated_names
-from training.datasets.readers import READERS, Reader, read_scenes
+from training.datasets.readers import READERS, read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.rooms import generate_rooms, rooms_vocabulary
 from training.datasets.shuffling import shuffle_objects
@@ -26,7 +26,6 @@ __all__ = [
     "DatasetError",
     "EncodedScene",
     "Names",
-    "Reader",
     "annotated_classes",
     "build_vocabulary",
     "coverage",
