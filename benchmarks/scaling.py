@@ -27,7 +27,7 @@ from benchmarks.report import Fact, Result
 from benchmarks.timing import interleave
 from benchmarks.yardsticks import object_machine, presence, random_scenes
 from training.machines import BoltzmannMachine, MachineSpec, Triway
-from training.machines.fantasies import pack_scenes
+from training.machines.chain_samples import pack_scenes
 
 CLASSES = (417, 2_000, 10_000)
 OBJECTS, SCENES = 12, 8

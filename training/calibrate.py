@@ -32,7 +32,7 @@ from app.questions.posterior import posterior
 from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
 from app.scene import CANONICAL
 from training.batches import SceneTensors
-from training.calibrate_objects import ALARMS, calibrate_objects
+from training.calibrate_objects import ALARMS, calibrate_objects, recalibrated
 from training.cases import (
     Triple,
     altered_case,
@@ -43,7 +43,7 @@ from training.cases import (
     told_pairs,
 )
 from training.datasets import EncodedScene
-from training.datasets.meanings import meaning_of
+from training.datasets.sources import meaning_of
 from training.evaluation.alarms import kept_in_each_source
 from training.oracle.units import NO_UNIT
 from training.trainer import subset
@@ -87,25 +87,25 @@ def calibrate(
         chosen: see `calibrate_objects`.
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
-    calibration = calibrate_objects(artifact, scenes, train, structure, seed, chosen)
-    artifact = replace(artifact, calibration=calibration)
+    objects = calibrate_objects(artifact, scenes, train, structure, seed, chosen)
+    artifact = replace(artifact, calibration=objects)
     generator = torch.Generator().manual_seed(seed)
     pick = torch.randperm(len(scenes), generator=generator)
     annotated = [k for k in pick.tolist() if scenes.scenes[k].evidence.holds.any()]
     count = _SCENES if artifact.oracle is None else _SCENES_OF_DRAWS
     related = subset(scenes, torch.tensor(annotated[:count], dtype=torch.int64)).scenes
     if not len(related):
-        return calibration
+        return objects
     alone = fit_relations(artifact, related)
-    calibration = calibration.model_copy(
-        update={
-            "relation": alone,
-            **fit_placements(artifact, related, seed),
-            "relation_given": fit_given(artifact, related, alone, seed),
-        }
-    )
     entry, limits = fit_misplaced(artifact, related, seed)
-    return calibration.model_copy(update={"misplaced": entry, "misplaced_thresholds": limits})
+    return recalibrated(
+        artifact,
+        relation=alone,
+        **fit_placements(artifact, related, seed),
+        relation_given=fit_given(artifact, related, alone, seed),
+        misplaced=entry,
+        misplaced_thresholds=limits,
+    ).calibration
 
 
 def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[PairSlope, ...]:

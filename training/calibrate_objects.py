@@ -116,20 +116,23 @@ def calibrate_objects(
     every = validation.complete if bool(validation.complete.any()) else ~validation.complete
     every_scene = subset(validation, every.nonzero().squeeze(1))
     learnt = complete_scenes(train, seed)
-    calibration = artifact.calibration.model_copy(
-        update={"popularity": tuple(np.round(popularity(train), 4).tolist())}
-    )
-    calibration = calibration.model_copy(
-        update=fit_coverage(artifact, every_scene, structure, seed, chosen)
-    )
-    artifact = replace(artifact, calibration=calibration)
+    popular = tuple(np.round(popularity(train), 4).tolist())
+    artifact = recalibrated(artifact, popularity=popular)
+    coverage = fit_coverage(artifact, every_scene, structure, seed, chosen)
+    artifact = recalibrated(artifact, **coverage)
     weights = chosen.evidence if chosen else fit_evidence(artifact, validation, structure, seed)
-    calibration = calibration.model_copy(update={"evidence": weights})
-    artifact = replace(artifact, calibration=calibration)
-    update = fit_outliers(artifact, scenes, learnt, structure, seed, chosen)
-    update |= {"smallest": smallest_scenes(learnt, structure, artifact.spec.C)}
-    update |= {"room_fit": room_limits(artifact, learnt)}
-    return calibration.model_copy(update=update)
+    artifact = recalibrated(artifact, evidence=weights)
+    return recalibrated(
+        artifact,
+        **fit_outliers(artifact, scenes, learnt, structure, seed, chosen),
+        smallest=smallest_scenes(learnt, structure, artifact.spec.C),
+        room_fit=room_limits(artifact, learnt),
+    ).calibration
+
+
+def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
+    """The artifact with some entries of its calibration replaced."""
+    return replace(artifact, calibration=artifact.calibration.model_copy(update=entries))
 
 
 def popularity(train: SceneTensors) -> Floats:
@@ -238,9 +241,7 @@ def _shown(
     chosen = place < _PARTIAL_SCENES
     some, weight = subset(scenes, order[chosen]), stands_for[chosen].tolist()
     source_of = source[chosen].tolist()
-    whole = replace(
-        artifact, calibration=artifact.calibration.model_copy(update={"coverage_weight": 1.0})
-    )
+    whole = recalibrated(artifact, coverage_weight=1.0)
     # One hidden class of each scene alone would leave the choice to chance.
     draws = [
         (name, share, seed + draw)
@@ -441,11 +442,7 @@ def fit_evidence(
             continue
         scores = {}
         for pull in PULLS:
-            weights = found.model_copy(update={name: pull})
-            asked = replace(
-                artifact,
-                calibration=artifact.calibration.model_copy(update={"evidence": weights}),
-            )
+            asked = recalibrated(artifact, evidence=found.model_copy(update={name: pull}))
             ranks = [_rank(asked, case.scenes[1], case.target, plain) for case in cases]
             scores[pull] = float(np.mean([1 / rank for rank in ranks]))
         found = found.model_copy(update={name: least_of_the_best(scores)})

@@ -11,7 +11,7 @@ from sklearn.linear_model import LogisticRegression
 
 from app.scene import CANONICAL, Scene, SceneObject
 from training.datasets import EncodedScene
-from training.datasets.meanings import meaning_of
+from training.datasets.sources import meaning_of
 
 Triple: TypeAlias = tuple[int, int, int]
 

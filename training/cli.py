@@ -18,7 +18,6 @@ from rich.table import Table
 
 from app.registry import Artifact, RegistryError, Store, load_model_set
 from app.registry.references import AliasTarget
-from training.checkpoints import CheckpointError
 from training.config import (
     DATA,
     Config,
@@ -106,7 +105,7 @@ def train(
         if publish is not None:
             _publish(load_run(folder), scenes, store, publish, alias, measured)
     except (
-        *(ConfigError, DatasetError, CheckpointError, RegistryError, RunError),
+        *(ConfigError, DatasetError, RegistryError, RunError),
         FloatingPointError,
     ) as error:
         fail(error)

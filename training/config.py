@@ -82,7 +82,7 @@ class MachineConfig(_Section):
     H2: int = Field(default=100, ge=0)
     K: int = Field(default=32, ge=0)
     G: int = Field(default=0, ge=0, description="rank of what given relations imply (Triway)")
-    N: int = Field(default=0, ge=0, description="fantasies kept for chains to start from")
+    N: int = Field(default=0, ge=0, description="chain samples stored for new chains")
     form: Form = "seed"
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
@@ -271,16 +271,29 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
 
 def config_toml(config: Config) -> str:
     """The configuration as a TOML file that `load_config` reads."""
-    values = config.model_dump(mode="json", exclude_none=True)
-    sections = {name: values.pop(name) for name in list(values) if isinstance(values[name], dict)}
-    blocks = [_entries(values)]
-    blocks += [f"[{name}]\n{_entries(entries)}" for name, entries in sections.items()]
-    return "\n\n".join(blocks) + "\n"
+    return sections_toml(config.model_dump(mode="json", exclude_none=True))
 
 
-def _entries(values: Mapping[str, Any]) -> str:
-    # Of the values that a configuration holds, JSON writes all as TOML does.
-    return "\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items())
+def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None = None) -> str:
+    """Entries and sections as TOML, with a reason above an entry where there is one.
+
+    Args:
+        reasons: by "section.entry".
+    """
+    sections = {name: own for name, own in values.items() if isinstance(own, Mapping)}
+    lines = [_entry(name, value) for name, value in values.items() if name not in sections]
+    for section, entries in sections.items():
+        lines += ["", f"[{section}]"]
+        for name, value in entries.items():
+            if reason := (reasons or {}).get(f"{section}.{name}"):
+                lines.append(f"# {reason}")
+            lines.append(_entry(name, value))
+    return "\n".join(lines) + "\n"
+
+
+def _entry(name: str, value: Any) -> str:
+    # JSON and TOML write the values of a configuration alike.
+    return f"{name} = {json.dumps(value, ensure_ascii=False)}"
 
 
 def _first_error(error: ValidationError) -> str:

@@ -13,10 +13,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from training.config import Config
-from training.curves import Epoch
+from training.runs import Epoch, TrainingResult
 
 if TYPE_CHECKING:
-    from training.trainer import Trainer, TrainingResult
+    from training.trainer import Trainer
 
 _LEVELS = "▁▂▃▄▅▆▇█"
 _WIDTH = 21

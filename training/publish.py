@@ -6,8 +6,12 @@ import importlib.metadata
 import json
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
+import torch
+
+from app.inference.posterior import ClosedForm
 from app.registry import (
     Artifact,
     Calibration,
@@ -20,13 +24,16 @@ from app.registry import (
 )
 from app.scene import Vocabulary
 from training.calibrate import calibrate
-from training.draft import as_stored, draft_artifact
+from training.config import DataConfig
+from training.datasets.sources import SOURCES
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
+from training.machines import BoltzmannMachine
+from training.machines.arrays import weights_of
 from training.offsets import fit_offsets
+from training.oracle.drawn import DrawnPosterior
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
-from training.terms import TERMS, terms_of
 from training.trainer import TrainingData
 
 _LIBRARIES = ("numpy", "scikit-learn", "scipy", "torch")
@@ -118,6 +125,35 @@ def calibrated_draft(
     return draft_artifact(machine, vocabulary, calibration, offsets)
 
 
+@torch.no_grad()
+def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
+    """The machine, its matrices rounded to half precision in place, as the store keeps them."""
+    for parameter in machine.parameters():
+        if parameter.dim() > 1:
+            parameter.copy_(parameter.half().float())
+    return machine.requires_grad_(False).eval()
+
+
+def draft_artifact(
+    machine: BoltzmannMachine,
+    vocabulary: Vocabulary,
+    calibration: Calibration | None = None,
+    offsets: Offsets | None = None,
+) -> Artifact:
+    """An artifact in memory alone, with the neutral calibration unless one is given."""
+    return Artifact(
+        manifest=None,  # type: ignore[arg-type]  # nothing that answers a question looks at it
+        weights=weights_of(machine),
+        vocabulary=vocabulary,
+        calibration=calibration or Calibration.neutral(machine.spec.A),
+        digest="",
+        card="",
+        path=Path(),
+        offsets=offsets,
+        oracle=None if ClosedForm.fits(weights_of(machine)) else DrawnPosterior,
+    )
+
+
 def _measure(artifact: Artifact, data: TrainingData, progress: Callable[[str], None]) -> list[Row]:
     """Figures on the test part; none where there is none."""
     if not len(data.test):
@@ -139,16 +175,19 @@ def _training(run: FinishedRun, measured: tuple[FinishedRun, SplitScenes] | None
 
 def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
     """What the model was trained on, with digests and terms."""
-    return tuple(
-        DataSource(
-            source=source,
-            scenes=scenes.counts[source],
-            digest=scenes.digests[source],
-            terms=terms_of(source, scenes.data).words,
-            research_only=terms_of(source, scenes.data).research_only,
+    sources = []
+    for source, count in scenes.counts.items():
+        words, research_only = terms_of(source, scenes.data)
+        sources.append(
+            DataSource(
+                source=source,
+                scenes=count,
+                digest=scenes.digests[source],
+                terms=words,
+                research_only=research_only,
+            )
         )
-        for source in scenes.counts
-    )
+    return tuple(sources)
 
 
 def metrics(rows: list[Row]) -> tuple[Metric, ...]:
@@ -167,14 +206,23 @@ def metrics(rows: list[Row]) -> tuple[Metric, ...]:
     )
 
 
+def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
+    """Terms of use in words, and whether they allow research only.
+
+    Those of a known source, or those that the configuration states for the user's own files.
+    """
+    if source in SOURCES and source in data.sources:
+        return SOURCES[source].terms, SOURCES[source].research_only
+    words = data.terms or "scenes of the user's own, whose terms were not stated"
+    return words, data.research_only
+
+
 def terms(scenes: SplitScenes) -> str:
     """One sentence on what the weights may be used for."""
     every = {source: terms_of(source, scenes.data) for source in scenes.counts}
-    research = [source for source, found in every.items() if found.research_only]
-    if research:
+    if research := [source for source, (_, research_only) in every.items() if research_only]:
         return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."
-    own = {source: found.words for source, found in every.items() if source not in TERMS}
-    if own:
+    if own := {source: words for source, (words, _) in every.items() if source not in SOURCES}:
         return " ".join(
             f"Trained on {source}: {words.rstrip('.')}." for source, words in own.items()
         )

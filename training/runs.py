@@ -1,7 +1,7 @@
-"""What a finished training run leaves in its folder, and how it is read back.
+"""The folder of a training run: its checkpoint and curve while it trains, its result afterwards.
 
 config.json        the validated configuration
-checkpoint.pt      training state, for resuming
+checkpoint.pt      training state of the last finished epoch, for resuming
 model.safetensors  the best weights, with the shape in the header
 curve.csv, .png    reconstruction error per epoch
 result.json        best epoch, seconds, what it learnt from
@@ -9,20 +9,48 @@ result.json        best epoch, seconds, what it learnt from
 
 from __future__ import annotations
 
+import csv
 import json
-from dataclasses import dataclass
+import os
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
+import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
 from training.config import Config
 from training.machines import BoltzmannMachine, MachineSpec, build
-from training.trainer import TrainingResult
 
 
 class RunError(RuntimeError):
-    """A folder that holds no finished run; says what is missing."""
+    """A folder without a finished run, or a checkpoint that cannot be resumed; says why."""
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """One row of the curve; errors are those of `evaluation.reconstruction`."""
+
+    epoch: int
+    loss: float
+    object_error_train: float
+    relation_error_train: float
+    object_error_validation: float
+    relation_error_validation: float
+    mrr_validation: float
+    r_precision_validation: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The machine with its best weights, the curve, and where the best epoch was."""
+
+    machine: BoltzmannMachine
+    epochs: list[Epoch]
+    best_epoch: int
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -104,3 +132,59 @@ def load_run(folder: Path) -> FinishedRun:
     machine.load_state_dict(state)
     machine.requires_grad_(False).eval()
     return FinishedRun(config, machine, **outcome)
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write to a sibling, fsync, rename: a crash leaves the old checkpoint."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    with temporary.open("wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
+    """Read a checkpoint that began with the configuration and scenes of the given digest.
+
+    Raises:
+        RunError: unreadable, or begun under another configuration or on other scenes.
+    """
+    try:
+        state: dict[str, Any] = torch.load(path, weights_only=True)
+    except Exception as error:
+        raise RunError(f"{path.name} cannot be read: {error}") from error
+    if state.get("digest") != digest:
+        raise RunError(
+            f"{path.name} was begun with another configuration or on other scenes: use --fresh to "
+            "start over"
+        )
+    return state
+
+
+def write_csv(path: Path, epochs: list[Epoch]) -> None:
+    """One line per epoch."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Epoch)])
+        writer.writeheader()
+        writer.writerows(asdict(epoch) for epoch in epochs)
+
+
+def write_plot(path: Path, epochs: list[Epoch], title: str) -> None:
+    """Reconstruction error per epoch, objects and relations side by side."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.2), constrained_layout=True)
+    x = [epoch.epoch for epoch in epochs]
+    for axis, unit in zip(axes, ("object", "relation"), strict=True):
+        for part in ("train", "validation"):
+            axis.plot(x, [getattr(e, f"{unit}_error_{part}") for e in epochs], label=part)
+        axis.set(xlabel="epoch", ylabel="mean absolute error", title=f"{unit}s")
+        axis.legend()
+    figure.suptitle(f"Reconstruction error, {title}")
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)

@@ -18,20 +18,23 @@ from torch import Tensor
 
 from app.inference.variants import FACTORISED
 from training.batches import SceneTensors, seen_triples
-from training.checkpoints import load_checkpoint, save_checkpoint
 from training.config import Config
-from training.curves import Epoch, write_csv, write_plot
 from training.evaluation.missing import leave_one_out, machine_score
 from training.evaluation.reconstruction import reconstruction_error
 from training.evaluation.relations import machine_score as relation_score
 from training.evaluation.relations import rank_relations
 from training.machines import BoltzmannMachine, MachineSpec, build
 from training.machines.edges import find_triples, triple_keys
-from training.objectives import OBJECTIVES, Objective, RelationLikelihood
-from training.objectives.relations import bake_word_prior
-from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples
-from training.polish import polish
-from training.residuals import with_counted_residuals
+from training.objectives import OBJECTIVES, Objective
+from training.objects import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
+from training.runs import (
+    Epoch,
+    TrainingResult,
+    load_checkpoint,
+    save_checkpoint,
+    write_csv,
+    write_plot,
+)
 
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
@@ -63,16 +66,6 @@ class TrainingData:
     room_types: int
     digest: str = ""
     words: Tensor | None = None
-
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """The machine with its best weights, the curve, and where the best epoch was."""
-
-    machine: BoltzmannMachine
-    epochs: list[Epoch]
-    best_epoch: int
-    seconds: float
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
@@ -152,7 +145,8 @@ class Trainer:
         torch.set_num_threads(config.training.threads)
         self.generator = torch.Generator().manual_seed(config.training.seed)
         self.machine = new_machine(config, data, self.generator)
-        self.objective = self._objective()
+        kind = OBJECTIVES[config.objective.name]
+        self.objective: Objective = kind.of(config.objective, self.machine, data)
         self.train = data.train
         if config.objects.epochs:
             self.train = _with_relations(data.train)
@@ -169,12 +163,6 @@ class Trainer:
         self.seconds = 0.0
         self.objects_trained = not config.objects.epochs
         self._drawn = -math.inf
-
-    def _objective(self) -> Objective:
-        config = self.config.objective
-        if config.name == "relations":
-            return RelationLikelihood(config, self.machine, self.data.train, self.data.words)
-        return OBJECTIVES[config.name](config, self.machine, self.data.structure)
 
     def _optimiser(self) -> torch.optim.Optimizer:
         t = self.config.training
@@ -218,7 +206,7 @@ class Trainer:
         """Go on from the folder's checkpoint; False where there is none.
 
         Raises:
-            CheckpointError: the checkpoint is unreadable or of another configuration.
+            RunError: the checkpoint is unreadable or of another configuration.
         """
         if self.folder is None or not (self.folder / "checkpoint.pt").exists():
             return False
@@ -265,18 +253,9 @@ class Trainer:
         with torch.no_grad():
             for name, value in self.best.items():
                 parameters[name].copy_(value)
-        bake_word_prior(self.machine)
-        machine = self.machine
-        if (
-            isinstance(self.objective, RelationLikelihood)
-            and "residual" not in self.config.machine.without
-        ):
-            known = self.objective
-            machine = with_counted_residuals(
-                machine, self.train, known.offsets.detach(), known.source_weights
-            )
+        machine = self.objective.finish(self.machine, self.train)
         if not self.config.objects.epochs:
-            polish(
+            fine_tune(
                 self.machine,
                 self.data.train,
                 self.config.polish,
@@ -340,8 +319,7 @@ class Trainer:
         object_train, relation_train = reconstruction_error(self.machine, self.data.train)
         object_val, relation_val = reconstruction_error(self.machine, self.data.validation)
         score = mrr + (0.0 if math.isnan(precision) else precision)
-        # Conditional likelihood under a prior has no early optimum: its last average is the best.
-        if score > self.best_score or isinstance(self.objective, RelationLikelihood):
+        if score > self.best_score or self.objective.keeps_last:
             self.best_score, self.best_epoch = score, number
             self.best = {name: p.detach().clone() for name, p in parameters.items()}
         for name, p in parameters.items():

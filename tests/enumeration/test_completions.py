@@ -15,7 +15,7 @@ from app.inference.posterior import Completions
 from tests.enumeration.small_machines import binary
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
-from training.machines.fantasies import pack_scenes
+from training.machines.chain_samples import pack_scenes
 
 SPEC = MachineSpec("triway", V=7, A=1, H1=4, C=2, K=1, form="local")
 NOTHING = np.zeros(SPEC.V, dtype=bool)

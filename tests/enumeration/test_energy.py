@@ -15,6 +15,7 @@ from tests.enumeration.small_machines import (
     binary,
     enumerate_joint,
     full_frame,
+    same,
     small_machine,
 )
 
@@ -91,33 +92,31 @@ def test_energy_is_the_formula(name):
         )
 
 
+def check_free_energy(joint, free, groups):
+    """F is -log sum exp(-E) over the states that agree in the given units."""
+    _, group = torch.cat(groups, 1).unique(dim=0, return_inverse=True)
+    for g in range(int(group.max()) + 1):
+        rows = group == g
+        assert float(free[rows][0]) == pytest.approx(-joint.log_sum(rows), rel=1e-10)
+
+
 @pytest.mark.parametrize("name", SEED_FORM)
 def test_free_energy_sums_h1_out(name):
     machine = small_machine(name)
     joint = enumerate_joint(machine)
     h2 = joint.h2 if machine.spec.H2 else None
     free = machine.free_energy(joint.v, joint.r, joint.edges, h2)
-    code = torch.cat([joint.v, joint.r, joint.h2], 1)
-    _, group = code.unique(dim=0, return_inverse=True)
-    for g in range(int(group.max()) + 1):
-        rows = group == g
-        assert float(free[rows][0]) == pytest.approx(-joint.log_sum(rows), rel=1e-10)
+    check_free_energy(joint, free, (joint.v, joint.r, joint.h2))
 
 
 @pytest.mark.parametrize("name", [n for n in SMALL if n not in SEED_FORM])
 @pytest.mark.parametrize("room", [None, 1])
 def test_local_free_energy_sums_relations_out(name, room):
     machine = small_machine(name)
-    if room is not None and not machine.spec.C:
-        room = None
-    joint = enumerate_joint(machine, room)
+    joint = enumerate_joint(machine, room if machine.spec.C else None)
     h2 = joint.h2 if machine.spec.H2 else None
     free = machine.free_energy(joint.v, h2=h2, room=joint.room)
-    code = torch.cat([joint.v, joint.h2], 1)
-    _, group = code.unique(dim=0, return_inverse=True)
-    for g in range(int(group.max()) + 1):
-        rows = group == g
-        assert float(free[rows][0]) == pytest.approx(-joint.log_sum(rows), rel=1e-10)
+    check_free_energy(joint, free, (joint.v, joint.h2))
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -197,14 +196,10 @@ def test_attraction_is_what_summing_relations_adds(name):
         for v in binary(machine.spec.V):
             for i in range(machine.spec.V):
                 others = torch.arange(machine.spec.V) != i
-                given = same_rows(joint.h1, h1) & same_rows(joint.v[:, others], v[others])
+                given = same(joint.h1, h1) & same(joint.v[:, others], v[others])
                 exact = joint.log_odds(joint.v[:, i] > 0, given)
                 absent = v.clone()
                 absent[i] = 0
                 gain = machine.attraction(absent[None], h1[None], joint.edges, torch.tensor([[i]]))
                 ours = machine.object_logits(h1[None])[0, i] + gain[0, 0]
                 assert float(ours) == pytest.approx(exact, abs=1e-9)
-
-
-def same_rows(block, value):
-    return (block == value).all(1)

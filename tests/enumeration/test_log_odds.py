@@ -22,7 +22,7 @@ from training.machines.draws import draw_hidden
 from training.machines.log_odds import (
     context_gain,
     object_log_odds,
-    object_log_odds_estimate,
+    presence_log_odds,
     relation_log_odds,
     relation_log_odds_observed,
 )
@@ -42,23 +42,28 @@ def test_context_gain_and_its_gradient():
     assert torch.autograd.gradcheck(context_gain, (x, W))
 
 
+def left_out(joint):
+    """Every v, every class i: (number of v, i, v without i, states that have the rest of v)."""
+    V = joint.machine.spec.V
+    for number, v in enumerate(binary(V)):
+        for i in range(V):
+            rest, others = v.clone(), torch.arange(V) != i
+            rest[i] = 0
+            yield number, i, rest, same(joint.v[:, others], v[others])
+
+
 @pytest.mark.parametrize("name", LOCAL_ONE_LAYER)
 @pytest.mark.parametrize("room", [None, 2])
 def test_object_log_odds_is_exact_in_the_local_form(name, room):
     machine = small_machine(name)
     joint = enumerate_joint(machine, room)
     rooms = None if room is None else torch.tensor([room])
-    for v in binary(machine.spec.V):
-        for i in range(machine.spec.V):
-            rest = v.clone()
-            rest[i] = 0
-            others = torch.arange(machine.spec.V) != i
-            given = same(joint.v[:, others], v[others])
-            exact = joint.log_odds(joint.v[:, i] > 0, given)
-            evidence = Evidence(rest[None], joint.edges, room=rooms)
-            assert float(object_log_odds(machine, evidence)[0, i]) == pytest.approx(exact, abs=1e-9)
-            one = object_log_odds(machine, evidence, candidates=torch.tensor([[i]]))
-            assert float(one) == pytest.approx(exact, abs=1e-9)
+    for _, i, rest, given in left_out(joint):
+        exact = joint.log_odds(joint.v[:, i] > 0, given)
+        evidence = Evidence(rest[None], joint.edges, room=rooms)
+        assert float(object_log_odds(machine, evidence)[0, i]) == pytest.approx(exact, abs=1e-9)
+        one = object_log_odds(machine, evidence, candidates=torch.tensor([[i]]))
+        assert float(one) == pytest.approx(exact, abs=1e-9)
 
 
 def partial_evidence(joint, v, keep, seed):
@@ -101,26 +106,31 @@ def test_relation_log_odds_with_any_mixture_observed(name, keep):
                 assert float(error[0, e]) < 0.2
 
 
+def estimate(machine, evidence, i, count):
+    """Log-odds of class i over so many draws, and their standard error by the delta method."""
+    draws, one = draw_hidden(machine, evidence, draws=count), torch.tensor([[i]])
+    gain = draws.h1 @ machine.W[i]
+    gain = gain.unsqueeze(-1) + machine.attraction(evidence.v, draws.h1, evidence.edges, one)
+    error = draws.standard_error((gain - draws.log_mean_exp(gain)).exp())
+    return float(presence_log_odds(machine, evidence, one, draws)), float(error)
+
+
 @pytest.mark.parametrize("name", ONE_LAYER)
 @pytest.mark.parametrize("keep", [0, 2])
 def test_object_log_odds_estimate_within_its_stated_error(name, keep):
     machine = small_machine(name)
     joint = enumerate_joint(machine)
-    for seed, v in enumerate(binary(machine.spec.V)):
-        for i in range(machine.spec.V):
-            rest = v.clone()
-            rest[i] = 0
-            r, observed = partial_evidence(joint, rest, keep, seed)
-            touching = (joint.edges.subject[0] == i) | (joint.edges.object[0] == i)
-            observed = observed & ~touching
-            r = r * observed
-            others = torch.arange(machine.spec.V) != i
-            given = same(joint.v[:, others], v[others]) & ((joint.r == r) | ~observed).all(1)
-            exact = joint.log_odds(joint.v[:, i] > 0, given)
-            evidence = Evidence(rest[None], joint.edges, r, observed)
-            log_odds, error = object_log_odds_estimate(machine, evidence, count=1 << 13)
-            assert abs(float(log_odds[0, i]) - exact) <= 4 * float(error[0, i]) + 1e-9
-            assert float(error[0, i]) < 0.2
+    for seed, i, rest, given in left_out(joint):
+        r, observed = partial_evidence(joint, rest, keep, seed)
+        touching = (joint.edges.subject[0] == i) | (joint.edges.object[0] == i)
+        observed = observed & ~touching
+        r = r * observed
+        given &= ((joint.r == r) | ~observed).all(1)
+        exact = joint.log_odds(joint.v[:, i] > 0, given)
+        evidence = Evidence(rest[None], joint.edges, r, observed)
+        log_odds, error = estimate(machine, evidence, i, 1 << 13)
+        assert abs(log_odds - exact) <= 4 * error + 1e-9
+        assert error < 0.2
 
 
 @pytest.mark.parametrize("name", [n for n in ONE_LAYER if n in SEED_FORM])
@@ -165,14 +175,8 @@ def test_two_layers_stay_close_to_the_joint(name):
     machine = small_machine(name, scale=0.4)
     joint = enumerate_joint(machine)
     worst = 0.0
-    for v in binary(machine.spec.V):
-        for i in range(machine.spec.V):
-            rest = v.clone()
-            rest[i] = 0
-            others = torch.arange(machine.spec.V) != i
-            exact = joint.log_odds(joint.v[:, i] > 0, same(joint.v[:, others], v[others]))
-            log_odds, _ = object_log_odds_estimate(
-                machine, Evidence(rest[None], joint.edges), count=1 << 12
-            )
-            worst = max(worst, abs(float(log_odds[0, i]) - exact))
+    for _, i, rest, given in left_out(joint):
+        exact = joint.log_odds(joint.v[:, i] > 0, given)
+        evidence = Evidence(rest[None], joint.edges)
+        worst = max(worst, abs(estimate(machine, evidence, i, 1 << 12)[0] - exact))
     assert worst < 0.05

@@ -18,8 +18,8 @@ from app.inference.relations import Given
 from tests.enumeration.small_machines import SMALL, enumerate_joint, small_machine
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of
+from training.machines.chain_samples import ChainSamples, pack_scenes
 from training.machines.edges import present_classes
-from training.machines.fantasies import Fantasies, pack_scenes
 from training.machines.gibbs import Clamp, run, sample_relations
 
 CHAINS = 20_000
@@ -203,15 +203,15 @@ CONDITIONS = {
     "relations": conditions([3, 17, 30], [(0, 0, 1, 1), (1, 1, 2, 1), (2, 2, 0, 0), (3, 0, 2, 1)]),
     "context": conditions([5], held=[2, 44]),
     "room": conditions([5], room=1),
-    "room without a fantasy": conditions([5], room=2),
+    "room without a sample": conditions([5], room=2),
 }
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
-def test_fantasies_are_weighed_as_the_tensors_weigh_them(wide, name):
+def test_samples_are_weighed_as_the_tensors_weigh_them(wide, name):
     condition, chains = CONDITIONS[name], SceneChains(weights_of(wide))
     mask, clamp = torch_clamp(wide, 1, condition)
-    expected = Fantasies(wide).log_weight(mask.float().unsqueeze(0), clamp).softmax(1)[0]
+    expected = ChainSamples(wide).log_weight(mask.float().unsqueeze(0), clamp).softmax(1)[0]
     np.testing.assert_allclose(chains.sample_weights(condition), expected, atol=1e-5)
 
 
@@ -224,7 +224,7 @@ def test_long_chains_agree_with_those_of_tensors(wide, name, temperature):
     condition, rows = CONDITIONS[name], 600
     mask, clamp = torch_clamp(wide, rows, condition)
     generator = torch.Generator().manual_seed(0)
-    state = Fantasies(wide).start(mask.float().repeat(rows, 1), generator, clamp)
+    state = ChainSamples(wide).start(mask.float().repeat(rows, 1), generator, clamp)
     tempered = wide.scaled(1 / temperature)
     state = run(tempered, state, generator, 5, clamp, relations=False)
     state = run(tempered, state, generator, 1, clamp)

@@ -1,4 +1,4 @@
-"""Draws have the probabilities asked for, well below the 8 bits that decide most of them."""
+"""Draws have their probabilities, well below the 8 bits that decide most; sparse products."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from training.machines.bernoulli import bernoulli
+from training.machines.gibbs import presence_product
 
 DRAWS = 2_000_000
 # The middle of a byte, its edges, a tie's fraction alone, and the least float32 below one.
@@ -39,3 +42,17 @@ def test_neighbouring_draws_are_independent():
     for lag in range(1, 17):
         correlation = float((drawn[:-lag] * drawn[lag:]).mean()) / 0.21
         assert abs(correlation) < 5 / math.sqrt(DRAWS)
+
+
+@given(
+    chains=st.integers(0, 40),
+    V=st.integers(1, 50),
+    H=st.integers(1, 20),
+    density=st.sampled_from([0.0, 0.03, 0.1, 0.13, 0.5, 1.0]),
+    seed=st.integers(0, 2**32),
+)
+def test_the_sparse_product_equals_the_dense_one(chains, V, H, density, seed):
+    generator = torch.Generator().manual_seed(seed)
+    W = torch.randn(V, H, generator=generator, dtype=torch.float64)
+    v = (torch.rand(chains, V, generator=generator) < density).double()
+    torch.testing.assert_close(presence_product(v, W), v @ W)

@@ -14,9 +14,9 @@ from tests.enumeration.implied import features_by_hand, implied_by_hand
 from training.machines import MachineSpec, Triway, build
 from training.machines.draws import draw_hidden
 from training.machines.gibbs import Clamp, sample_relations
-from training.machines.implications import implication_features, implied
 from training.machines.log_odds import object_log_odds, relation_log_odds
 from training.machines.mean_field import Evidence
+from training.machines.triway import implication_features, implied
 
 
 @st.composite

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from app.questions import missing
 from tests.questions.artifacts import LABELS, artifact_of, larger_artifact, scene_of
 from training.machines import MachineSpec, build
-from training.machines.fantasies import pack_scenes
+from training.machines.chain_samples import pack_scenes
 
 SPECS = {
     "rbm": MachineSpec("rbm", V=9, A=4, H1=12, T=8, C=2, N=256, form="local"),

@@ -31,7 +31,6 @@ from training.calibrate_objects import (
 )
 from training.cases import altered_case
 from training.config import ObjectsConfig
-from training.draft import draft_artifact
 from training.evaluation.alarms import alarm_threshold, calibrated_alarm
 from training.evaluation.answers import QUESTIONS, collect
 from training.evaluation.asking import of_classes
@@ -40,6 +39,7 @@ from training.evaluation.outliers import IntruderScores, clean_scores, intruder_
 from training.machines import MachineSpec, build
 from training.machines.arrays import machine_of
 from training.objects import fit_objects, store_samples
+from training.publish import draft_artifact
 
 ROOM_COUNT = 400
 

@@ -15,8 +15,9 @@ from training.config import (
     source_name,
     with_settings,
 )
+from training.datasets.sources import SOURCES
 from training.pipeline import prepare
-from training.terms import TERMS, terms_of
+from training.publish import terms_of
 
 
 @pytest.mark.parametrize("name", shipped_configs())
@@ -24,7 +25,7 @@ def test_shipped_configurations_load(name: str) -> None:
     config = load_config(name)
     assert config.name == name
     assert config.description
-    assert all(source in TERMS for source in config.data.sources)
+    assert all(source in SOURCES for source in config.data.sources)
 
 
 @pytest.mark.parametrize("domain", ["indoor", "everyday"])
@@ -106,13 +107,14 @@ def test_terms_change_no_digest_until_they_are_given() -> None:
     assert with_settings(config, {"data.terms": "ours"}).digest != config.digest
 
 
-def test_terms_of_ones_own_scenes_are_ones_own(tmp_path) -> None:
+def test_terms_of_the_users_own_files() -> None:
     data = load_config("indoor-rbm").data
-    assert terms_of("sunrgbd", data).research_only
+    assert terms_of("sunrgbd", data) == (SOURCES["sunrgbd"].terms, True)
+    # A file of a known source's name is another source.
     own = data.model_copy(update={"sources": ("sunrgbd.jsonl",), "terms": "ours"})
-    # A file that happens to be called as a known source is not that source.
-    assert terms_of("sunrgbd", own).words == "ours"
-    assert not terms_of("sunrgbd", own).research_only
-    only = own.model_copy(update={"research_only": True, "terms": ""})
-    assert terms_of("sunrgbd", only).research_only
-    assert "not stated" in terms_of("sunrgbd", only).words
+    assert terms_of("sunrgbd", own) == ("ours", False)
+    words, research_only = terms_of(
+        "sunrgbd", own.model_copy(update={"research_only": True, "terms": ""})
+    )
+    assert research_only
+    assert "not stated" in words

@@ -15,11 +15,11 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from typer.testing import CliRunner
 
-from training.checkpoints import save_checkpoint
 from training.cli import app
 from training.config import Config
 from training.live import Display, sparkline, summarise
 from training.pipeline import prepare
+from training.runs import save_checkpoint
 from training.trainer import Trainer
 
 ROOT = Path(__file__).parents[2]

@@ -1,4 +1,4 @@
-"""The object phase on machines small enough to enumerate: likelihood, room types, samples."""
+"""The object part: likelihood, room types and samples by enumeration; the fine tuning."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import pytest
 import torch
 
 from tests.enumeration.small_machines import binary
-from tests.training.evaluation.scenes import scene, tensors
+from tests.training.evaluation.scenes import WIDE, random_scenes, scene, tensors
+from tests.training.test_trainer import small_config
 from training import objects
-from training.config import ObjectsConfig
+from training.config import ObjectsConfig, PolishConfig, with_settings
 from training.machines import MachineSpec, build
-from training.machines.fantasies import unpack_scenes
-from training.objects import OBJECT_WEIGHTS, fit_objects, store_samples
+from training.machines.chain_samples import unpack_scenes
+from training.objects import OBJECT_WEIGHTS, fine_tune, fit_objects, store_samples
+from training.pipeline import prepare
+from training.trainer import Trainer
 
 V = 4
 EVERY = binary(V).float()
@@ -183,3 +186,100 @@ def test_samples_keep_the_room_type_they_were_drawn_under():
         p = log_p(machine, room).exp() @ EVERY.double()
         error = 5 * (p * (1 - p) / len(own)).sqrt()
         assert bool(((own.mean(0) - p).abs() <= error).all())
+
+
+# -- fine tuning ----------------------------------------------------------------------------------
+
+DATA = tensors(random_scenes(20), WIDE)
+
+
+def wide_machine(N, variant="triway", form="local", scale=0.5):
+    K = 2 if variant == "triway" else 0
+    machine = build(MachineSpec(variant, V=WIDE, A=4, H1=5, K=K, N=N, form=form))
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        machine.W.copy_(torch.randn(machine.W.shape, generator=generator) * scale)
+        machine.b.copy_(torch.linspace(-3, 1, WIDE))
+    return machine.requires_grad_(False)
+
+
+def store(machine, scenes, seed):
+    fine_tune(machine, scenes, PolishConfig(updates=0, chains=1), 0.5, seed)
+
+
+def stored(machine):
+    return unpack_scenes(machine.fantasies, machine.spec.V)
+
+
+def test_fine_tuned_samples_follow_the_machine():
+    """Independent classes: frequencies within five standard errors, 12 classes, so that chance
+    fails with probability < 8e-6."""
+    machine = wide_machine(3000, scale=0.0)
+    store(machine, DATA, 0)
+    found = stored(machine).double().mean(0)
+    for p, share in zip(machine.b.double().sigmoid().tolist(), found.tolist(), strict=True):
+        assert abs(share - p) <= 5 * math.sqrt(p * (1 - p) / 3000)
+
+
+def test_each_sample_keeps_the_room_type_of_its_chain():
+    rooms = [k % 3 - 1 for k in range(30)]
+    data = tensors([scene([0, 1], room=room) for room in rooms], WIDE)
+    spec = MachineSpec("rbm", V=WIDE, A=4, H1=2, C=2, N=300, form="local")
+    machine = build(spec).requires_grad_(False)
+    machine.b.fill_(-4.0)
+    machine.W[2:4, 0], machine.W[4:6, 1] = 8.0, 8.0
+    machine.c1.fill_(-12.0)
+    machine.Q[:] = torch.eye(2) * 20
+    store(machine, data, 0)
+    found, own = stored(machine), machine.fantasy_rooms
+    assert set(own.tolist()) == {-1, 0, 1}
+    for room, things in ((0, slice(2, 4)), (1, slice(4, 6))):
+        # h1 is on with probability 0.9997 there, and each thing then with 0.98.
+        assert float(found[own == room][:, things].mean()) > 0.85
+        assert float(found[own != room][:, things].mean()) < 0.15
+
+
+@pytest.mark.parametrize("variant", ["triway", "gbm"])
+def test_chains_come_to_the_data(variant):
+    """Scenes of two kinds; a machine that is far too full. The frequencies of its own scenes are
+    at most half as far from the data's after the updates, and the anchor holds the weights back."""
+    v = torch.zeros(40, WIDE)
+    v[:20, :4], v[20:, 6:10] = 1, 1
+    data = tensors([scene(row.nonzero().squeeze(1).tolist()) for row in v], WIDE)
+
+    def distance(machine):
+        return float((stored(machine).mean(0) - v.mean(0)).abs().sum())
+
+    def fine_tuned(**changes):
+        machine = wide_machine(400, variant)
+        machine.b.fill_(1.0)
+        machine.requires_grad_()
+        start = machine.W.detach().clone()
+        fine_tune(machine, data, PolishConfig(learning_rate=0.05, **changes), 0.5, 1)
+        return machine, float((machine.W.detach() - start).abs().mean())
+
+    (before, none), (after, much), (held, little) = (
+        fine_tuned(updates=0),
+        fine_tuned(updates=400, anchor=0.0),
+        fine_tuned(updates=400, anchor=10.0),
+    )
+    assert none == 0
+    assert distance(after) < 0.5 * distance(before)
+    assert 0 < little < 0.2 * much
+    assert distance(held) < distance(before)
+
+
+def test_a_trained_machine_is_fine_tuned(tmp_path):
+    """Once, from its best weights: a finished run that is resumed ends at the same weights."""
+    changes = {"machine.N": 30, "data.rooms": 60, "polish.updates": 5}
+    config = with_settings(small_config(epochs=1), changes)
+    data = prepare(config, tmp_path).training_data()
+    first = Trainer(config, data, tmp_path).run().machine
+    again = Trainer(config, data, tmp_path)
+    assert again.resume()
+    second = again.run().machine
+    assert len(stored(first).unique(dim=0)) > 5
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name
+    plain = with_settings(config, {"polish.updates": 0})
+    assert not torch.equal(Trainer(plain, data).run().machine.W, first.W)

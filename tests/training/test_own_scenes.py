@@ -186,15 +186,3 @@ def test_a_grown_data_set_is_compared_on_what_the_older_version_never_saw(workpl
     assert comparison["scenes"] > 10
     # Two epochs are no match for the older version, whoever's classes are asked in.
     assert comparison["differences"][0]["verdict"] == "worse"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("compare", "nowhere"), "must be a finished run or a model"),
-        (("compare", "baselines"), "name a model or a run"),
-        (("train", "nowhere"), "no configuration"),
-    ],
-)
-def test_errors_are_one_clear_line(tmp_path, arguments, message) -> None:
-    assert message in invoke(*arguments, code=1)

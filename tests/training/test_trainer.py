@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from training.checkpoints import CheckpointError
 from training.config import Config, ConfigError, with_settings
 from training.machines import Triway
 from training.pipeline import prepare
@@ -152,13 +151,13 @@ def test_an_object_phase_that_diverges_says_so(data):
 
 def test_a_checkpoint_of_another_configuration_is_refused(data, tmp_path):
     Trainer(small_config(epochs=1), data, tmp_path).run()
-    with pytest.raises(CheckpointError, match="another configuration"):
+    with pytest.raises(RunError, match="another configuration"):
         Trainer(small_config(epochs=2), data, tmp_path).resume()
 
 
 def test_a_broken_checkpoint_is_refused(data, tmp_path):
     (tmp_path / "checkpoint.pt").write_bytes(b"not a checkpoint")
-    with pytest.raises(CheckpointError, match="cannot be read"):
+    with pytest.raises(RunError, match="cannot be read"):
         Trainer(small_config(), data, tmp_path).resume()
 
 

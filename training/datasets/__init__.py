@@ -1,9 +1,8 @@
 """Scenes from files and from the room generator, and what a model sees of them."""
 
 from training.datasets.encoding import EncodedScene, annotated_classes, encode
-from training.datasets.meanings import MEANINGS, Meaning, meaning_of
 from training.datasets.names import Names, curated_names
-from training.datasets.readers import READERS, Reader, read_scenes
+from training.datasets.readers import READERS, read_scenes
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
 from training.datasets.rooms import generate_rooms, rooms_vocabulary
 from training.datasets.shuffling import shuffle_objects
@@ -21,15 +20,12 @@ from training.datasets.vocabulary import (
 
 __all__ = [
     "FRACTIONS",
-    "MEANINGS",
     "READERS",
     "AnnotatedObject",
     "AnnotatedScene",
     "DatasetError",
     "EncodedScene",
-    "Meaning",
     "Names",
-    "Reader",
     "annotated_classes",
     "build_vocabulary",
     "coverage",
@@ -37,7 +33,6 @@ __all__ = [
     "encode",
     "generate_rooms",
     "indoor_vocabulary",
-    "meaning_of",
     "read_scenes",
     "read_vocabulary",
     "rooms_vocabulary",

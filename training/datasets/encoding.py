@@ -25,21 +25,14 @@ from app.scene import (
     to_viewer_frame,
 )
 from scene_client.image_plane import are_neighbours, relation_between
-from training.datasets.meanings import Meaning, meaning_of
 from training.datasets.names import Names, curated_names
 from training.datasets.records import AnnotatedObject, AnnotatedScene
+from training.datasets.sources import SOURCES, Meaning, meaning_of
 
 A = len(CANONICAL)
 _ON_TOP: Final = CANONICAL.index("on-top")
 _VERTICAL: Final = [_ON_TOP, CANONICAL.index("above")]
 _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
-
-# Labels that a source annotates so incompletely that they say nothing there.
-LEFT_OUT: Final[dict[str, tuple[str, ...]]] = {"sunrgbd": ("wall", "floor")}
-
-# Sources annotated in free words: a class that they never mention was not there. In the others the
-# annotator chose from a list, and a class that is not on it is unobserved.
-OPEN_VOCABULARY: Final = frozenset({"sunrgbd"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,10 +79,10 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
     - boxes in an image: the rule of `scene_client.image_plane`, left and above;
     - otherwise support links alone, or nothing.
 
-    `training.datasets.meanings` says which unlisted relations of a source are off.
+    `training.datasets.sources` says which unlisted relations of a source are off, and which of its
+    labels are left out as if they had not been annotated.
 
-    Relations of structure classes are dropped: neither on nor off. Labels in `LEFT_OUT` are treated
-    as if they had not been annotated.
+    Relations of structure classes are dropped: neither on nor off.
     """
     encoder = _Encoder(vocabulary, curated_names())
     every = list(scenes)
@@ -103,20 +96,25 @@ def annotated_classes(
     """Per source, (V,) the classes whose absence from a scene means something.
 
     These are the classes that the source ever mentions, or all of them in a source of open
-    vocabulary, less those in `LEFT_OUT`. Initial biases are frequencies over the sources that
+    vocabulary, less those it leaves out. Initial biases are frequencies over the sources that
     mention a class, and generated scenes are compared in these.
     """
     annotated: dict[str, NDArray[np.bool_]] = {}
     for scene in scenes:
         if scene.source not in annotated:
-            start = scene.source in OPEN_VOCABULARY
+            known = SOURCES.get(scene.source)
+            start = known is not None and known.open_vocabulary
             annotated[scene.source] = np.full(len(vocabulary), start)
         annotated[scene.source][scene.instance_classes] = True
-    for source, labels in LEFT_OUT.items():
-        for index in map(vocabulary.index, labels):
-            if source in annotated and index is not None:
-                annotated[source][index] = False
+    for source, classes in annotated.items():
+        classes[_left_out(source, vocabulary)] = False
     return annotated
+
+
+def _left_out(source: str, vocabulary: Vocabulary) -> list[int]:
+    """The classes of the labels that a source annotates too incompletely."""
+    labels = SOURCES[source].left_out if source in SOURCES else ()
+    return [index for label in labels if (index := vocabulary.index(label)) is not None]
 
 
 class _Encoder:
@@ -124,14 +122,10 @@ class _Encoder:
         self.vocabulary = vocabulary
         self.names = names
         self.indices: dict[str, int | None] = {}
-        self.left_out = {
-            source: frozenset(vocabulary.index(label) for label in labels)
-            for source, labels in LEFT_OUT.items()
-        }
 
     def __call__(self, scene: AnnotatedScene, group_size: int) -> EncodedScene:
         meaning = meaning_of(scene.source, listed=scene.relations is not None)
-        left_out = self.left_out.get(scene.source, frozenset())
+        left_out = _left_out(scene.source, self.vocabulary)
         classes = [self._index(thing.label) for thing in scene.objects]
         kept = [i for i, c in enumerate(classes) if c is not None and c not in left_out]
         relations, positions = _relations(scene, meaning)

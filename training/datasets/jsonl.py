@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from training.datasets.files import bounded_int, read_lines
-from training.datasets.predicates import relation_of
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
+from training.datasets.sources import relation_of
 
 MAX_LINE: Final = 8 * 2**20
 

@@ -12,9 +12,7 @@ from training.datasets.records import AnnotatedScene, DatasetError
 from training.datasets.sunrgbd_mat import read_sunrgbd_mat
 from training.datasets.threedssg import read_3dssg
 
-Reader = Callable[[Path], list[AnnotatedScene]]
-
-READERS: Final[dict[str, Reader]] = {
+READERS: Final[dict[str, Callable[[Path], list[AnnotatedScene]]]] = {
     "jsonl": read_jsonl,
     "3dssg": read_3dssg,
     "sunrgbd-mat": read_sunrgbd_mat,

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from training.datasets.files import load_json, located, take
-from training.datasets.predicates import relation_of
 from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetError
+from training.datasets.sources import relation_of
 
 SOURCE = "3dssg"
 

@@ -19,9 +19,9 @@ from training.datasets import (
     generate_rooms,
     vocabulary_json,
 )
-from training.datasets.furniture import DOMAINS
 from training.datasets.jsonl import scan_jsonl, write_jsonl
 from training.datasets.readers import guess_format
+from training.datasets.rooms import DOMAINS
 from training.domain.proposal import Proposal, propose
 from training.domain.report import as_dict, show
 

@@ -6,14 +6,13 @@ docs/decisions/own-scenes.md); `training tune` is there for whoever wants better
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from app.scene import Vocabulary, label_key
-from training.config import Config, ConfigError
+from training.config import Config, ConfigError, sections_toml
 from training.datasets import (
     FRACTIONS,
     AnnotatedScene,
@@ -71,25 +70,11 @@ class Proposal:
 
     def toml(self) -> str:
         """The configuration with the reason of each entry above it."""
-        lines = [
-            f"# Proposed by `python -m training init {self.name}`; every entry may be changed.",
-            "# python -m training tune searches better ones on the validation scenes.",
-            "",
-        ]
-        lines += [_entry(name, self.values[name]) for name in ("name", "description")]
-        for section, entries in self.values.items():
-            if isinstance(entries, Mapping):
-                lines += ["", f"[{section}]"]
-                for name, value in entries.items():
-                    if reason := self.reasons.get(f"{section}.{name}"):
-                        lines.append(f"# {reason}")
-                    lines.append(_entry(name, value))
-        return "\n".join(lines) + "\n"
-
-
-def _entry(name: str, value: Any) -> str:
-    # Of the values that a configuration holds, JSON writes all as TOML does.
-    return f"{name} = {json.dumps(value, ensure_ascii=False)}"
+        return (
+            f"# Proposed by `python -m training init {self.name}`; every entry may be changed.\n"
+            "# python -m training tune searches better ones on the validation scenes.\n\n"
+            f"{sections_toml(self.values, self.reasons)}"
+        )
 
 
 def propose(

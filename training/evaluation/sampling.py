@@ -8,8 +8,8 @@ from torch import Tensor
 from app.questions.generate import STEPS
 from training.evaluation.generation import Contradictions, Drawn, Sampler
 from training.machines import BoltzmannMachine
+from training.machines.chain_samples import ChainSamples
 from training.machines.edges import present_classes
-from training.machines.fantasies import Fantasies
 from training.machines.gibbs import Clamp, State, gibbs_step, run
 
 _CHAINS = 256
@@ -23,14 +23,14 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
     Args:
         steps: sweeps of a chain.
     """
-    fantasies = Fantasies(machine)
+    samples = ChainSamples(machine)
 
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
         generator = torch.Generator().manual_seed(seed)
         parts = []
         for index in torch.arange(len(given)).split(_CHAINS):
             clamp = Clamp(v=given[index], room=room[index] if machine.spec.C else None)
-            state = fantasies.start(given[index].to(machine.b.dtype), generator, clamp)
+            state = samples.start(given[index].to(machine.b.dtype), generator, clamp)
             state = _sweep(machine, state, generator, clamp, steps)
             parts.append((state.v, Contradictions.of(_grid(machine, state))))
         objects, found = zip(*parts, strict=True)

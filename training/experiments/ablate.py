@@ -13,7 +13,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.console import Console
 
 from training.batches import seen_triples
-from training.checkpoints import CheckpointError
 from training.config import Config, ConfigError, data_folder, load_config, with_settings
 from training.datasets import DatasetError
 from training.evaluation.report import SourceReport, pooled, settings_by_source
@@ -89,7 +88,7 @@ def ablate(
                 failures=(FloatingPointError,),
             )
     except (
-        ConfigError, DatasetError, BenchmarkError, CheckpointError, BrokenProcessPool,
+        ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool,
     ) as error:  # fmt: skip
         console.print(f"[red]error:[/red] {error}")
         raise typer.Exit(1) from None

@@ -18,7 +18,6 @@ from rich.console import Console
 
 from training.baselines import OBJECTS, RELATIONS
 from training.batches import seen_triples
-from training.checkpoints import CheckpointError
 from training.config import (
     Config,
     ConfigError,
@@ -62,6 +61,7 @@ from training.experiments.rows import (
     reference_rows,
 )
 from training.pipeline import SplitScenes, prepare
+from training.runs import RunError
 
 DOMAINS = ("indoor", "everyday")
 """Measured when no configuration is given."""
@@ -238,7 +238,7 @@ def benchmark(
                 compare_on_shuffled(domain, place / "shuffled", options)
             console.print(f"every figure: {place}/**/results.json; plots beside it")
     except (
-        ConfigError, DatasetError, BenchmarkError, CheckpointError, BrokenProcessPool,
+        ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool,
         ValueError, FloatingPointError,
     ) as error:  # fmt: skip
         console.print(f"[red]error:[/red] {error}")

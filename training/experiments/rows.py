@@ -25,13 +25,13 @@ from training.baselines.size import parameter_count
 from training.batches import SceneTensors
 from training.calibrate import calibrate
 from training.config import Config, ConfigError
-from training.draft import as_stored, draft_artifact
 from training.evaluation.alarms import fitted_alarm
 from training.evaluation.contenders import Contender, artifact_contender
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import floor_contender, independent_contender
 from training.machines import BoltzmannMachine
 from training.pipeline import SplitScenes
+from training.publish import as_stored, draft_artifact
 from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer, TrainingData
 

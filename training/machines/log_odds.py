@@ -8,13 +8,14 @@ The rest may be any mixture of observed and unobserved units. See `Evidence`.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from training.machines.draws import draw_hidden
+from training.machines.draws import HiddenDraws, draw_hidden
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
@@ -67,7 +68,7 @@ def object_log_odds(
 
     Exact for one layer where no relation is observed and the form is local; with a second layer h2
     is held at its mean-field value; in the seed form, and with relations observed, the context is
-    replaced by its factorial approximation (`object_log_odds_estimate` weighs draws instead).
+    replaced by its factorial approximation (`presence_log_odds` weighs draws instead).
     Candidates must be absent in `evidence.v`. Differentiable.
 
     Args:
@@ -87,30 +88,70 @@ def object_log_odds(
     return gain + machine.attraction(evidence.v, field.y.sigmoid(), evidence.edges, candidates)
 
 
-def object_log_odds_estimate(
+def presence_log_odds(
     machine: BoltzmannMachine,
     evidence: Evidence,
-    *,
-    count: int = 64,
-) -> tuple[Tensor, Tensor]:
-    """Log-odds of all objects as log E[exp(...)] over draws, with their standard error.
+    candidates: Tensor,
+    draws: HiddenDraws | None = None,
+) -> Tensor:
+    """log p(v_i = 1 | rest) - log p(v_i = 0 | rest) for candidates absent in the evidence, (B, N).
 
-        log E_{h1 | rest}[ exp(b_i + W_i·h1 + attraction_i(h1)) ]
+    Local form without observed relations: `object_log_odds`, exact with one layer. Otherwise
 
-    an identity (`model.md`: Rao–Blackwell estimate), so the only error is that of the draws and,
-    with a second layer, of holding h2 at its mean-field value.
+        log-odds_i = b_i + G_i + log E_w[exp(W_i·h1 + attraction_i)] - log mean exp(W_i·h1)
+
+    over weighted draws of h1, with G_i = log E_q[exp(W_i·h1)] in closed form under the proposal q
+    of the draws, unweighted in the last term: a control that takes out what both err in common.
+
+    Args:
+        candidates: (B or 1, N) int64.
+        draws: of h1 given the evidence; 64 by default.
+    """
+    if not machine.relations_act and evidence.edges is None:
+        return object_log_odds(machine, evidence, candidates=candidates)
+    draws = draw_hidden(machine, evidence) if draws is None else draws
+    weights = machine.W[candidates]
+    y = draws.field.y.unsqueeze(1)
+    closed = (softplus(y + weights) - softplus(y)).sum(-1)
+    bare = _object_input(machine, draws.h1, candidates)
+    proposal_mean = bare.logsumexp(0) - math.log(len(draws.h1))
+    gain = bare + _attraction(machine, evidence, draws, candidates)
+    return machine.b[candidates] + closed + draws.log_mean_exp(gain) - proposal_mean
+
+
+def weights_with(
+    machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
+) -> Tensor:
+    """Weights that turn draws of h1 given the evidence into draws given it and one object more.
+
+    p(h1 | rest, v_i = 1) ∝ p(h1 | rest) exp(W_i·h1 + attraction_i(h1)), for one row of evidence.
+
+    Args:
+        candidates: (N,) int64.
 
     Returns:
-        (B, V) log-odds and (B, V) standard errors.
+        (M, N), normalised over M.
     """
-    draws = draw_hidden(machine, evidence, draws=count)
-    gain = machine.object_logits(draws.h1)
-    if evidence.edges is not None:
-        candidates = torch.arange(machine.spec.V).unsqueeze(0)
-        gain = gain + machine.attraction(evidence.v, draws.h1, evidence.edges, candidates)
-    log_odds = draws.log_mean_exp(gain)
-    ratio = (gain - log_odds).exp()
-    return log_odds, draws.standard_error(ratio)
+    row = candidates.unsqueeze(0)
+    gain = _object_input(machine, draws.h1, row) + _attraction(machine, evidence, draws, row)
+    return torch.softmax(draws.log_weight + gain.squeeze(1), dim=0)
+
+
+def _object_input(machine: BoltzmannMachine, h1: Tensor, candidates: Tensor) -> Tensor:
+    """W_i·h1, (M, B, N)."""
+    weights = machine.W[candidates]
+    if len(weights) == 1:
+        return h1 @ weights[0].T
+    return torch.einsum("mbk,bnk->mbn", h1, weights)
+
+
+def _attraction(
+    machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
+) -> Tensor:
+    """What unobserved relations add to the log-odds, (M, B, N)."""
+    if evidence.edges is None:
+        return draws.h1.new_zeros(())
+    return machine.attraction(evidence.v, draws.h1, evidence.edges, candidates)
 
 
 def relation_log_odds(

@@ -38,7 +38,7 @@ class BoltzmannMachine(nn.Module, ABC):
     Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
     """
 
-    # Triples have weights of their own beside shared ones, which `training.residuals` may fit.
+    # Triples have weights of their own beside shared ones, which `objectives.relations` may fit.
     has_residuals = False
 
     def __init__(self, spec: MachineSpec) -> None:
@@ -53,7 +53,7 @@ class BoltzmannMachine(nn.Module, ABC):
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         self.triples: Tensor
         if spec.N:
-            # N scenes as bits, (N, ceil(V / 32)), and their room types, -1 for none: `fantasies`.
+            # N chain samples as bits, (N, ceil(V / 32)), and their room types, -1 for none.
             empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
             self.register_buffer("fantasies", empty)
             self.register_buffer("fantasy_rooms", torch.full((spec.N,), -1, dtype=torch.int32))
@@ -165,7 +165,7 @@ class BoltzmannMachine(nn.Module, ABC):
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 
     def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """What given relations add to the logits of the others, (B, E); see `implications`.
+        """What given relations add to the logits of the others, (B, E); see `triway`.
 
         Nothing but in a machine that has weights for it.
 
@@ -300,12 +300,13 @@ class BoltzmannMachine(nn.Module, ABC):
         logits = self.relation_logits(edges, v, h1)
         observed = torch.ones_like(gate, dtype=torch.bool)
         relation = self.relation_term(logits, gate, r, observed).sum(-1)
-        energy = -(self._object_part(v, h1, h2, room) + relation + self.pair_offset(edges, v))
+        energy = self.object_energy(v, h1, h2, room) - relation - self.pair_offset(edges, v)
         return torch.where((r > gate).any(-1), torch.inf, energy)
 
-    def _object_part(self, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor | None) -> Tensor:
-        context = (h1 * self.context_bias(room)).sum(-1) + ((v @ self.W) * h1).sum(-1)
-        return v @ self.b + context + h2 @ self.c2 + ((h1 @ self.J) * h2).sum(-1)
+    def object_energy(self, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor | None) -> Tensor:
+        """The energy without relations, (..., B)."""
+        context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
+        return -(v @ self.b + h2 @ self.c2 + context + ((h1 @ self.J) * h2).sum(-1))
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
         """sum of κ_a over active units, (..., B); zero but for a compensated seed form."""

@@ -16,6 +16,7 @@ OBJECTIVES: dict[str, type[Objective]] = {
     "contrastive_divergence": ContrastiveDivergence,
     "persistent_cd": PersistentCD,
     "composite": CompositeLikelihood,
+    "relations": RelationLikelihood,
 }
 
 __all__ = [

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from training.batches import Batch
+from training.batches import Batch, SceneTensors
 from training.config import ObjectiveConfig
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges
+
+if TYPE_CHECKING:
+    from training.trainer import TrainingData
 
 
 class Objective(ABC):
@@ -26,6 +30,14 @@ class Objective(ABC):
         nothing = torch.zeros(machine.spec.V, dtype=torch.bool)
         self.structure = nothing if structure is None else structure
 
+    # The best epoch is the last: a likelihood under a prior has no early optimum.
+    keeps_last = False
+
+    @classmethod
+    def of(cls, config: ObjectiveConfig, machine: BoltzmannMachine, data: TrainingData) -> Self:
+        """The objective over the scenes of a run."""
+        return cls(config, machine, data.structure)
+
     @abstractmethod
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
         """A scalar whose gradient is the update direction."""
@@ -36,6 +48,15 @@ class Objective(ABC):
     def parameters(self) -> list[nn.Parameter]:
         """What it learns beside the machine's weights, and leaves out of the machine."""
         return []
+
+    def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
+        """The machine with its best weights, made ready to be stored.
+
+        Args:
+            train: the scenes that the objective was trained on.
+        """
+        del train
+        return machine
 
     def state(self) -> dict[str, Tensor]:
         """What a checkpoint must keep."""

@@ -57,14 +57,6 @@ def data_state(
     return State(batch.v, h1, h2, r, edges), observed
 
 
-def object_energy(
-    machine: BoltzmannMachine, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor
-) -> Tensor:
-    """The energy without relations, (B,)."""
-    context = (h1 * (machine.context_bias(room) + v @ machine.W)).sum(-1)
-    return -(v @ machine.b + h2 @ machine.c2 + context + ((h1 @ machine.J) * h2).sum(-1))
-
-
 def relation_nll(
     machine: BoltzmannMachine, edges: Edges, v: Tensor, h1: Tensor, r: Tensor, observed: Tensor
 ) -> Tensor:
@@ -83,9 +75,9 @@ def energy_difference(
 ) -> Tensor:
     """mean F(data) - mean F(model); in the local form mean E, plus -log p(r | v, h1)."""
     if not machine.relations_act:
-        positive = object_energy(machine, data.v, data.h1, data.h2, data_room)
+        positive = machine.object_energy(data.v, data.h1, data.h2, data_room)
         positive = positive + relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
-        negative = object_energy(machine, model.v, model.h1, model.h2, model_room)
+        negative = machine.object_energy(model.v, model.h1, model.h2, model_room)
         return positive.mean() - negative.mean()
     # Both in one pass: the states are reachable, so the gate need not be looked at.
     bare, context = machine.linear_relations(data.edges, data.v, data.r)

@@ -2,7 +2,7 @@
 
     - sum over scenes and known units of log p(r_e | v, E[h1 | v]),   logit_e = ℓ_e + δ[source, a]
 
-A unit is known where it holds or is known not to (`training.datasets.meanings`); all others drop
+A unit is known where it holds or is known not to (`training.datasets.sources`); all others drop
 out. People mention what is worth mentioning, and a procedural room lists all there is: so each
 source has an offset δ of its own for each relation. Offsets are learned and left out when serving.
 
@@ -27,7 +27,12 @@ Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Sala
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import (
     cached,
@@ -38,15 +43,25 @@ from torch.nn.utils.parametrize import (
 
 from training.batches import Batch, SceneTensors, relation_units
 from training.config import ObjectiveConfig
-from training.machines import BoltzmannMachine
+from training.machines import BoltzmannMachine, build
 from training.machines.mean_field import Evidence, mean_field
 from training.objectives.base import Objective, relation_nll, withhold_counts, withhold_rooms
+
+if TYPE_CHECKING:
+    from training.trainer import TrainingData
 
 _OBJECT_PART = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B", "usual", "d"})
 # The map of word vectors is shared by all classes, and needs less of a prior than one class does.
 _MAP_PRIOR = 0.1
 _ROWS = ("S", "O")
 _COLUMNS = ("s", "o")
+# τ: so many scenes at even odds would weigh four times as much.
+_PRECISION = 1.0
+# Scenes that must speak of a triple, and the least weight that is worth keeping.
+_SPEAKING_SCENES = 5
+_LEAST_RESIDUAL = 0.1
+_NEWTON_STEPS = 12
+_BATCH = 64
 
 
 class WordPrior(nn.Module):
@@ -77,8 +92,9 @@ class RelationLikelihood(Objective):
         machine: gets the word prior.
         train: says which sources there are, and how many scenes.
         words: (V, D) unit vectors of the classes; None without a word prior.
-        structure: (V,) bool; relations of structure are unknown.
     """
+
+    keeps_last = True
 
     def __init__(
         self,
@@ -94,6 +110,20 @@ class RelationLikelihood(Objective):
         self.source_weights = torch.tensor(weights)
         if words is not None and config.word_weight:
             add_word_prior(machine, words * config.word_weight)
+
+    @classmethod
+    def of(cls, config: ObjectiveConfig, machine: BoltzmannMachine, data: TrainingData) -> Self:
+        """The objective over the training scenes of a run."""
+        return cls(config, machine, data.train, data.words)
+
+    def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
+        """With the word prior in plain weights, and residuals unless they are held at zero."""
+        bake_word_prior(machine)
+        if machine.has_residuals and machine.get_parameter("residual").requires_grad:
+            return with_counted_residuals(
+                machine, train, self.offsets.detach(), self.source_weights
+            )
+        return machine
 
     def parameters(self) -> list[nn.Parameter]:
         """The offsets."""
@@ -161,3 +191,73 @@ def bake_word_prior(machine: BoltzmannMachine) -> None:
     for name in (*_ROWS, *_COLUMNS):
         if is_parametrized(machine, name):
             remove_parametrizations(machine, name, leave_parametrized=True)
+
+
+def with_counted_residuals(
+    machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
+) -> BoltzmannMachine:
+    """The machine with weights of single triples, smoothed towards counts.
+
+    Shared factors say what a relation means across classes, and say too much of pairs that many
+    scenes show not to stand so (a window on a stove). So after training each triple e = (a,i,j)
+    that enough scenes speak of gets a weight of its own: the maximum of
+
+        sum over scenes of log p(r_e | v, E[h1 | v], w_e' + δ_e) - τ/2 δ_e²
+
+    by Newton's method, all other weights as they are and the context seeing a random share of the
+    objects, as in training. The fewer scenes speak of a triple, the nearer its δ stays to 0.
+
+    Args:
+        train: scenes of which relations are known.
+        offsets: (sources, A), added to the logits of each source's scenes.
+        source_weights: (sources,) what a relation of each source counts for.
+    """
+    keys, logits, holds, weights = _known_units(machine, train, offsets, source_weights)
+    triples, which, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    delta = np.zeros(len(triples))
+    for _ in range(_NEWTON_STEPS):
+        p = 1 / (1 + np.exp(-(logits + delta[which])))
+        slope = np.bincount(which, weights * (holds - p), len(triples)) - _PRECISION * delta
+        curvature = np.bincount(which, weights * p * (1 - p), len(triples)) + _PRECISION
+        delta += (slope / curvature).clip(-2, 2)
+    before = machine.get_parameter("residual").tolist()
+    old = dict(zip(machine.triple_keys.tolist(), before, strict=True))
+    kept = (counts >= _SPEAKING_SCENES) & (np.abs(delta) >= _LEAST_RESIDUAL)
+    for key, value in zip(triples[kept].tolist(), delta[kept].tolist(), strict=True):
+        old[key] = old.get(key, 0.0) + value
+    return _with_residuals(machine, old)
+
+
+@torch.no_grad()
+def _known_units(
+    machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Keys (U,), logits, values and weights of all known units."""
+    columns: list[list[Tensor]] = [[], [], [], []]
+    V = machine.spec.V
+    generator = torch.Generator().manual_seed(0)
+    for index in torch.arange(len(train)).split(_BATCH):
+        batch = train.batch(index)
+        edges, r, observed = relation_units(machine, batch)
+        h1 = mean_field(machine, Evidence(partly_shown(batch.v, generator))).y.sigmoid()
+        logits = machine.relation_logits(edges, batch.v, h1)
+        logits = logits + offsets[batch.source].gather(1, edges.relation)
+        known = (observed * machine.gate(edges, batch.v)) > 0
+        key = (edges.relation * V + edges.subject) * V + edges.object
+        weight = source_weights[batch.source].unsqueeze(1).expand_as(logits)
+        for column, values in zip(columns, (key, logits, r, weight), strict=True):
+            column.append(values[known])
+    key, logits, r, weight = (torch.cat(column) for column in columns)
+    return key.numpy(), logits.double().numpy(), r.double().numpy(), weight.double().numpy()
+
+
+def _with_residuals(machine: BoltzmannMachine, residuals: dict[int, float]) -> BoltzmannMachine:
+    V = machine.spec.V
+    keys = torch.tensor(sorted(residuals), dtype=torch.int64)
+    triples = torch.stack([keys // V // V, keys // V % V, keys % V], 1).to(torch.int32)
+    larger = build(replace(machine.spec, T=len(keys)))
+    state = machine.state_dict()
+    state["triples"] = triples
+    state["residual"] = torch.tensor([residuals[key] for key in keys.tolist()])
+    larger.load_state_dict(state)
+    return larger

@@ -63,8 +63,6 @@ class Observation:
         machine: whose units these are.
         scene: its classes, in arrays.
         classes, counts: (n,) int64, the distinct classes, ascending, and their instances.
-        row: (N,) int64, for each object of the scene the place of its class in `classes`.
-        first: (n,) int64, position of the first object of each class.
         holds, observed: (A, n, n) bool.
         evidence: the same in the machine's layout, one row.
         units: layout of the evidence's relations; None where relations say nothing.
@@ -75,20 +73,11 @@ class Observation:
     scene: Present
     classes: Tensor
     counts: Tensor
-    row: Tensor
-    first: Tensor
     holds: Tensor
     observed: Tensor
     evidence: Evidence
     units: Units | None
     touched: Tensor
-
-    @property
-    def present(self) -> Tensor:
-        """(V,) bool."""
-        present = torch.zeros(self.machine.spec.V, dtype=torch.bool)
-        present[self.classes] = True
-        return present
 
     @property
     def unit_count(self) -> int:
@@ -125,7 +114,6 @@ def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
         ValueError: an object outside the machine's classes, or a room type it does not have.
     """
     spec = machine.spec
-    present_ = present(scene, spec)
     found = class_evidence(scene)
     classes, counts = torch.from_numpy(found.classes), torch.from_numpy(found.counts)
     v = torch.zeros(1, spec.V, dtype=machine.b.dtype)
@@ -136,11 +124,9 @@ def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
     observed = torch.from_numpy(found.observed[: spec.A])
     observation = Observation(
         machine=machine,
-        scene=present_,
+        scene=present(scene, spec),
         classes=classes,
         counts=counts,
-        row=torch.from_numpy(present_.row),
-        first=torch.from_numpy(present_.first),
         holds=holds,
         observed=observed,
         evidence=Evidence(v, room=room),

@@ -17,8 +17,11 @@ import pytest
 from scipy.io import savemat
 
 from app.scene import CANONICAL
+from training.config import ConfigError, DataConfig
 from training.datasets import (
     READERS,
+    AnnotatedObject,
+    AnnotatedScene,
     DatasetError,
     encode,
     generate_rooms,
@@ -27,6 +30,7 @@ from training.datasets import (
     read_scenes,
 )
 from training.datasets.readers import guess_format
+from training.pipeline import read_sources
 
 Write = Callable[[Path], Path]
 
@@ -49,6 +53,8 @@ DESK_SCENE: dict[str, Any] = {
         {"id": "x", "label": "cup", "box2d": [1, 2, 3, 4]},
     ],
     "relations": [[1, "on-top", 0], ["x", "right", 1], ["x", "right", 1]],
+    "false_relations": [[0, "behind", "x"]],
+    "counts": {"cup": 3},
     "viewer_frame": True,
 }
 BARE_SCENE: dict[str, Any] = {"scene_id": "b", "objects": [{"id": 0, "label": "bed"}]}
@@ -68,7 +74,9 @@ def test_jsonl(tmp_path: Path) -> None:
     assert (desk.id, desk.position, desk.size) == ("0", (2.0, 0.0, 0.4), (0.8, 1.6, 0.8))
     assert (monitor.supported_by, monitor.size) == ("0", None)
     assert (cup.id, cup.box2d) == ("x", (1.0, 2.0, 3.0, 4.0))
+    assert [thing.count for thing in first.objects] == [1, 1, 3]
     assert first.relations == ((1, "on-top", 0), (2, "right", 1))
+    assert first.false_relations == ((0, "behind", 2),)
     assert (second.group, second.room_type, second.relations) == ("b", None, None)
     assert second.viewer_frame is False
 
@@ -131,8 +139,50 @@ def test_jsonl_of_known_sources(tmp_path: Path) -> None:
     assert bedroom.viewer_frame is True
 
 
-def change(scene: dict[str, Any], **fields: Any) -> dict[str, Any]:
-    return scene | fields
+@pytest.fixture
+def alfred(tmp_path: Path) -> Callable[..., Path]:
+    """Writes one scene of a cup and a table."""
+
+    def write(**fields: Any) -> Path:
+        things = [{"id": 0, "label": "cup"}, {"id": 1, "label": "table"}]
+        scene = {"scene_id": "a", "source": "alfred", "objects": things}
+        return write_json(tmp_path / "alfred.jsonl", scene | fields)
+
+    return write
+
+
+def test_predicates_of_sentences(alfred: Callable[..., Path]) -> None:
+    relations = [[0, "on-top", 1], [0, "inside", 1], [0, "next to", 1], [1, "covered", 0]]
+    (scene,) = read_scenes(alfred(relations=relations, false_relations=[[1, "inside", 0]]))
+    assert scene.relations == ((0, "on-top", 1),)
+    assert scene.false_relations == ()
+
+
+def test_counts_belong_to_the_one_object_of_their_label(alfred: Callable[..., Path]) -> None:
+    (scene,) = read_scenes(alfred(counts={"cup": 3}))
+    assert [thing.count for thing in scene.objects] == [3, 1]
+    for counts, problem in (
+        ({"fork": 1}, "which 0 objects are called"),
+        ({"cup": 0}, "must be 1 to 1000000"),
+        ({"cup": 10**20}, "must be 1 to 1000000"),
+        ({"cup": 1.5}, "must be an integer"),
+        ({"cup": True}, "must be an integer"),
+        ([3], "must be a mapping"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            read_scenes(alfred(counts=counts))
+
+
+def test_sources_by_name_are_found_in_the_folder_extra(
+    alfred: Callable[..., Path], tmp_path: Path
+) -> None:
+    (tmp_path / "extra").mkdir()
+    jsonl.write_jsonl(read_scenes(alfred()), tmp_path / "extra" / "nr3d.jsonl.gz")
+    (scene,) = read_sources(DataConfig(sources=("nr3d",)), tmp_path)["nr3d"]
+    assert scene.source == "nr3d"
+    for source in ("vsr", "nr3d.jsonl.gz"):
+        with pytest.raises(ConfigError, match="there is no"):
+            read_sources(DataConfig(sources=(source,)), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -141,22 +191,22 @@ def change(scene: dict[str, Any], **fields: Any) -> dict[str, Any]:
         ("{", "not JSON"),
         ("[]", "a scene must be a JSON object, not list"),
         ('{"scene_id": "a"}', "a scene lacks objects"),
-        (json.dumps(change(BARE_SCENE, scene_id=" ")), "scene_id must be a non-empty string"),
-        (json.dumps(change(BARE_SCENE, colour="red")), "unknown fields: colour"),
-        (json.dumps(change(BARE_SCENE, objects={})), "objects must be a list"),
-        (json.dumps(change(BARE_SCENE, objects=["bed"])), "an object must be a JSON object"),
-        (json.dumps(change(BARE_SCENE, objects=[{"id": 0}])), "an object lacks label"),
-        (json.dumps(change(BARE_SCENE, objects=[{"id": 0, "label": ""}])), "label must be"),
-        (json.dumps(change(BARE_SCENE, objects=[{"id": 1.5, "label": "a"}])), "an id must be"),
-        (json.dumps(change(BARE_SCENE, objects=BARE_SCENE["objects"] * 2)), "objects with one id"),
-        (json.dumps(change(BARE_SCENE, room_type=3)), "room_type must be"),
-        (json.dumps(change(BARE_SCENE, viewer_frame="yes")), "viewer_frame must be"),
-        (json.dumps(change(BARE_SCENE, relations={})), "relations must be a list or null"),
-        (json.dumps(change(BARE_SCENE, relations=[[0, "left"]])), "a relation is"),
-        (json.dumps(change(BARE_SCENE, relations=[[0, "left", 7]])), "not in the scene"),
-        (json.dumps(change(DESK_SCENE, relations=[[0, "near", 1]])), "unknown relation 'near'"),
+        (json.dumps(BARE_SCENE | {"scene_id": " "}), "scene_id must be a non-empty string"),
+        (json.dumps(BARE_SCENE | {"colour": "red"}), "unknown fields: colour"),
+        (json.dumps(BARE_SCENE | {"objects": {}}), "objects must be a list"),
+        (json.dumps(BARE_SCENE | {"objects": ["bed"]}), "an object must be a JSON object"),
+        (json.dumps(BARE_SCENE | {"objects": [{"id": 0}]}), "an object lacks label"),
+        (json.dumps(BARE_SCENE | {"objects": [{"id": 0, "label": ""}]}), "label must be"),
+        (json.dumps(BARE_SCENE | {"objects": [{"id": 1.5, "label": "a"}]}), "an id must be"),
+        (json.dumps(BARE_SCENE | {"objects": BARE_SCENE["objects"] * 2}), "objects with one id"),
+        (json.dumps(BARE_SCENE | {"room_type": 3}), "room_type must be"),
+        (json.dumps(BARE_SCENE | {"viewer_frame": "yes"}), "viewer_frame must be"),
+        (json.dumps(BARE_SCENE | {"relations": {}}), "relations must be a list or null"),
+        (json.dumps(BARE_SCENE | {"relations": [[0, "left"]]}), "a relation is"),
+        (json.dumps(BARE_SCENE | {"relations": [[0, "left", 7]]}), "not in the scene"),
+        (json.dumps(DESK_SCENE | {"relations": [[0, "near", 1]]}), "unknown relation 'near'"),
         *(
-            (json.dumps(change(BARE_SCENE, objects=[{"id": 0, "label": "a"} | extra])), message)
+            (json.dumps(BARE_SCENE | {"objects": [{"id": 0, "label": "a"} | extra]}), message)
             for extra, message in (
                 ({"position": [1, 2]}, "position must be a list of 3 numbers"),
                 ({"position": [1, 2, "3"]}, "position must be a list of 3 numbers"),
@@ -172,7 +222,7 @@ def change(scene: dict[str, Any], **fields: Any) -> dict[str, Any]:
 )  # fmt: skip
 def test_malformed_jsonl(tmp_path: Path, line: str, message: str) -> None:
     path = tmp_path / "scenes.jsonl"
-    path.write_text(f"{json.dumps(change(BARE_SCENE, scene_id='good'))}\n{line}\n")
+    path.write_text(f"{json.dumps(BARE_SCENE | {'scene_id': 'good'})}\n{line}\n")
     with pytest.raises(DatasetError, match=message) as caught:
         read_scenes(path)
     assert caught.value.path == path
@@ -496,6 +546,13 @@ def test_malformed_coco(tmp_path: Path, content: Any, message: str) -> None:
 
 
 # ------------------------------------------------------------------------------- all of them
+
+
+@pytest.mark.parametrize("ends", [(0, "left", 1), (-1, "left", 0)])
+def test_relations_name_objects_of_their_scene(ends: tuple[int, str, int]) -> None:
+    with pytest.raises(ValueError, match=r"a relation names object -?1 of 1"):
+        AnnotatedScene("s", "t", "g", None, (AnnotatedObject("0", "bed"),), (ends,))
+
 
 LAYOUTS: dict[str, Write] = {
     "jsonl": write_jsonl,

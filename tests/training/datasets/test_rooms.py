@@ -8,7 +8,7 @@ import pytest
 from app.scene import CANONICAL
 from app.scene.footprints import overlap_and_gap
 from training.datasets import AnnotatedScene, encode, generate_rooms, rooms_vocabulary, split
-from training.datasets.furniture import ROOMS, WORKPLACES
+from training.datasets.rooms import ROOMS, WORKPLACES
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from tests.training.domain.scenes import scene
 from training.cli import app
 from training.config import ConfigError, data_folder, load_config
 from training.datasets import generate_rooms
-from training.datasets.furniture import WORKPLACES
 from training.datasets.jsonl import write_jsonl
+from training.datasets.rooms import WORKPLACES
 from training.domain.proposal import propose
 from training.pipeline import prepare
 

@@ -6,8 +6,8 @@ from pydantic import ValidationError
 from scene_client.schemas import MissingRequest
 from tests.training.domain.scenes import scene
 from training.datasets import generate_rooms
-from training.datasets.furniture import WORKPLACES
 from training.datasets.names import Names
+from training.datasets.rooms import WORKPLACES
 from training.domain.look import LONGEST, Facts, look
 
 NAMES = Names()

@@ -9,8 +9,8 @@ import torch
 from app.registry import Artifact
 from training.batches import SceneTensors, scene_tensors
 from training.datasets import annotated_classes, encode, generate_rooms, rooms_vocabulary
-from training.draft import draft_artifact
 from training.machines import MachineSpec, build
+from training.publish import draft_artifact
 
 VOCABULARY = rooms_vocabulary()
 STRUCTURE = torch.from_numpy(VOCABULARY.structure.copy())

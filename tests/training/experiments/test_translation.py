@@ -7,11 +7,11 @@ import torch
 
 from app.scene import ObjectClass, Vocabulary
 from training.batches import Batch
-from training.draft import draft_artifact
 from training.evaluation.contenders import artifact_contender
 from training.evaluation.placed import Places
 from training.experiments.translation import BEYOND, Translation, same_classes
 from training.machines import MachineSpec, build
+from training.publish import draft_artifact
 
 
 def vocabulary(*labels: str, aliases: dict[str, tuple[str, ...]] | None = None) -> Vocabulary:

@@ -1,18 +1,18 @@
-"""Where chains start: scenes that the machine has dreamt before.
+"""Where chains start: samples of the machine's own long chains.
 
 A chain that starts at nothing needs thousands of sweeps to find all kinds of rooms, since one kind
-leads to another through scenes of neither. So a trained machine keeps N fantasies, the states of
-long chains of its own, with the room type that each was dreamt under (`BoltzmannMachine.fantasies`
-and `.fantasy_rooms`), and a new chain goes on from one of them.
+leads to another through scenes of neither. So a trained machine stores N chain samples, each with
+its room type (`BoltzmannMachine.fantasies` and `.fantasy_rooms`, the names in the artifact), and a
+new chain goes on from one of them.
 
-With evidence the fantasies are weighed by what they make of it before one is drawn for each chain,
+With evidence the samples are weighed before one is drawn for each chain,
 
-    log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
-            - 6 [dreamt under another room type than t],
+    log w = sum_{i observed} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
+            - 6 [drawn under another room type than t],
 
-h1 at its mean given the fantasy: sampling importance resampling, the sweeps that follow do the
-rest. Where no fantasy was dreamt under t, the last term is h1·Q[t]. A chain does not find from one
-kind of room to another in a few sweeps, whatever Q says.
+h1 at its mean given the sample: sampling importance resampling, followed by sweeps. Where no sample
+was drawn under t, the last term is h1·Q[t]. A few sweeps do not lead from one kind of room to
+another, whatever Q is.
 
 Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for
 fantasy particles; Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian
@@ -54,8 +54,8 @@ def unpack_scenes(packed: Tensor, classes: int) -> Tensor:
     return torch.from_numpy(weights.unpack_scenes(packed.numpy(), classes))
 
 
-class Fantasies:
-    """The fantasies of a machine whose weights do not change, and what each makes of evidence.
+class ChainSamples:
+    """The stored samples of a machine whose weights do not change, weighed by evidence.
 
     Args:
         machine: read here; later changes to it are not seen.
@@ -69,14 +69,14 @@ class Fantasies:
             self.v = unpack_scenes(machine.fantasies, machine.spec.V).to(machine.b.dtype)
             field = mean_field(machine, Evidence(self.v))
             self.h1, self.h2 = field.y.sigmoid(), field.h2
-            # log w of each given class, room type and held unit, a row for each fantasy.
+            # log w of each given class, room type and held unit, a row for each sample.
             self._present = logsigmoid(machine.object_logits(self.h1))
             self._room = self.h1 @ machine.Q.T
             self._unit = logsigmoid(field.y)
 
     @torch.no_grad()
     def start(self, given: Tensor, generator: torch.Generator, clamp: Clamp = FREE) -> State:
-        """A state for each chain: a fantasy that suits its evidence; without any, the evidence.
+        """A state for each chain: a sample that suits its evidence; without any, the evidence.
 
         Args:
             given: (B, V), 1 for classes that must be there.
@@ -91,7 +91,7 @@ class Fantasies:
         return _held(bare_state(machine, self.v[chosen].maximum(given), h1, h2), clamp)
 
     def log_weight(self, given: Tensor, clamp: Clamp = FREE) -> Tensor:
-        """log w of every fantasy, (B, N); see the module."""
+        """log w of every sample, (B, N); see the module."""
         weight = given @ self._present.T
         if clamp.room is not None and self.machine.spec.C:
             known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)

@@ -1,4 +1,4 @@
-"""Fantasies as bits, and chains that start at those which suit their evidence."""
+"""Chain samples as bits, and chains that start at samples which suit their evidence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from training.machines import MachineSpec, build
-from training.machines.fantasies import Fantasies, pack_scenes, unpack_scenes, words
+from training.machines.chain_samples import ChainSamples, pack_scenes, unpack_scenes, words
 from training.machines.gibbs import FREE, Clamp, initial_state
 
 V = 35
@@ -28,7 +28,7 @@ def test_scenes_are_read_back_from_their_bits(scenes, classes, seed):
 
 
 def machine_of(N=6, H2=0, form="local", seed=0):
-    """Every weight from N(0, 1); distinct random fantasies."""
+    """Every weight from N(0, 1); distinct random samples."""
     spec = MachineSpec("triway", V=V, A=1, H1=4, H2=H2, K=2, C=2, N=N, form=form)
     machine = build(spec).double()
     generator = torch.Generator().manual_seed(seed)
@@ -37,15 +37,15 @@ def machine_of(N=6, H2=0, form="local", seed=0):
             if name != "kappa":
                 parameter.copy_(torch.randn(parameter.shape, generator=generator))
         if N:
-            dreamt = (torch.rand(N, V, generator=generator) < 0.4).float()
-            assert len(dreamt.unique(dim=0)) == N
-            machine.fantasies.copy_(pack_scenes(dreamt))
+            stored = (torch.rand(N, V, generator=generator) < 0.4).float()
+            assert len(stored.unique(dim=0)) == N
+            machine.fantasies.copy_(pack_scenes(stored))
             machine.fantasy_rooms.copy_(torch.arange(N) % 3 - 1)
     return machine.requires_grad_(False)
 
 
 def start_chains(machine, given, generator, clamp=FREE):
-    return Fantasies(machine).start(given, generator, clamp)
+    return ChainSamples(machine).start(given, generator, clamp)
 
 
 def evidence(*classes, chains=CHAINS):
@@ -59,12 +59,12 @@ def log_sigmoid(x):
 
 
 def by_formula(machine, classes, room=None, held=()):
-    """Share of chains that start at each fantasy, by the module's docstring, one layer."""
+    """Share of chains that start at each sample, by the module's docstring, one layer."""
     weights = []
-    dreamt = zip(
+    stored = zip(
         unpack_scenes(machine.fantasies, V).double(), machine.fantasy_rooms.tolist(), strict=True
     )
-    for v, own in dreamt:
+    for v, own in stored:
         x = [float(machine.c1[k] + v @ machine.W[:, k]) for k in range(4)]
         h1 = [1 / (1 + math.exp(-value)) for value in x]
         log_w = 0.0
@@ -84,8 +84,8 @@ def by_formula(machine, classes, room=None, held=()):
     [([], None, ()), ([0], None, ()), ([3, 33], None, ()), ([5], 1, ()), ([], None, (2,)),
      ([1], 0, (0, 3))],
 )  # fmt: skip
-def test_fantasies_are_weighed_by_the_formula(classes, room, held):
-    """Shares of 20,000 chains within five standard errors: six fantasies fail by chance with
+def test_samples_are_weighed_by_the_formula(classes, room, held):
+    """Shares of 20,000 chains within five standard errors: six samples fail by chance with
     probability < 4e-6."""
     machine = machine_of()
     clamp = Clamp(
@@ -95,10 +95,10 @@ def test_fantasies_are_weighed_by_the_formula(classes, room, held):
     state = start_chains(machine, evidence(*classes), torch.Generator().manual_seed(1), clamp)
     expected = by_formula(machine, classes, room, held)
     assert max(expected) > 1.05 * min(expected) or not (classes or held or room is not None)
-    dreamt = unpack_scenes(machine.fantasies, V).double().maximum(evidence(*classes, chains=1))
-    assert len(dreamt.unique(dim=0)) == len(dreamt)
+    stored = unpack_scenes(machine.fantasies, V).double().maximum(evidence(*classes, chains=1))
+    assert len(stored.unique(dim=0)) == len(stored)
     total = 0.0
-    for v, p in zip(dreamt, expected, strict=True):
+    for v, p in zip(stored, expected, strict=True):
         share = float((state.v == v).all(1).double().mean())
         assert abs(share - p) <= 5 * math.sqrt(p * (1 - p) / CHAINS)
         total += share
@@ -106,14 +106,14 @@ def test_fantasies_are_weighed_by_the_formula(classes, room, held):
     assert bool((state.h1[:, list(held)] == 1).all())
 
 
-def test_a_room_type_that_nobody_dreamt_of_takes_any_fantasy():
+def test_a_room_type_without_samples_takes_any_sample():
     machine = machine_of()
     machine.fantasy_rooms.fill_(0)
     clamp = Clamp(room=torch.full((200,), 1))
-    fantasies = Fantasies(machine)
-    plain = fantasies.log_weight(evidence(3, chains=200))
-    weight = fantasies.log_weight(evidence(3, chains=200), clamp)
-    assert torch.allclose(weight - plain, (fantasies.h1 @ machine.Q[1]).expand(200, -1))
+    samples = ChainSamples(machine)
+    plain = samples.log_weight(evidence(3, chains=200))
+    weight = samples.log_weight(evidence(3, chains=200), clamp)
+    assert torch.allclose(weight - plain, (samples.h1 @ machine.Q[1]).expand(200, -1))
 
 
 @pytest.mark.parametrize("N", [0, 6])
@@ -137,7 +137,7 @@ def test_chains_hold_what_is_given(N, H2):
 
 
 @pytest.mark.parametrize("form", ["seed", "local"])
-def test_without_fantasies_chains_start_at_their_evidence(form):
+def test_without_samples_chains_start_at_their_evidence(form):
     machine = machine_of(N=0, form=form)
     chains = evidence(2, 9, chains=7)
     state = start_chains(machine, chains, torch.Generator().manual_seed(5))

@@ -1,9 +1,5 @@
 from __future__ import annotations
 
-import gzip
-import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,20 +9,14 @@ import torch
 from app.scene import ObjectClass, Vocabulary
 from app.scene.relations import ABOVE, FRONT, LEFT, ON_TOP
 from training.batches import scene_tensors
-from training.config import ConfigError, DataConfig
 from training.datasets import (
     AnnotatedObject,
     AnnotatedScene,
-    DatasetError,
     EncodedScene,
     annotated_classes,
     encode,
-    jsonl,
-    read_scenes,
 )
-from training.datasets.meanings import BOXES, LISTS, MEANINGS, meaning_of
-from training.pipeline import read_sources
-from training.terms import TERMS
+from training.datasets.sources import BOXES, LISTS, SOURCES, meaning_of
 
 VOCABULARY = Vocabulary([ObjectClass("desk"), ObjectClass("monitor"), ObjectClass("pencil")])
 LATERAL, VERTICAL = [LEFT, FRONT], [ON_TOP, ABOVE]
@@ -141,84 +131,7 @@ def test_a_floor_plan_counts_as_a_few_scenes() -> None:
     assert tensors.complete[[12, 0]].tolist() == [False, True]
 
 
-def test_every_source_has_a_meaning_and_terms() -> None:
-    assert set(MEANINGS) - {"sunrgbd-bedroom-3d"} == set(TERMS) - {"rooms"}
-    incomplete = {source for source, meaning in MEANINGS.items() if not meaning.complete_objects}
+def test_sources_of_mentions_have_incomplete_object_lists() -> None:
+    incomplete = {name for name in SOURCES if not meaning_of(name).complete_objects}
     mentions = {"vrd", "nr3d", "coco_captions", "reverie_text", "vsr", "bddl_goal"}
     assert incomplete == mentions | {"placing_priors"}
-
-
-# ------------------------------------------------------------------------------ reading
-
-
-@pytest.fixture
-def lines(tmp_path: Path) -> Callable[..., Path]:
-    def write(**fields: Any) -> Path:
-        scene = {
-            "scene_id": "a",
-            "source": "alfred",
-            "objects": [{"id": 0, "label": "cup"}, {"id": 1, "label": "table"}],
-        }
-        path = tmp_path / "alfred.jsonl"
-        path.write_text(json.dumps(scene | fields) + "\n")
-        return path
-
-    return write
-
-
-def test_predicates_of_sentences(lines: Callable[..., Path]) -> None:
-    relations = [[0, "on-top", 1], [0, "inside", 1], [0, "next to", 1], [1, "covered", 0]]
-    (scene,) = read_scenes(lines(relations=relations, false_relations=[[1, "inside", 0]]))
-    assert scene.relations == ((0, "on-top", 1),)
-    assert scene.false_relations == ()
-
-
-def test_counts_belong_to_the_one_object_of_their_label(lines: Callable[..., Path]) -> None:
-    (scene,) = read_scenes(lines(counts={"cup": 3}))
-    assert [thing.count for thing in scene.objects] == [3, 1]
-    for counts, problem in (
-        ({"fork": 1}, "which 0 objects are called"),
-        ({"cup": 0}, "must be 1 to 1000000"),
-        ({"cup": 10**20}, "must be 1 to 1000000"),
-        ({"cup": 1.5}, "must be an integer"),
-        ({"cup": True}, "must be an integer"),
-        ([3], "must be a mapping"),
-    ):
-        with pytest.raises(ValueError, match=problem):
-            read_scenes(lines(counts=counts))
-
-
-def test_scenes_are_read_as_they_were_written(lines: Callable[..., Path], tmp_path: Path) -> None:
-    scenes = read_scenes(lines(counts={"cup": 3}, relations=[], false_relations=[[1, "behind", 0]]))
-    jsonl.write_jsonl(scenes, tmp_path / "again.jsonl.gz")
-    assert read_scenes(tmp_path / "again.jsonl.gz") == scenes
-    assert scenes[0].false_relations == ((1, "behind", 0),)
-
-
-def test_a_number_of_400_digits_is_an_error_of_its_line(lines: Callable[..., Path]) -> None:
-    for field in ("position", "size", "yaw"):
-        huge = [10**400, 0, 0] if field != "yaw" else 10**400
-        path = lines(objects=[{"id": 0, "label": "cup", field: huge}])
-        with pytest.raises(DatasetError, match=r"alfred\.jsonl, line 1: a number of 401 digits"):
-            read_scenes(path)
-
-
-def test_a_small_file_cannot_unpack_into_a_huge_line(tmp_path: Path) -> None:
-    path = tmp_path / "bomb.jsonl.gz"
-    with gzip.open(path, "wb", compresslevel=1) as file:
-        for _ in range(9):
-            file.write(b" " * 2**20)
-    with pytest.raises(DatasetError, match="line 1: is longer than 8388608 bytes"):
-        read_scenes(path)
-
-
-def test_sources_by_name_are_found_in_the_folder_extra(
-    lines: Callable[..., Path], tmp_path: Path
-) -> None:
-    (tmp_path / "extra").mkdir()
-    jsonl.write_jsonl(read_scenes(lines()), tmp_path / "extra" / "nr3d.jsonl.gz")
-    (scene,) = read_sources(DataConfig(sources=("nr3d",)), tmp_path)["nr3d"]
-    assert scene.source == "nr3d"
-    for source in ("vsr", "nr3d.jsonl.gz"):
-        with pytest.raises(ConfigError, match="there is no"):
-            read_sources(DataConfig(sources=(source,)), tmp_path)

@@ -1,0 +1,228 @@
+"""The known data sets: terms of use, predicates, and the meaning of what a scene does not list.
+
+A listed relation holds. An unlisted one is off, or off only for neighbours, or unobserved:
+
+| source | on-top | above | left, front |
+|---|---|---|---|
+| boxes with sizes (procthor) | off | off | off for neighbours |
+| centres only (bedrooms) | unobserved | unobserved | off |
+| 3dssg | off | unobserved | off for neighbours |
+| pictures and sentences | unobserved | unobserved | unobserved |
+| lists of the user's own | off | off | off |
+
+Two rules hold in every source. A listed on-top or above excludes all other relations of its pair,
+in both directions, unless they are listed too: a thing on another is not beside it. (Of pairs
+with a listed on-top or above, 1 to 10 % also have a left or front.) A relation that an annotator
+denied is off.
+
+Neighbours are near by the rule of `app.scene.geometry`. Without poses, neighbours are the pairs for
+which the annotators listed any relation. 3DSSG compares heights only within a class and lists
+left and front only between things with one support, so above and far pairs stay unobserved there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from app.scene import CANONICAL, RELATIONS
+
+Unlisted = Literal["off", "off for neighbours", "unobserved"]
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """The meaning of the unlisted in a source.
+
+    Attributes:
+        on_top, above, lateral: an unlisted relation of the kind; left and front are lateral.
+        complete_objects: the object list is nearly the whole scene, so that absence from it teaches
+            which objects go together.
+        scenes_per_group: a group counts as so many scenes at most in object learning; None where
+            each scene counts in full.
+    """
+
+    on_top: Unlisted = "off"
+    above: Unlisted = "off"
+    lateral: Unlisted = "off"
+    complete_objects: bool = True
+    scenes_per_group: float | None = None
+
+    @property
+    def unlisted(self) -> tuple[Unlisted, ...]:
+        """By canonical relation."""
+        own = {"on-top": self.on_top, "above": self.above}
+        return tuple(own.get(name, self.lateral) for name in CANONICAL)
+
+
+LISTS: Final = Meaning()
+"""Relations that a user listed: an unlisted one is off."""
+
+BOXES: Final = Meaning(lateral="off for neighbours")
+"""Relations derived from positions; without sizes the vertical ones are unobserved."""
+
+_CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
+_MENTIONS: Final = Meaning(
+    on_top="unobserved", above="unobserved", lateral="unobserved", complete_objects=False
+)
+
+_THE_EIGHT: Final = {name: name for name in RELATIONS}
+# Supports of 3DSSG are one relation here, however the thing rests.
+_3DSSG: Final = {
+    "left": "left",
+    "right": "right",
+    "front": "front",
+    "behind": "behind",
+    "standing on": "on-top",
+    "lying on": "on-top",
+    "supported by": "on-top",
+    "higher than": "above",
+    "lower than": "below",
+}
+_VRD: Final = {
+    "on": "on-top",
+    "on the top of": "on-top",
+    "above": "above",
+    "over": "above",
+    "under": "under",
+    "beneath": "under",
+    "below": "below",
+    "behind": "behind",
+    "in the front of": "front",
+    "on the left of": "left",
+    "on the right of": "right",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A known data set.
+
+    Attributes:
+        terms: provenance and licence, for the model card.
+        research_only: the licence excludes commercial use.
+        meaning: of the unlisted; None where it depends on whether a scene lists relations.
+        predicates: the relation of each predicate. Other predicates are left out: they are known
+            and say nothing that the eight relations could hold, such as "inside", "attached",
+            "next to", "wear". None where an unknown predicate is a mistake.
+        left_out: labels that are annotated too incompletely to be used.
+        open_vocabulary: annotated in free words: a class that is never mentioned was absent. In
+            the others annotators chose from a list; a class outside the list is unobserved.
+    """
+
+    terms: str
+    research_only: bool = False
+    meaning: Meaning | None = None
+    predicates: Mapping[str, str] | None = None
+    left_out: tuple[str, ...] = ()
+    open_vocabulary: bool = False
+
+
+_BEDROOMS: Final = Source(
+    "SUN RGB-D (Song, Lichtenberg, Xiao, CVPR 2015): 3D boxes of real bedrooms; research use",
+    research_only=True,
+    meaning=_CENTRES,
+)
+
+SOURCES: Final[dict[str, Source]] = {
+    "sunrgbd": Source(
+        "SUN RGB-D (Song, Lichtenberg, Xiao, CVPR 2015): object labels and scene types of real "
+        "RGB-D frames; research use",
+        research_only=True,
+        meaning=LISTS,  # lists no relation at all
+        left_out=("wall", "floor"),
+        open_vocabulary=True,
+    ),
+    "sunrgbd_bedrooms_3d": _BEDROOMS,
+    "sunrgbd-bedroom-3d": _BEDROOMS,  # its name inside the file
+    "3dssg": Source(
+        "3DSSG (Wald, Dhamo, Navab, Tombari, CVPR 2020) on 3RScan: annotated relations of real "
+        "rooms; research use",
+        research_only=True,
+        meaning=Meaning(above="unobserved", lateral="off for neighbours"),
+        predicates=_3DSSG,
+    ),
+    "procthor": Source(
+        "ProcTHOR (Deitke et al., NeurIPS 2022): procedural rooms; Apache-2.0", meaning=BOXES
+    ),
+    "vrd": Source(
+        "VRD (Lu, Krishna, Bernstein, Fei-Fei, ECCV 2016): annotated relations in photographs; "
+        "research use",
+        research_only=True,
+        meaning=_MENTIONS,
+        predicates=_VRD,
+    ),
+    "nr3d": Source(
+        "Nr3D (Achlioptas et al., ECCV 2020): triples from descriptions of ScanNet rooms; "
+        "research use",
+        research_only=True,
+        meaning=_MENTIONS,
+        predicates=_THE_EIGHT,
+    ),
+    "coco_captions": Source(
+        "COCO captions (Lin et al., ECCV 2014): triples from captions of indoor pictures; "
+        "CC BY 4.0",
+        meaning=_MENTIONS,
+        predicates=_THE_EIGHT,
+    ),
+    "reverie_text": Source(
+        "REVERIE (Qi et al., CVPR 2020): triples from instructions for Matterport houses; "
+        "non-commercial use",
+        research_only=True,
+        meaning=_MENTIONS,
+        predicates=_THE_EIGHT,
+    ),
+    "alfred": Source(
+        "ALFRED (Shridhar et al., CVPR 2020): AI2-THOR rooms and triples from instructions; MIT",
+        # Thousands of episodes in about a hundred rooms: a room counts as a few scenes.
+        meaning=Meaning(
+            on_top="unobserved", above="unobserved", lateral="unobserved", scenes_per_group=3.0
+        ),
+        predicates=_THE_EIGHT,
+    ),
+    "bddl_goal": Source(
+        "BEHAVIOR-1K (Li et al., CoRL 2022): end states of household activities; MIT",
+        meaning=_MENTIONS,
+        predicates=_THE_EIGHT,
+    ),
+    "behavior1k_rooms": Source(
+        "BEHAVIOR-1K (Li et al., CoRL 2022): object lists of rooms; MIT",
+        meaning=LISTS,  # lists no relation at all
+        predicates=_THE_EIGHT,
+    ),
+    "vsr": Source(
+        "Visual Spatial Reasoning (Liu, Emerson, Collier, TACL 2023): voted relations in "
+        "photographs; Apache-2.0",
+        meaning=_MENTIONS,
+        predicates=_THE_EIGHT,
+    ),
+    "placing_priors": Source(
+        "VirtualHome (Puig et al., CVPR 2018), AI2-THOR (Kolve et al., 2017) and TidyBot (Wu et "
+        "al., 2023): where things are placed; MIT and Apache-2.0",
+        meaning=_MENTIONS,
+    ),
+    "rooms": Source("Rooms made by this project's own generator; no restriction"),
+}
+
+
+def meaning_of(source: str, *, listed: bool = True) -> Meaning:
+    """The meaning of a source; of an unknown one by whether its scenes list relations."""
+    known = SOURCES.get(source)
+    if known is not None and known.meaning is not None:
+        return known.meaning
+    return LISTS if listed else BOXES
+
+
+def relation_of(source: str, predicate: str) -> str | None:
+    """One of the eight relations, or None where a predicate of the source is none of them.
+
+    Raises:
+        ValueError: none of the eight, in a source that has no predicates of its own.
+    """
+    known = SOURCES.get(source)
+    if known is not None and known.predicates is not None:
+        return known.predicates.get(predicate)
+    if predicate not in RELATIONS:
+        raise ValueError(f"unknown relation {predicate!r}: must be one of {', '.join(RELATIONS)}")
+    return predicate
