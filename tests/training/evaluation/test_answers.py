@@ -18,9 +18,9 @@ from training.evaluation.answers import (
     QUESTIONS,
     ask_outliers,
     collect,
-    kinds_of_intruders,
     uncalibrated,
 )
+from training.evaluation.intruders import kinds_of_intruders
 
 ARTIFACT = artifact_of(larger_machine("triway-local"))
 V = LARGER["triway-local"].V
