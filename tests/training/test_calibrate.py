@@ -237,9 +237,9 @@ def test_hidden_classes_are_as_likely_as_said(model, fitted):
     """On 200 other rooms."""
     artifact = replace(model, calibration=fitted)
     found = collect(artifact, rooms(200, 3), QUESTIONS["missing"])
-    assert found.probability.mean() == pytest.approx(found.truth.mean(), abs=0.05)
-    assert found.ece().value < 0.08
-    assert found.brier_skill().value > 0
+    assert found.score.mean() == pytest.approx(found.truth.mean(), abs=0.05)
+    assert found.metric("ECE").value < 0.08
+    assert found.metric("Brier skill").value > 0
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ take every default, so only answers returned count.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -39,7 +39,7 @@ from training.cases import (
 from training.datasets import EncodedScene
 from training.evaluation.asking import labels_alone, with_intruder
 from training.evaluation.intruders import kinds_of_intruders
-from training.evaluation.metrics import Flags, Floats, Ints, Metric, Scored
+from training.evaluation.metrics import Flags, Ints, Items, Metric
 from training.evaluation.missing import SHARES, shown_classes
 from training.evaluation.setting import Contender, Outcome, Setting
 
@@ -51,30 +51,6 @@ Answered = list[tuple[float, bool]]
 Ask = Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]
 
 
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """All answers of one kind.
-
-    Attributes:
-        scene: (N,) position; probability: (N,); truth: (N,) bool.
-        scenes, skipped: how many were given, and how many could not be asked.
-    """
-
-    scene: Ints
-    probability: Floats
-    truth: Flags
-    scenes: int
-    skipped: int
-
-    def ece(self) -> Scored:
-        """Expected calibration error in bins of equal mass."""
-        return Scored("ECE", self.scene, self.probability, self.truth, self.scenes)
-
-    def brier_skill(self) -> Scored:
-        """Brier skill against the base rate of these answers."""
-        return Scored("Brier skill", self.scene, self.probability, self.truth, self.scenes)
-
-
 def uncalibrated(artifact: Artifact) -> Artifact:
     """The artifact with log-odds taken as they are, only their signs made to fit the answers."""
     plain = Calibration.neutral(artifact.spec.A).model_copy(
@@ -83,33 +59,16 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     return replace(artifact, calibration=plain)
 
 
-def collect(
-    artifact: Artifact,
-    scenes: SceneTensors,
-    ask: Ask,
-    seed: int = 0,
-) -> Answers:
+def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
     """Ask one question (see `QUESTIONS`) of every scene."""
-    place: list[int] = []
-    probability: list[float] = []
-    truth: list[bool] = []
+    answers: list[tuple[int, float, bool]] = []
     skipped = 0
     for k, scene in enumerate(scenes.scenes):
         found = ask(artifact, scene, scene_rng(scene, seed))
-        if found is None:
-            skipped += 1
-            continue
-        for p, so in found:
-            place.append(k)
-            probability.append(p)
-            truth.append(so)
-    return Answers(
-        np.array(place, dtype=np.int64),
-        np.array(probability),
-        np.array(truth, dtype=np.bool_),
-        len(scenes),
-        skipped,
-    )
+        skipped += found is None
+        answers += [(k, probability, so) for probability, so in found or ()]
+    place, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
+    return Items(place.astype(np.int64), probability, truth > 0, len(scenes), skipped)
 
 
 def ask_relations(
@@ -289,10 +248,9 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
         skipped += found.skipped
         if len(found.scene):
             before = collect(plain, asked, ask, setting.seed)
-            metrics[f"ECE, {name}"] = found.ece()
-            metrics[f"ECE, {name}, uncalibrated"] = before.ece()
-            metrics[f"Brier skill, {name}"] = found.brier_skill()
-            metrics[f"Brier skill, {name}, uncalibrated"] = before.brier_skill()
+            for figure in ("ECE", "Brier skill"):
+                metrics[f"{figure}, {name}"] = found.metric(figure)
+                metrics[f"{figure}, {name}, uncalibrated"] = before.metric(figure)
     # Skill is undefined where no answer was true, or every one.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from training.batches import SceneTensors
 from training.cases import scene_rng
-from training.evaluation.metrics import Flags, Floats, Ints, Ratio, Scored, lowest_is
+from training.evaluation.metrics import Flags, Floats, Ints, Items, Ratio
 
 SIGNATURE = 10
 """Classes that a room type is known by, at most."""
@@ -177,23 +177,16 @@ class IntruderScores:
         """With the log-odds of being an intruder taken from each class, (V,)."""
         return replace(self, log_odds=self.log_odds - prior[self.thing])
 
+    @property
+    def dirty(self) -> Items:
+        """The objects of scenes with an intruder, by -log-odds; it alone is true."""
+        rows = ~self.clean
+        score, truth = -self.log_odds[rows], self.intruder[rows]
+        return Items(self.scene[rows], score, truth, self.scenes, self.skipped)
+
     def hit_at_1(self) -> Ratio:
         """Share of scenes whose intruder has the lowest log-odds (ties in expectation)."""
-        rows = ~self.clean
-        return lowest_is(self.scene[rows], self.log_odds[rows], self.intruder[rows], self.scenes)
-
-    def auroc(self) -> Scored:
-        """Area under the ROC of -log-odds, intruders against the objects they joined."""
-        return self._scored("AUROC")
-
-    def average_precision(self) -> Scored:
-        """Average precision of the same ranking."""
-        return self._scored("average precision")
-
-    def _scored(self, statistic: str) -> Scored:
-        rows = ~self.clean
-        scene, score = self.scene[rows], -self.log_odds[rows]
-        return Scored(statistic, scene, score, self.intruder[rows], self.scenes)
+        return self.dirty.hit_at_1()
 
     def false_alarms(self, loud: Flags) -> Ratio:
         """Share of untouched scenes in which some object is loud, (N,)."""

@@ -235,20 +235,6 @@ class Ratio(Metric):
         )
 
 
-def lowest_is(scene: Ints, value: Floats, right: Flags, scenes: int) -> Ratio:
-    """hit@1: share of scenes whose item of the lowest value is a right one, ties in expectation.
-
-    Args:
-        scene, value, right: (N,) of each item.
-    """
-    lowest = np.full(scenes, np.inf)
-    np.minimum.at(lowest, scene, value)
-    least = value == lowest[scene]
-    ties = np.bincount(scene[least], minlength=scenes)
-    hits = np.bincount(scene[least & right], minlength=scenes)
-    return Ratio.of_scenes(hits / np.maximum(ties, 1), ties > 0)
-
-
 class _OfItems(Metric):
     """A metric of N items that belong to scenes: a dataclass of columns.
 
@@ -354,6 +340,35 @@ class Scored(_OfItems):
         drawn = super().resampled(resamples, seed)
         # Calibration errors grow under resampling, as if there were fewer answers.
         return _centred(drawn, self.value) if self.statistic == "ECE" else drawn
+
+
+@dataclass(frozen=True, eq=False)
+class Items:
+    """N scored items of some scenes, such as answers with their probability.
+
+    Attributes:
+        scene: (N,) position; score: (N,); truth: (N,) bool.
+        scenes, skipped: how many were given, and how many could not be scored.
+    """
+
+    scene: Ints
+    score: Floats
+    truth: Flags
+    scenes: int
+    skipped: int = 0
+
+    def hit_at_1(self) -> Ratio:
+        """Share of scenes whose item of the highest score is a true one, ties in expectation."""
+        highest = np.full(self.scenes, -np.inf)
+        np.maximum.at(highest, self.scene, self.score)
+        best = self.score == highest[self.scene]
+        ties = np.bincount(self.scene[best], minlength=self.scenes)
+        hits = np.bincount(self.scene[best & self.truth], minlength=self.scenes)
+        return Ratio.of_scenes(hits / np.maximum(ties, 1), ties > 0)
+
+    def metric(self, statistic: str) -> Scored:
+        """One of `STATISTICS`."""
+        return Scored(statistic, self.scene, self.score, self.truth, self.scenes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from torch import Tensor
 from app.scene import CANONICAL
 from training.batches import Batch, SceneTensors
 from training.cases import Triple, scene_rng
-from training.evaluation.metrics import Flags, Floats, Ints, Metric, Ratio, Scored, lowest_is
+from training.evaluation.metrics import Flags, Floats, Ints, Items, Metric, Ratio
 from training.evaluation.setting import Contender, Outcome, Setting
 from training.machines import BoltzmannMachine
 from training.machines.edges import triple_keys
@@ -262,30 +262,6 @@ def expected_hits(score: Floats, truth: Flags, count: int) -> float:
 # -------------------------------------------------------------------------------------------- T3b
 
 
-@dataclass(frozen=True, eq=False)
-class PlacementScores:
-    """Scores of the N triples of all scenes, each with one false triple.
-
-    Attributes:
-        scene: (N,) position; score: (N,), higher = likelier true; false: (N,) bool.
-        scenes, skipped: how many were given, and how many could not be scored.
-    """
-
-    scene: Ints
-    score: Floats
-    false: Flags
-    scenes: int
-    skipped: int
-
-    def hit_at_1(self) -> Ratio:
-        """Share of scenes whose false triple has the lowest score (ties in expectation)."""
-        return lowest_is(self.scene, self.score, self.false, self.scenes)
-
-    def auroc(self) -> Scored:
-        """Area under the ROC, false triples against true ones."""
-        return Scored("AUROC", self.scene, -self.score, self.false, self.scenes)
-
-
 def alter(holds: Flags, usable: Flags, rng: np.random.Generator) -> tuple[Triple, Triple] | None:
     """A triple of a scene and the false one in its place; None where there is none.
 
@@ -314,11 +290,12 @@ def alter(holds: Flags, usable: Flags, rng: np.random.Generator) -> tuple[Triple
 @torch.no_grad()
 def placement_scores(
     scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
-) -> PlacementScores:
-    """Score every triple of every scene of which one is false.
+) -> Items:
+    """Every triple of every scene of which one is false: its suspicion, and whether it is false.
 
     Args:
-        score: gets the triples as observed ones; it must judge each without itself.
+        score: gets the triples as observed ones; it must judge each without itself; higher =
+            likelier true.
     """
     scene = [torch.zeros(0, dtype=torch.int64)]
     values = [torch.zeros(0, dtype=torch.float64)]
@@ -339,9 +316,9 @@ def placement_scores(
         scene.append(torch.tensor(index)[stated.nonzero()[:, 0]])
         values.append(result[stated].double())
         false.append(wrong[stated])
-    place, score_, is_false = (torch.cat(column).numpy() for column in (scene, values, false))
+    place, likely, is_false = (torch.cat(column).numpy() for column in (scene, values, false))
     skipped = len(scenes) - len(np.unique(place))
-    return PlacementScores(place, score_, is_false, len(scenes), skipped)
+    return Items(place, -likely, is_false, len(scenes), skipped)
 
 
 # ------------------------------------------------------------------------------------------ tasks
@@ -416,5 +393,5 @@ def placement_task(contender: Contender, setting: Setting) -> Outcome | None:
     scores = placement_scores(scenes, setting.structure, contender.placement, seed=setting.seed)
     if not len(scores.scene):
         return None
-    metrics: dict[str, Metric] = {"hit@1": scores.hit_at_1(), "AUROC": scores.auroc()}
+    metrics: dict[str, Metric] = {"hit@1": scores.hit_at_1(), "AUROC": scores.metric("AUROC")}
     return Outcome(metrics, len(scenes), scores.skipped)

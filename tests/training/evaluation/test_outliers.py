@@ -66,7 +66,7 @@ def test_metrics_by_hand():
     )
     assert scores.hit_at_1().value == pytest.approx(1 / 2)
     # Intruders at -1 and 1, others at 1, 2, 0, 3: 4 pairs + 2.5 pairs of 8.
-    assert scores.auroc().value == pytest.approx(6.5 / 8)
+    assert scores.dirty.metric("AUROC").value == pytest.approx(6.5 / 8)
     suspicion = -scores.log_odds
     assert scores.false_alarms(suspicion >= 0.0).value == pytest.approx(1 / 2)
     assert scores.false_alarms(suspicion >= 0.5).value == 0.0
@@ -81,15 +81,17 @@ def test_scores_that_know_everything_or_nothing():
     data = tensors([scene([0, 1, 2]) for _ in range(5)])
     known = lambda v: torch.tensor([5.0, 5, 5, -5, -5]).expand_as(v)  # noqa: E731
     scores = intruder_scores(data, NO_STRUCTURE, known)
-    assert scores.hit_at_1().value == scores.auroc().value == 1.0
-    assert scores.average_precision().value == 1.0
+    assert scores.hit_at_1().value == scores.dirty.metric("AUROC").value == 1.0
+    assert scores.dirty.metric("average precision").value == 1.0
     wrong = intruder_scores(data, NO_STRUCTURE, lambda v: -known(v))
-    assert wrong.hit_at_1().value == wrong.auroc().value == 0.0
+    assert wrong.hit_at_1().value == wrong.dirty.metric("AUROC").value == 0.0
     none = intruder_scores(data, NO_STRUCTURE, torch.zeros_like)
-    assert (none.hit_at_1().value, none.auroc().value) == pytest.approx((1 / 4, 1 / 2))
+    assert (none.hit_at_1().value, none.dirty.metric("AUROC").value) == pytest.approx(
+        (1 / 4, 1 / 2)
+    )
     # 5 true ones among 20 equal scores.
     expected = sum((1 + (k - 1) * 4 / 19) / k for k in range(1, 21)) / 20
-    assert none.average_precision().value == pytest.approx(expected)
+    assert none.dirty.metric("average precision").value == pytest.approx(expected)
 
 
 def test_an_object_is_judged_by_the_rest_without_itself():
