@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -126,6 +126,17 @@ def scene_tensors(
         source=torch.tensor([names.index(scene.source) for scene in scenes], dtype=torch.int64),
         annotated_classes=torch.from_numpy(np.stack([annotated[name] for name in names])),
         source_names=tuple(names),
+    )
+
+
+def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
+    """The scenes at the given positions."""
+    return replace(
+        scenes,
+        scenes=[scenes.scenes[k] for k in index.tolist()],
+        v=scenes.v[index],
+        room=scenes.room[index],
+        source=scenes.source[index],
     )
 
 

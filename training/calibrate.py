@@ -31,7 +31,7 @@ from app.questions.missing import PLACES
 from app.questions.posterior import posterior
 from app.registry import Artifact, Calibration, PairSlope, Slope, Thresholds
 from app.scene import CANONICAL
-from training.batches import SceneTensors
+from training.batches import SceneTensors, subset
 from training.calibrate_objects import ALARMS, calibrate_objects, recalibrated
 from training.cases import (
     Triple,
@@ -44,9 +44,8 @@ from training.cases import (
 )
 from training.datasets import EncodedScene
 from training.datasets.sources import meaning_of
-from training.evaluation.alarms import kept_in_each_source
+from training.evaluation.outliers import kept_in_each_source
 from training.oracle.units import NO_UNIT
-from training.trainer import subset
 
 _SCENES = 2500
 # A machine without a closed form draws its answers, at a hundred times the cost.

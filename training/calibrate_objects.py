@@ -28,21 +28,19 @@ from app.questions.generate import room_fit
 from app.questions.posterior import posterior
 from app.registry import Artifact, Calibration, CountSlope, EvidenceWeights, Thresholds
 from app.scene import Scene, SceneObject
-from training.batches import SceneTensors
+from training.batches import SceneTensors, subset
 from training.cases import logistic
-from training.evaluation.alarms import alarm_threshold
 from training.evaluation.evidence import removals
-from training.evaluation.missing import machine_score
-from training.evaluation.outliers import (
+from training.evaluation.intruders import (
     IntruderScores,
     by_popularity,
+    by_signature,
     clean_scores,
     intruder_scores,
 )
-from training.evaluation.partial import SHARES, hide
-from training.evaluation.signature import by_signature
+from training.evaluation.missing import SHARES, MachineScore, hide
+from training.evaluation.outliers import alarm_threshold
 from training.machines.arrays import machine_of
-from training.trainer import subset
 
 Floats = NDArray[np.float64]
 
@@ -315,7 +313,7 @@ def fit_outliers(
     have thresholds of their own, by the same rule, on parts of the same scenes: no lower than those
     of whole scenes, and no higher than those of shorter lists.
     """
-    score = machine_score(machine_of(artifact.weights))
+    score = MachineScore(machine_of(artifact.weights))
     prior = np.array(artifact.calibration.popularity)
     laws = {
         "uniform": None,

@@ -1,15 +1,23 @@
-"""Scenes as questions: what is told, what is taken away, what is altered."""
+"""Scenes as questions: what is stated, what is hidden, what is altered.
+
+What is drawn for a scene depends on the seed and on the scene's name alone: not on the model, on
+the other scenes, or on how they are batched. So every model is asked the same questions, one source
+at a time or all together.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TypeAlias
+from zlib import crc32
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
 from app.scene import CANONICAL, Scene, SceneObject
+from training.batches import SceneTensors, subset
 from training.datasets import EncodedScene
 from training.datasets.sources import meaning_of
 
@@ -18,11 +26,20 @@ Triple: TypeAlias = tuple[int, int, int]
 _VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
 
 
-def scene_of(
-    encoded: EncodedScene,
-    kept: Sequence[int],
-    triples: Sequence[tuple[int, int, int]],
-) -> Scene:
+def scene_rng(scene: EncodedScene, seed: int) -> np.random.Generator:
+    """The random numbers of one scene."""
+    return np.random.default_rng([seed, crc32(scene.scene_id.encode())])
+
+
+def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> SceneTensors:
+    """At most `limit` scenes, the same ones for every model, in their order."""
+    if limit is None or len(scenes) <= limit:
+        return scenes
+    place = [crc32(f"{seed} {scene.source} {scene.scene_id}".encode()) for scene in scenes.scenes]
+    return subset(scenes, torch.from_numpy(np.sort(np.argsort(place, kind="stable")[:limit])))
+
+
+def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Triple]) -> Scene:
     """The instances at the given positions as a request would give them."""
     objects = tuple(
         SceneObject(id=str(k), label=str(c), class_index=int(c))

@@ -18,6 +18,7 @@ from rich.table import Table
 
 from app.registry import Artifact, RegistryError, Store, load_model_set
 from app.registry.references import AliasTarget
+from training.batches import subset
 from training.config import (
     DATA,
     Config,
@@ -41,7 +42,7 @@ from training.live import Display, summarise
 from training.pipeline import SplitScenes, prepare, read_sources, split_and_encode
 from training.publish import publish_run
 from training.runs import FinishedRun, RunError, load_run, save_run
-from training.trainer import Trainer, subset
+from training.trainer import Trainer
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 app.command()(example)

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from app.inference.variants import FACTORISED
-from training.batches import SceneTensors, seen_triples
+from training.batches import SceneTensors, seen_triples, subset
 from training.config import Config
-from training.evaluation.missing import leave_one_out, machine_score
+from training.evaluation.missing import MachineScore, leave_one_out
 from training.evaluation.reconstruction import reconstruction_error
 from training.evaluation.relations import machine_score as relation_score
 from training.evaluation.relations import rank_relations
@@ -345,7 +345,7 @@ class Trainer:
         generator = torch.Generator().manual_seed(0)
         pick = torch.randperm(len(self.data.validation), generator=generator)[:_VALIDATION_SCENES]
         sample = subset(self.data.validation, pick)
-        result = leave_one_out(sample, self.data.structure, machine_score(self.machine))
+        result = leave_one_out(sample, self.data.structure, MachineScore(self.machine))
         mrr = float(result.reciprocal_rank().mean()) if len(result.target) else float("nan")
         annotated = [
             k for k, scene in enumerate(self.data.validation.scenes) if scene.evidence.holds.any()
@@ -397,15 +397,3 @@ def _with_relations(scenes: SceneTensors) -> SceneTensors:
     """The scenes of which any relation is known; all of them where there is none."""
     kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
     return subset(scenes, torch.tensor(kept, dtype=torch.int64)) if kept else scenes
-
-
-def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
-    """The scenes at the given positions."""
-    return SceneTensors(
-        scenes=[scenes.scenes[k] for k in index.tolist()],
-        v=scenes.v[index],
-        room=scenes.room[index],
-        source=scenes.source[index],
-        annotated_classes=scenes.annotated_classes,
-        source_names=scenes.source_names,
-    )

@@ -31,11 +31,11 @@ from training.calibrate_objects import (
 )
 from training.cases import altered_case
 from training.config import ObjectsConfig
-from training.evaluation.alarms import alarm_threshold, calibrated_alarm
 from training.evaluation.answers import QUESTIONS, collect
 from training.evaluation.asking import of_classes
-from training.evaluation.missing import machine_score
-from training.evaluation.outliers import IntruderScores, clean_scores, intruder_scores
+from training.evaluation.intruders import IntruderScores, clean_scores, intruder_scores
+from training.evaluation.missing import MachineScore
+from training.evaluation.outliers import alarm_threshold, calibrated_alarm
 from training.machines import MachineSpec, build
 from training.machines.arrays import machine_of
 from training.objects import fit_objects, store_samples
@@ -197,7 +197,7 @@ def test_every_entry_of_objects_is_fitted(fitted):
 def test_thresholds_keep_their_share_of_untouched_scenes(model, fitted):
     """On the scenes that they were fitted on."""
     scenes = complete_scenes(rooms(300, 1))
-    scores = intruder_scores(scenes, STRUCTURE, machine_score(machine_of(model.weights)))
+    scores = intruder_scores(scenes, STRUCTURE, MachineScore(machine_of(model.weights)))
     own = scores.with_prior(fitted.popularity_weight * np.array(fitted.popularity))
     p = 1 / (1 + np.exp(-fitted.outlier.log_odds(own.log_odds, own.size)))
     for name, share in ALARMS.items():
@@ -221,7 +221,7 @@ def test_lists_of_few_classes_keep_the_share_too(model, fitted):
         assert (parts <= some.v).all()
         assert (parts * STRUCTURE == some.v * STRUCTURE).all()
         assert ((some.v > 0) & ~STRUCTURE).sum(1).min() > listed
-        found = clean_scores(parts, STRUCTURE, machine_score(machine_of(model.weights)))
+        found = clean_scores(parts, STRUCTURE, MachineScore(machine_of(model.weights)))
         assert (found.listed == listed).all()
         alarms = found.false_alarms(calibrated_alarm(fitted).raised(found)).value
         # 300 rooms: a share of .1 lies above .17 with probability 1e-4.
@@ -237,9 +237,9 @@ def test_hidden_classes_are_as_likely_as_said(model, fitted):
     """On 200 other rooms."""
     artifact = replace(model, calibration=fitted)
     found = collect(artifact, rooms(200, 3), QUESTIONS["missing"])
-    assert found.probability.mean() == pytest.approx(found.truth.mean(), abs=0.05)
-    assert found.ece().value < 0.08
-    assert found.brier_skill().value > 0
+    assert found.score.mean() == pytest.approx(found.truth.mean(), abs=0.05)
+    assert found.metric("ECE").value < 0.08
+    assert found.metric("Brier skill").value > 0
 
 
 @pytest.mark.slow

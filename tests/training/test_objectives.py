@@ -15,7 +15,7 @@ import torch
 from tests.enumeration.small_machines import SEED_FORM, SMALL, enumerate_joint, small_machine
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
-from training.evaluation.missing import machine_score
+from training.evaluation.missing import MachineScore
 from training.evaluation.relations import machine_score as relation_score
 from training.machines import build
 from training.machines.gibbs import State
@@ -193,7 +193,7 @@ def test_every_objective_trains_every_machine(objective, name):
         optimiser.step()
         schedule.step()
     v = torch.tensor([[1.0, 1, 0, 0, 0], [1, 0, 0, 0, 1]])
-    log_odds = machine_score(machine)(v)
+    log_odds = MachineScore(machine)(v)
     assert log_odds[0, 2] > log_odds[0, 3:].max()
     assert log_odds[1, 3] > log_odds[1, 1:3].max()
     both = Batch(*(getattr(batch, n)[-8:] for n in batch.__dataclass_fields__))

@@ -1,8 +1,9 @@
-"""What every baseline has in common: it proposes, validation chooses, every trial is kept.
+"""One interface of all baselines: a model proposes, validation chooses, every trial is kept.
 
 A model is a generator: it fits on the training part alone and proposes (parameters, score) for
 every point of its declared grid, an epoch of one run being a point too. It never sees the
-validation part, by which `Baseline.fit` judges each proposal.
+validation part, by which `Baseline.fit` judges each proposal: by the primary metric of its task,
+pooled over sources.
 """
 
 from __future__ import annotations
@@ -11,20 +12,25 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeAlias, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 from torch import Tensor
 
 from training.batches import SceneTensors
+from training.evaluation.density import ObjectDensity
+from training.evaluation.missing import (
+    ObjectScore,
+    PlacedScore,
+    hide,
+    leave_one_out,
+    leave_one_out_at,
+    rank_hidden,
+)
+from training.evaluation.relations import RelationScore, complete_scenes, rank, rank_relations
 
 Score = TypeVar("Score")
 Parameters: TypeAlias = Mapping[str, float | int | str]
 Proposals: TypeAlias = Iterator[tuple[Parameters, Score]]
-Progress: TypeAlias = Callable[[str], None]
-
-
-def silent(_: str) -> None:
-    """Report nothing."""
 
 
 @dataclass(frozen=True)
@@ -45,27 +51,40 @@ class Trial:
 
 @dataclass(frozen=True)
 class Fitted(Generic[Score]):
-    """A tuned baseline.
+    """The score of the best trial (the first of the highest figure), and every trial in order."""
 
-    Attributes:
-        name: the row of the table.
-        score: of the best trial.
-        trials: every trial, in the order tried.
-    """
-
-    name: str
     score: Score
     trials: tuple[Trial, ...]
 
-    @property
-    def best(self) -> Trial:
-        """The chosen trial: the first of the highest validation figure."""
-        return max(self.trials, key=lambda trial: trial.validation)
 
-    @property
-    def seconds(self) -> float:
-        """Wall time of all trials."""
-        return sum(trial.seconds for trial in self.trials)
+def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
+    """T2: mean reciprocal rank of removed objects."""
+    return leave_one_out(scenes, structure, score).mrr().value
+
+
+def partial_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
+    """T2 partial: mean reciprocal rank of the hidden half of every scene."""
+    return rank_hidden(hide(scenes, structure, 0.5), structure, score)[0].value
+
+
+def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
+    """T2-at: mean reciprocal rank of removed objects of which one relation is known."""
+    return leave_one_out_at(scenes, structure, score)[0].mrr().value
+
+
+def r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+    """T1a: R-precision, the counts of instances known."""
+    return rank_relations(scenes, structure, score).pooled().value
+
+
+def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
+    """T1b: R-precision on the half of the relations that is not given."""
+    return rank(complete_scenes(scenes, structure, score), len(scenes)).pooled().value
+
+
+def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:
+    """Density: mean log-likelihood of the objects, nats, with the upper estimate of log Z."""
+    return float(density.log_unnormalised(scenes.v).double().mean()) - density.upper
 
 
 @dataclass(frozen=True)
@@ -76,13 +95,20 @@ class Baseline(Generic[Score]):
         name: the row.
         propose: training scenes, structure classes (V,) bool and a seed -> what to choose from.
         judge: validation scenes, structure classes and a score -> figure, higher is better.
+        scores: the attributes of `Contender` that the score gives.
         stochastic: the seed changes the fit.
     """
 
     name: str
     propose: Callable[[SceneTensors, Tensor, int], Proposals[Score]]
-    judge: Callable[[SceneTensors, Tensor, Score], float]
+    judge: Callable[[SceneTensors, Tensor, Any], float] = missing_mrr
+    scores: tuple[str, ...] = ("objects",)
     stochastic: bool = False
+
+    @property
+    def learns_relations(self) -> bool:
+        """It needs scenes that are annotated with relations."""
+        return self.scores not in (("objects",), ("density",))
 
     def fit(
         self,
@@ -91,7 +117,7 @@ class Baseline(Generic[Score]):
         structure: Tensor,
         *,
         seed: int = 0,
-        progress: Progress = silent,
+        progress: Callable[[str], None] = lambda _: None,
     ) -> Fitted[Score]:
         """Fit on one part, choose on another.
 
@@ -125,4 +151,4 @@ class Baseline(Generic[Score]):
             shown = ", ".join(f"{key} {value}" for key, value in parameters.items())
             progress(f"{self.name} {shown}: {figure:.4f}")
             start = now
-        return Fitted(self.name, chosen[0], tuple(trials))
+        return Fitted(chosen[0], tuple(trials))

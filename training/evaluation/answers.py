@@ -18,12 +18,10 @@ take every default, so only answers returned count.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from app.questions import misplaced, missing, outliers, relations
 from app.registry import Artifact, Calibration, CountSlope, Slope
@@ -34,16 +32,16 @@ from training.cases import (
     known_relations,
     occupied_place,
     scene_of,
+    scene_rng,
     taken_away,
     told_pairs,
 )
 from training.datasets import EncodedScene
-from training.evaluation.asking import labels_alone
-from training.evaluation.cases import scene_rng
-from training.evaluation.metrics import Scored
-from training.evaluation.outliers import by_popularity, draw_intruders
-from training.evaluation.partial import SHARES, shown_classes
-from training.evaluation.signature import by_signature, with_intruder
+from training.evaluation.asking import labels_alone, with_intruder
+from training.evaluation.intruders import kinds_of_intruders
+from training.evaluation.metrics import Flags, Ints, Items, Metric
+from training.evaluation.missing import SHARES, shown_classes
+from training.evaluation.setting import Contender, Outcome, Setting
 
 # An object has three places, where a scene has twenty relations: of one object a scene there are so
 # few answers that chance alone makes an ECE of .02 to .03.
@@ -51,30 +49,6 @@ _REMOVALS = 4
 # (probability, whether it was so) of the answers to one scene.
 Answered = list[tuple[float, bool]]
 Ask = Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]
-
-
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """All answers of one kind.
-
-    Attributes:
-        scene: (N,) position; probability: (N,); truth: (N,) bool.
-        scenes, skipped: how many were given, and how many could not be asked.
-    """
-
-    scene: NDArray[np.int64]
-    probability: NDArray[np.float64]
-    truth: NDArray[np.bool_]
-    scenes: int
-    skipped: int
-
-    def ece(self) -> Scored:
-        """Expected calibration error in bins of equal mass."""
-        return Scored("ECE", self.scene, self.probability, self.truth, self.scenes)
-
-    def brier_skill(self) -> Scored:
-        """Brier skill against the base rate of these answers."""
-        return Scored("Brier skill", self.scene, self.probability, self.truth, self.scenes)
 
 
 def uncalibrated(artifact: Artifact) -> Artifact:
@@ -85,33 +59,16 @@ def uncalibrated(artifact: Artifact) -> Artifact:
     return replace(artifact, calibration=plain)
 
 
-def collect(
-    artifact: Artifact,
-    scenes: SceneTensors,
-    ask: Ask,
-    seed: int = 0,
-) -> Answers:
+def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
     """Ask one question (see `QUESTIONS`) of every scene."""
-    place: list[int] = []
-    probability: list[float] = []
-    truth: list[bool] = []
+    answers: list[tuple[int, float, bool]] = []
     skipped = 0
     for k, scene in enumerate(scenes.scenes):
         found = ask(artifact, scene, scene_rng(scene, seed))
-        if found is None:
-            skipped += 1
-            continue
-        for p, so in found:
-            place.append(k)
-            probability.append(p)
-            truth.append(so)
-    return Answers(
-        np.array(place, dtype=np.int64),
-        np.array(probability),
-        np.array(truth, dtype=np.bool_),
-        len(scenes),
-        skipped,
-    )
+        skipped += found is None
+        answers += [(k, probability, so) for probability, so in found or ()]
+    place, probability, truth = np.array(answers, dtype=np.float64).reshape(-1, 3).T
+    return Items(place.astype(np.int64), probability, truth > 0, len(scenes), skipped)
 
 
 def ask_relations(
@@ -137,9 +94,7 @@ def ask_given(
     return _judged(artifact, encoded, scene, known_relations(encoded) & asked) or None
 
 
-def _judged(
-    artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: NDArray[np.bool_]
-) -> Answered:
+def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Flags) -> Answered:
     """Answers about the relations (A, N, N) that are to be judged."""
     found: Answered = []
     for answer in relations(artifact, scene)[0]:
@@ -210,9 +165,7 @@ def ask_placed(
     return [(a.probability, a.label in there) for a in found if a.label not in unknown]
 
 
-def _hidden(
-    artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
-) -> NDArray[np.int64] | None:
+def _hidden(artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator) -> Ints | None:
     """The classes that are not shown: a share, drawn for each scene, or all but one are."""
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
@@ -220,7 +173,7 @@ def _hidden(
     if not encoded.complete or len(classes) < 2:
         return None
     share = list(SHARES.values())[rng.integers(len(SHARES))]
-    hidden: NDArray[np.int64] = rng.permutation(classes)[shown_classes(len(classes), share) :]
+    hidden: Ints = rng.permutation(classes)[shown_classes(len(classes), share) :]
     return hidden
 
 
@@ -228,7 +181,7 @@ def ask_outliers(
     artifact: Artifact,
     encoded: EncodedScene,
     rng: np.random.Generator,
-    intruders: Mapping[tuple[str, str], NDArray[np.int64]] | None = None,
+    intruders: Mapping[tuple[str, str], Ints] | None = None,
 ) -> Answered | None:
     """The intruder, if there is one.
 
@@ -251,23 +204,6 @@ def ask_outliers(
     found = outliers(artifact, scene, details=False).outliers
     usable = [not structure[thing.class_index] for thing in scene.objects]
     return [(a.probability, a.object == intruder) for a in found if usable[a.object]]
-
-
-def kinds_of_intruders(
-    scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
-) -> dict[tuple[str, str], NDArray[np.int64]]:
-    """One intruder of each kind for every scene, by its source and id.
-
-    The kinds are those of calibration: uniform, by popularity, and typical of another room type.
-    """
-    laws: list[Tensor | None] = [None]
-    if train is not None:
-        laws += [by_popularity(scenes, train), by_signature(scenes, train)]
-    # `ask_outliers` draws from the scene's numbers of the same seed.
-    drawn = [draw_intruders(scenes, structure, weights, seed + 1) for weights in laws]
-    each = torch.stack(drawn, 1).numpy()
-    names = [(scene.source, scene.scene_id) for scene in scenes.scenes]
-    return {name: own[own >= 0] for name, own in zip(names, each, strict=True)}
 
 
 def ask_misplaced(
@@ -293,3 +229,36 @@ QUESTIONS: dict[str, Ask] = {
     "outliers": ask_outliers,
     "misplaced": ask_misplaced,
 }
+
+
+def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Every probability of the service, as published and with log-odds as they are."""
+    if contender.artifact is None:
+        return None
+    related = setting.some(related=True, share=3)
+    complete = setting.complete.some(share=3)
+    at_place = setting.complete.some(related=True, share=3)
+    of_objects = {"missing": complete, "outliers": complete, "missing at a place": at_place}
+    metrics: dict[str, Metric] = {}
+    skipped = 0
+    published, plain = contender.artifact, uncalibrated(contender.artifact)
+    for name, ask in _questions(complete, setting).items():
+        asked = of_objects.get(name, related)
+        found = collect(published, asked, ask, setting.seed)
+        skipped += found.skipped
+        if len(found.scene):
+            before = collect(plain, asked, ask, setting.seed)
+            for figure in ("ECE", "Brier skill"):
+                metrics[f"{figure}, {name}"] = found.metric(figure)
+                metrics[f"{figure}, {name}, uncalibrated"] = before.metric(figure)
+    # Skill is undefined where no answer was true, or every one.
+    metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
+    return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None
+
+
+def _questions(complete: SceneTensors, setting: Setting) -> dict[str, Ask]:
+    """`QUESTIONS`, with intruders of every kind among these scenes."""
+    intruders = kinds_of_intruders(
+        complete, setting.structure, setting.complete.train, setting.seed
+    )
+    return QUESTIONS | {"outliers": partial(ask_outliers, intruders=intruders)}

@@ -1,7 +1,8 @@
-"""Questions put to `app.questions` as a robot puts them, the answers as columns.
+"""Questions put to a score or to `app.questions`, as a robot puts them; the answers as columns.
 
 A sample of the cases is asked once more in another order: an answer that follows the order of the
-questions knows more than its scene, and the evaluation stops.
+questions knows more than its scene, and the evaluation stops. (A model that recognises a scene by
+the objects that are left has seen it before: against that stand the splits by group.)
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from dataclasses import dataclass, replace
 from typing import TypeVar, get_args
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from app import questions
 from app.questions import Sensitivity
@@ -19,15 +22,20 @@ from app.registry import Artifact
 from app.scene import CANONICAL, Scene, SceneObject
 from training.cases import scene_of
 from training.datasets import EncodedScene
-from training.evaluation.missing import LeakError
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 Case = TypeVar("Case")
-
-_PROBED = 32
 
 SENSITIVITIES: tuple[Sensitivity, ...] = get_args(Sensitivity)
 """Presets of the alarm; "medium" is the default."""
+
+_PROBED_CASES, _PROBED_ROWS = 32, 64
+_LEAK = "the same scene in another order gets another answer: something leaks"
+
+
+class LeakError(ValueError):
+    """A score knows more than it was shown."""
 
 
 def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floats]:
@@ -40,11 +48,36 @@ def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floa
     answers = [ask(case) for case in cases]
     if any(np.isnan(answer).any() for answer in answers):
         raise FloatingPointError("an answer is not a number")
-    for k in np.random.default_rng(0).permutation(len(cases))[:_PROBED].tolist():
-        again = ask(cases[k])
-        if not np.allclose(again, answers[k], rtol=1e-3, atol=1e-9):
-            raise LeakError("the same scene in another order gets other answers: something leaks")
+    for k in np.random.default_rng(0).permutation(len(cases))[:_PROBED_CASES].tolist():
+        if not np.allclose(ask(cases[k]), answers[k], rtol=1e-3, atol=1e-9):
+            raise LeakError(_LEAK)
     return answers
+
+
+@torch.no_grad()
+def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -> Tensor:
+    """The scores (N, ...) of N rows, block by block.
+
+    Args:
+        score: gets the rows of each column (N, ...).
+
+    Raises:
+        LeakError: rows that are asked again, in other company, have other scores.
+    """
+    count = len(columns[0])
+    blocks = [
+        score(*(column[index] for column in columns))
+        for index in torch.arange(count).split(block)
+        if len(index)
+    ]
+    if not blocks:
+        return torch.zeros_like(columns[0])
+    found = torch.cat(blocks)
+    probed = torch.from_numpy(np.random.default_rng(0).permutation(count)[:_PROBED_ROWS])
+    again = score(*(column[probed] for column in columns))
+    if not torch.allclose(again, found[probed], rtol=1e-3, atol=1e-3, equal_nan=True):
+        raise LeakError(_LEAK)
+    return found
 
 
 def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Scene:
@@ -58,10 +91,16 @@ def of_classes(classes: Sequence[int]) -> Scene:
     return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
 
 
-def things(scene: Scene, structure: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
+    """The scene with one more object, of a class that it lacks."""
+    thing = SceneObject("intruder", artifact.vocabulary.labels[intruder], intruder)
+    return replace(scene, objects=(*scene.objects, thing))
+
+
+def things(scene: Scene, structure: Flags) -> Flags:
     """(n,) bool of its objects: those that are no structure."""
     classes = [-1 if thing.class_index is None else thing.class_index for thing in scene.objects]
-    found: NDArray[np.bool_] = ~structure[classes]
+    found: Flags = ~structure[classes]
     return found
 
 
@@ -96,14 +135,14 @@ class Verdict:
 
     probability: Floats
     log_odds: Floats
-    is_outlier: NDArray[np.bool_]
+    is_outlier: Flags
 
 
 def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Verdict:
     """Every object of a scene at one of `SENSITIVITIES`."""
-    found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
     n = len(scene.objects)
     probability, log_odds, flagged = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.bool_)
+    found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
     for answer in found:
         probability[answer.object] = answer.probability
         log_odds[answer.object] = answer.log_odds

@@ -1,56 +1,30 @@
-"""What is evaluated: a machine or a baseline, as one callable for each task that it can answer."""
+"""A model as a contender, each of its scores as the service computes it; and two references."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache, partial
 
+import numpy as np
+import torch
+from torch import Tensor
+
+from app.questions.posterior import posterior
 from app.registry import Artifact
-from training.batches import SceneTensors
-from training.evaluation.alarms import Alarm, calibrated_alarm
-from training.evaluation.density import DensitySettings, ObjectDensity, machine_density
-from training.evaluation.generation import Sampler
-from training.evaluation.missing import ObjectScore, RoomScore, machine_score
-from training.evaluation.placed import PlacedScore
+from app.scene import CANONICAL, OPPOSITES, Scene
+from training.batches import Batch, SceneTensors
+from training.evaluation.asking import missing_probabilities, of_classes
+from training.evaluation.density import DensitySettings, independent_density, machine_density
+from training.evaluation.generation import (
+    held_out_halves,
+    independent_sampler,
+    machine_sampler,
+    scene_sampler,
+)
+from training.evaluation.missing import MachineScore, PlacedScore, Places
+from training.evaluation.outliers import calibrated_alarm
 from training.evaluation.relations import RelationScore
-from training.evaluation.sampling import machine_sampler
-from training.evaluation.scores import placed_score, relation_score
-from training.machines import BoltzmannMachine
+from training.evaluation.setting import Contender, Setting
 from training.machines.arrays import machine_of
-
-
-@dataclass(frozen=True, eq=False)
-class Contender:
-    """One row of the tables; None where it does not take part.
-
-    Attributes:
-        objects: T2 and T3.
-        relations: T1a.
-        completion: T1b; gets the given triples as the batch's relations.
-        placed: T2-at.
-        placement: T3b; gets the triples, a false one among them, as the batch's relations.
-        sampler: T4.
-        density: Density; called once, when it is needed.
-        alarm: T3, the share of untouched scenes that raise one.
-        artifact: Calibration.
-        objects_in_rooms: T2 where the room type is given.
-        machine: the seed protocol, which samples.
-        parameters: number of trained weights, None where that says nothing.
-    """
-
-    objects: ObjectScore | None = None
-    relations: RelationScore | None = None
-    completion: RelationScore | None = None
-    placed: PlacedScore | None = None
-    placement: RelationScore | None = None
-    sampler: Sampler | None = None
-    density: Callable[[], ObjectDensity] | None = None
-    alarm: Alarm | None = None
-    artifact: Artifact | None = None
-    objects_in_rooms: RoomScore | None = None
-    machine: BoltzmannMachine | None = None
-    parameters: int | None = None
 
 
 def artifact_contender(
@@ -69,7 +43,7 @@ def artifact_contender(
             machine has without a calibration.
     """
     machine = machine_of(artifact.weights)
-    objects, completion = machine_score(machine), relation_score(artifact, given=True)
+    objects, completion = MachineScore(machine), relation_score(artifact, given=True)
     density = None
     if not machine.relations_act:
         density = cache(partial(machine_density, machine, train, settings, seed))
@@ -86,4 +60,76 @@ def artifact_contender(
         parameters=machine.parameter_count,
         alarm=calibrated_alarm(artifact.calibration) if calibrated else None,
         artifact=artifact if calibrated else None,
+    )
+
+
+def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
+    """Log-odds of every relation between the classes of a batch, each without itself.
+
+    Args:
+        given: the relations that the batch observes as on are stated; otherwise none is.
+    """
+
+    def score(batch: Batch) -> Tensor:
+        found = torch.full(batch.holds.shape, -torch.inf)
+        stated = batch.holds * batch.observed * given
+        for row, padded in enumerate(batch.classes):
+            n = int((padded >= 0).sum())
+            scene, first = _instances(padded[:n], batch.counts[row, :n])
+            told = set(map(tuple, stated[row].nonzero().tolist()))
+            # a(x, y) and a(y, x) both hold of classes where they hold of different instances.
+            last = first + batch.counts[row, :n].clamp(min=1) - 1
+            triples = [
+                (a, *(last[[x, y]] if (a, y, x) in told and x > y else first[[x, y]]).tolist())
+                for a, x, y in sorted(told)
+            ]
+            scene = Scene(scene.objects, tuple(triples) or None)
+            values = posterior(artifact, scene).relation_log_odds()
+            found[row, : len(values), :n, :n] = torch.from_numpy(values)
+        return found
+
+    return score
+
+
+def placed_score(artifact: Artifact) -> PlacedScore:
+    """Log-probabilities of `/missing` at a place, -inf for what it does not propose."""
+
+    def score(places: Places) -> Tensor:
+        rows = []
+        for row, v in enumerate(places.v):
+            classes = v.nonzero().squeeze(1)
+            scene, first = _instances(classes, places.counts[row, classes])
+            relation = CANONICAL[int(places.relation[row])]
+            anchor = int(first[int((classes == places.anchor[row]).nonzero())])
+            # The question names the place from the missing object's side.
+            name = relation if places.outgoing[row] else OPPOSITES[relation]
+            p = missing_probabilities(artifact, scene, at=(name, anchor))
+            tiny = np.finfo(np.float64).tiny
+            rows.append(np.where(p >= 0, np.log(np.maximum(p, tiny)), -np.inf))
+        return torch.from_numpy(np.stack(rows)).to(places.v.dtype)
+
+    return score
+
+
+def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
+    """So many objects of each class, one where nobody counted, and the place of each first one."""
+    each = counts.clamp(min=1).long()
+    return of_classes(classes.repeat_interleave(each).tolist()), each.cumsum(0) - each
+
+
+def floor_contender(setting: Setting) -> Contender:
+    """A second half of the held-out scenes as if it had been drawn: the floor of T4."""
+    _, second = held_out_halves(setting.complete)
+    return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
+
+
+def independent_contender(setting: Setting) -> Contender:
+    """Classes drawn independently, each as often as in training."""
+    train = setting.complete.train
+    if train is None:
+        return Contender()
+    return Contender(
+        sampler=independent_sampler(train),
+        density=lambda: independent_density(train),
+        parameters=train.v.shape[1],
     )

@@ -20,10 +20,8 @@ from app import questions
 from app.registry import Artifact
 from app.scene import Scene, SceneObject, opposite
 from training.config import DATA
-from training.evaluation.contenders import Contender
-from training.evaluation.intervals import Metric
-from training.evaluation.metrics import Ratio
-from training.evaluation.setting import Outcome, Setting
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.setting import Contender, Outcome, Setting
 
 EVERYDAY = DATA.parent / "everyday"
 """Where the facts are looked for."""

@@ -17,7 +17,7 @@ among the instances that stay are left out. What is asked is never stated.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,31 +25,27 @@ from numpy.typing import NDArray
 from app.registry import Artifact
 from app.scene import PoseRelations, Scene
 from training.batches import SceneTensors
-from training.cases import scene_of
+from training.cases import scene_of, scene_rng
 from training.datasets import EncodedScene
 from training.evaluation.asking import (
-    Floats,
+    Flags,
     ask_every,
     judge,
     missing_probabilities,
     relation_probabilities,
     things,
+    with_intruder,
 )
-from training.evaluation.cases import scene_rng
-from training.evaluation.contenders import Contender
-from training.evaluation.intervals import Metric
-from training.evaluation.metrics import Ratio
-from training.evaluation.outliers import draw_intruders
+from training.evaluation.intruders import draw_intruders
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.outliers import share_of_first
 from training.evaluation.relations import expected_hits
-from training.evaluation.setting import Outcome, Setting
-from training.evaluation.signature import with_intruder
+from training.evaluation.setting import Contender, Outcome, Setting
 
 KINDS = ("relations", "poses", "room type")
 
 # Removed classes a scene: of one, chance alone moves the change of a small source by .01.
 _REMOVALS = 2
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +55,16 @@ class Case:
     Attributes:
         place: of the scene; scenes: the labels alone, and with evidence.
         target: the removed class in T2, the place of the intruder in T3.
-        truth, asked: (A, n, n) of the relations in T1.
+        truth, asked: (A, n, n) of the relations in T1, empty elsewhere.
+        items: listed relations in T1; 1 elsewhere.
     """
 
     place: int
     scenes: tuple[Scene, Scene]
     target: int = -1
-    truth: Flags | None = None
-    asked: Flags | None = None
+    truth: Flags = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.bool_))
+    asked: Flags = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.bool_))
+    items: int = 1
 
 
 def told(
@@ -150,7 +148,7 @@ def halves(
         asked = np.broadcast_to(pair, encoded.instance_holds.shape)
         truth = encoded.instance_holds & asked
         if both is not None and truth.any():
-            yield Case(place, both, truth=truth, asked=asked)
+            yield Case(place, both, truth=truth, asked=asked, items=int(truth.sum()))
 
 
 def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
@@ -160,94 +158,89 @@ def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
     return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())
 
 
-def first(artifact: Artifact, scene: Scene, target: int, structure: NDArray[np.bool_]) -> float:
-    """Whether an object is the likeliest outlier; ties in expectation."""
-    p = np.where(things(scene, structure), judge(artifact, scene).probability, -np.inf)
-    best = p == p.max()
-    return float(best[target] / best.sum())
-
-
 def missing_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
     """T2 with evidence."""
-    artifact = contender.artifact
-    if artifact is None:
-        return None
-    scenes, structure = setting.some(related=True), setting.structure.numpy()
-    metrics: dict[str, Metric] = {}
-    for kind in KINDS:
-        cases = list(removals(scenes, structure, kind, setting.seed))
-        values = _asked(cases, lambda scene, case: reciprocal_rank(artifact, scene, case.target))
-        metrics |= _changes("MRR", kind, cases, values, np.ones(len(cases)), len(scenes))
-    return _outcome(metrics, scenes)
+
+    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
+        return reciprocal_rank(artifact, scene, case.target)
+
+    return _changes(
+        "MRR",
+        contender,
+        setting,
+        lambda _, scenes, kind: removals(scenes, setting.structure.numpy(), kind, setting.seed),
+        value,
+    )
 
 
 def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
     """T3 with evidence."""
-    artifact = contender.artifact
-    if artifact is None:
-        return None
-    scenes, structure = setting.some(related=True), setting.structure.numpy()
-    intruders = draw_intruders(scenes, setting.structure, seed=setting.seed).numpy()
-    metrics: dict[str, Metric] = {}
-    for kind in KINDS:
-        cases = list(intrusions(artifact, scenes, intruders, kind))
-        values = _asked(cases, lambda scene, case: first(artifact, scene, case.target, structure))
-        metrics |= _changes("hit@1", kind, cases, values, np.ones(len(cases)), len(scenes))
-    return _outcome(metrics, scenes)
+    structure = setting.structure.numpy()
+
+    def cases(artifact: Artifact, scenes: SceneTensors, kind: str) -> Iterator[Case]:
+        intruders = draw_intruders(scenes, setting.structure, seed=setting.seed).numpy()
+        return intrusions(artifact, scenes, intruders, kind)
+
+    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
+        p = np.where(things(scene, structure), judge(artifact, scene).probability, -np.inf)
+        return share_of_first(p, case.target)
+
+    return _changes("hit@1", contender, setting, cases, value)
 
 
 def relations_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
     """T1 with evidence."""
-    artifact = contender.artifact
-    if artifact is None:
-        return None
-    scenes, structure = setting.some(related=True), setting.structure.numpy()
 
-    def hits(scene: Scene, case: Case) -> float:
-        if case.asked is None or case.truth is None:
-            return 0.0  # `halves` makes none like this
+    def value(artifact: Artifact, scene: Scene, case: Case) -> float:
         p, truth = relation_probabilities(artifact, scene)[case.asked], case.truth[case.asked]
-        return expected_hits(p, truth, int(truth.sum()))
+        return expected_hits(p, truth, case.items)
 
-    metrics: dict[str, Metric] = {}
-    for kind in KINDS[:2]:
-        cases = list(halves(scenes, structure, kind, setting.seed))
-        listed = np.array([case.truth.sum() for case in cases if case.truth is not None])
-        values = _asked(cases, hits)
-        metrics |= _changes("R-precision", kind, cases, values, listed, len(scenes))
-    return _outcome(metrics, scenes)
-
-
-def _asked(cases: list[Case], value: Callable[[Scene, Case], float]) -> Floats:
-    """(N, 2) of the cases: labels alone, with evidence."""
-
-    def ask(case: Case) -> Floats:
-        return np.array([value(scene, case) for scene in case.scenes])
-
-    return np.array(ask_every(ask, cases)).reshape(-1, 2)
+    return _changes(
+        "R-precision",
+        contender,
+        setting,
+        lambda _, scenes, kind: halves(scenes, setting.structure.numpy(), kind, setting.seed),
+        value,
+        KINDS[:2],
+    )
 
 
 def _changes(
-    metric: str, kind: str, cases: list[Case], values: Floats, items: Floats, scenes: int
-) -> dict[str, Metric]:
-    """The change, and the metric on both sides, pooled over items."""
-    if not cases:
-        return {}
-    place = np.array([case.place for case in cases])
-    below = np.bincount(place, weights=items, minlength=scenes).astype(np.float64)
-    without, given = (
-        np.bincount(place, weights=column, minlength=scenes).astype(np.float64)
-        for column in values.T
-    )
-    return {
-        f"change of {metric}, {kind}": Ratio(given - without, below),
-        f"{metric}, {kind}": Ratio(given, below),
-        f"{metric}, {kind} withheld": Ratio(without, below),
-    }
+    metric: str,
+    contender: Contender,
+    setting: Setting,
+    cases_of: Callable[[Artifact, SceneTensors, str], Iterator[Case]],
+    value: Callable[[Artifact, Scene, Case], float],
+    kinds: tuple[str, ...] = KINDS,
+) -> Outcome | None:
+    """The change by each kind of evidence, and the metric on both sides, pooled over items.
 
-
-def _outcome(metrics: dict[str, Metric], scenes: SceneTensors) -> Outcome | None:
-    if not metrics:
+    Args:
+        cases_of: the cases of some scenes and one kind of evidence.
+        value: of one scene of a case, summed over its items.
+    """
+    artifact = contender.artifact
+    if artifact is None:
         return None
-    (below, *_) = [metric.denominators for metric in metrics.values() if isinstance(metric, Ratio)]
-    return Outcome(metrics, len(scenes), int((below == 0).sum()))
+    scenes = setting.some(related=True)
+    metrics: dict[str, Metric] = {}
+    skipped: list[int] = []
+    for kind in kinds:
+        cases = list(cases_of(artifact, scenes, kind))
+        if not cases:
+            continue
+        values = np.array(
+            ask_every(lambda case: np.array([value(artifact, s, case) for s in case.scenes]), cases)
+        )
+        place = [case.place for case in cases]
+        without, given, below = (
+            np.bincount(place, weights=column, minlength=len(scenes)).astype(np.float64)
+            for column in (*values.T, [case.items for case in cases])
+        )
+        metrics |= {
+            f"change of {metric}, {kind}": Ratio(given - without, below),
+            f"{metric}, {kind}": Ratio(given, below),
+            f"{metric}, {kind} withheld": Ratio(without, below),
+        }
+        skipped.append(int((below == 0).sum()))
+    return Outcome(metrics, len(scenes), skipped[0]) if metrics else None

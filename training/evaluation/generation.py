@@ -25,22 +25,25 @@ from zlib import crc32
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from app.questions.generate import STEPS
 from app.scene import CANONICAL
-from training.batches import SceneTensors
-from training.evaluation.closure import transitive_closure
-from training.evaluation.intervals import Metric
-from training.evaluation.metrics import Ratio, Resampled
-from training.trainer import subset
-
-Floats = NDArray[np.float64]
+from training.batches import SceneTensors, subset
+from training.cases import some_scenes
+from training.evaluation.metrics import Floats, Metric, Ratio, Resampled
+from training.evaluation.relations import transitive_closure
+from training.evaluation.setting import Contender, Outcome, Setting
+from training.machines import BoltzmannMachine
+from training.machines.chain_samples import ChainSamples
+from training.machines.edges import present_classes
+from training.machines.gibbs import Clamp, State, gibbs_step, run
 
 _RESAMPLES = 200
 # The bandwidth is taken from so many held-out scenes, and covariances over so many classes.
 _BANDWIDTH_SCENES = 1000
 _COMMON_CLASSES = 200
+_CHAINS = 256
 _ON_TOP = CANONICAL.index("on-top")
 
 
@@ -177,11 +180,57 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
     return sample
 
 
-def halves(scenes: SceneTensors) -> tuple[SceneTensors, SceneTensors]:
-    """Held-out scenes to compare with, and a second half, the floor; a group stays together."""
+def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler:
+    """Gibbs chains as the service runs them, but with relations as the machine draws them.
+
+    The service keeps one of a(x, y) and a(y, x); here both may be on.
+
+    Args:
+        steps: sweeps of a chain.
+    """
+    samples = ChainSamples(machine)
+
+    def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:
+        generator = torch.Generator().manual_seed(seed)
+        parts = []
+        for index in torch.arange(len(given)).split(_CHAINS):
+            clamp = Clamp(v=given[index], room=room[index] if machine.spec.C else None)
+            state = samples.start(given[index].to(machine.b.dtype), generator, clamp)
+            state = _sweep(machine, state, generator, clamp, steps)
+            parts.append((state.v, Contradictions.of(_grid(machine, state))))
+        objects, found = zip(*parts, strict=True)
+        return Drawn(torch.cat(objects), Contradictions.joined(found))
+
+    return sample
+
+
+def _sweep(
+    machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp, steps: int
+) -> State:
+    """Gibbs sweeps. In the local form relations do not act on the rest: the last one draws them."""
+    always = machine.relations_act
+    state = run(machine, state, generator, steps - 1, clamp, relations=always)
+    return gibbs_step(machine, state, generator, clamp)
+
+
+def _grid(machine: BoltzmannMachine, state: State) -> Tensor:
+    """Relations between present classes, (B, A, n, n)."""
+    r = state.r * state.edges.ends_present(state.v)
+    return machine.between(state.edges, r, present_classes(state.v)).clamp(min=0)
+
+
+def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
+    """Scenes to compare drawn ones with, and a second half, the floor, each within the limit.
+
+    A group stays together.
+    """
+    scenes = setting.scenes
     odd = torch.tensor([crc32(scene.group.encode()) % 2 for scene in scenes.scenes]).bool()
-    first, second = (~odd).nonzero().squeeze(1), odd.nonzero().squeeze(1)
-    return subset(scenes, first), subset(scenes, second)
+    first, second = (subset(scenes, some.nonzero().squeeze(1)) for some in (~odd, odd))
+    return (
+        some_scenes(first, setting.limit, setting.seed),
+        some_scenes(second, setting.limit, setting.seed),
+    )
 
 
 def hamming(x: Tensor, y: Tensor) -> Tensor:
@@ -292,8 +341,8 @@ def generation_metrics(
     metrics: dict[str, Metric] = {
         "MMD²": resampled(discrepancy(y, x, bandwidth)),
         "marginal error": resampled(marginal_error(theirs, ours)),
-        "classes per scene": Ratio(ours.sum(1), np.ones(len(ours))),
-        "copies of training scenes": Ratio(copies(x, known), np.ones(len(ours))),
+        "classes per scene": Ratio.of_scenes(ours.sum(1)),
+        "copies of training scenes": Ratio.of_scenes(copies(x, known)),
     }
     pairs = resampled(pair_correlation(theirs, ours))
     if np.isfinite(pairs.value):
@@ -301,3 +350,38 @@ def generation_metrics(
     if drawn.contradictions is not None:
         metrics |= drawn.contradictions.metrics()
     return metrics
+
+
+def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T4: as many scenes as there are in a second half of the held-out ones, against the first.
+
+    Free; given the room types of the second half; and given one class each, drawn from all the
+    classes that scenes of the second half hold. A scene then comes up as often as it has classes:
+    so the first half counts by size there, and a perfect sampler would leave no discrepancy.
+    """
+    if contender.sampler is None or setting.train is None:
+        return None
+    first, second = held_out_halves(setting)
+    asked = first.annotated_classes[first.source].any(0) & ~setting.structure
+    mentions = ((second.v > 0) & asked).nonzero()
+    if min(len(first), len(second), len(mentions)) < 2 or not first.v[:, asked].any():
+        return None
+    bandwidth = median_distance(first.v[:, asked])
+    nothing = torch.zeros_like(second.v, dtype=torch.bool)
+    nowhere = torch.full_like(second.room, -1)
+    order = np.random.default_rng(setting.seed).permutation(len(mentions))[: len(second)]
+    classes = mentions[torch.from_numpy(order), 1]
+    one = nothing[: len(classes)].scatter(1, classes.unsqueeze(1), True)
+    size = first.v[:, asked].sum(1)
+    conditions = {
+        "free": (nothing, nowhere, None),
+        "given room types": (nothing, second.room, None),
+        "given one class": (one, nowhere[: len(one)], size),
+    }
+    metrics: dict[str, Metric] = {}
+    for name, (given, room, emphasis) in conditions.items():
+        drawn = contender.sampler(given, room, setting.seed)
+        found = generation_metrics(drawn, first.v, setting.train.v, asked, bandwidth, emphasis)
+        metrics |= {f"{metric}, {name}": value for metric, value in found.items()}
+    notes = {"bandwidth": bandwidth, "held-out scenes": len(first), "drawn scenes": len(second)}
+    return Outcome(metrics, len(first), 0, notes)

@@ -1,46 +1,169 @@
-"""Metrics that keep what they were made of, scene by scene.
+"""Metrics that keep what they were made of, scene by scene, and their bootstrap intervals.
 
 So they can be resampled, paired with another model's, pooled over sources, and stored as JSON.
+
+A resample draws as many scenes as there are, with replacement; it is held as the number of times
+that each scene was drawn. The draws depend on the seed and the number of scenes alone, so two
+metrics of the same scenes are resampled alike, and their difference is a paired one.
+
+Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993).
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from training.evaluation.intervals import Floats, Metric, resample, scene_weights
 from training.evaluation.item_statistics import STATISTICS
 
+Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+RESAMPLES = 1000
 
 
-class SceneMetric(Metric):
-    """A metric whose items belong to scenes: it can be pooled and stored."""
+@dataclass(frozen=True)
+class Figure:
+    """A metric with its 95 % interval.
+
+    Attributes:
+        value: the metric over all scenes.
+        low, high: percentiles 2.5 and 97.5 over scenes drawn with replacement.
+        n: scored items (removed objects, relations, scenes).
+    """
+
+    value: float
+    low: float
+    high: float
+    n: int
+
+    @classmethod
+    def of(cls, value: float, draws: Floats, n: int) -> Figure:
+        """The interval of resampled values, those that are undefined left out."""
+        low, high = np.nanpercentile(draws, [2.5, 97.5])
+        return cls(value, float(low), float(high), n)
+
+    def __str__(self) -> str:
+        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
+
+
+class Metric(ABC):
+    """A metric over a set of scenes that can be resampled.
+
+    Attributes:
+        scenes: how many scenes were given, those that could not be scored among them.
+        n: scored items.
+    """
+
+    scenes: int
+    n: int
 
     @abstractmethod
     def at(self, weight: Floats) -> float:
-        """The metric where scene k counts weight[k] times; nan where it is undefined."""
+        """The metric where scene k counts weight[k] times; nan where it is undefined.
+
+        Raises:
+            NotImplementedError: the metric is of a whole set and keeps only its resamples.
+        """
 
     @classmethod
-    @abstractmethod
-    def join(cls, parts: Sequence[Self]) -> Self:
-        """The metric over the scenes of all parts, one after the other."""
+    def join(cls, parts: Sequence[Self]) -> Metric | None:
+        """The metric over the scenes of all parts, one after the other.
+
+        None for metrics of whole sets.
+        """
+        return None
 
     @property
     def value(self) -> float:
+        """The metric over all scenes."""
         return self.at(np.ones(self.scenes))
 
     def resampled(self, resamples: int, seed: int) -> Floats:
+        """The metric over resampled scenes, (resamples,); nan where it is undefined."""
         return resample(self.at, self.scenes, resamples, seed)
+
+    def draws(self, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
+        """`resampled`, computed once."""
+        if (resamples, seed) not in self._known:
+            self._known[resamples, seed] = self.resampled(resamples, seed)
+        return self._known[resamples, seed]
+
+    @cached_property
+    def _known(self) -> dict[tuple[int, int], Floats]:
+        return {}
+
+    def figure(self, *, resamples: int = RESAMPLES, seed: int = 0) -> Figure:
+        """The value with its interval."""
+        return Figure.of(self.value, self.draws(resamples, seed), self.n)
+
+
+def paired_difference(
+    a: Metric,
+    b: Metric,
+    *,
+    groups: Sequence[str] | None = None,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Figure:
+    """a minus b on the same scenes, with the interval of the difference.
+
+    Args:
+        groups: of each scene; groups are drawn then, not scenes, since scenes of one group are
+            near-duplicates (Field and Welsh, "Bootstrapping clustered data", 2007).
+
+    Raises:
+        ValueError: the two were measured on different numbers of scenes.
+    """
+    if a.scenes != b.scenes or (groups is not None and len(groups) != a.scenes):
+        of = "" if groups is None else f", of {len(groups)} groups"
+        raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes}{of}")
+    if groups is None:
+        x, y = a.draws(resamples, seed), b.draws(resamples, seed)
+        both = min(len(x), len(y))
+        draws = x[:both] - y[:both]
+    else:
+        names, place = np.unique(np.array(groups), return_inverse=True)
+        weights = scene_weights(len(names), resamples, seed)
+        draws = np.array([a.at(weight[place]) - b.at(weight[place]) for weight in weights])
+    return Figure.of(a.value - b.value, draws, min(a.n, b.n))
+
+
+@lru_cache(maxsize=4)
+def scene_weights(scenes: int, resamples: int, seed: int) -> Floats:
+    """How often each scene is drawn, (resamples, scenes); not to be written to.
+
+    Kept, since many metrics are resampled over the same scenes one after the other.
+    """
+    rng = np.random.default_rng(seed)
+    weights = np.empty((resamples, scenes))
+    for row in weights:
+        row[:] = np.bincount(rng.integers(scenes, size=scenes), minlength=scenes)
+    weights.flags.writeable = False
+    return weights
+
+
+def resample(
+    statistic: Callable[[Floats], float], scenes: int, resamples: int = RESAMPLES, seed: int = 0
+) -> Floats:
+    """A statistic of the scenes' weights over the resamples, (resamples,)."""
+    return np.array([statistic(weight) for weight in scene_weights(scenes, resamples, seed)])
+
+
+def _centred(drawn: Floats, value: float) -> Floats:
+    """The resamples moved onto the value, so that they tell its spread alone."""
+    return drawn + (value - np.nanmean(drawn)) if np.isfinite(drawn).any() else drawn
 
 
 @dataclass(frozen=True, eq=False)
-class Ratio(SceneMetric):
+class Ratio(Metric):
     """sum(numerators) / sum(denominators) over scenes, as a micro-average is.
 
     Attributes:
@@ -58,17 +181,23 @@ class Ratio(SceneMetric):
             raise ValueError("no scene could be scored")
 
     @classmethod
-    def of_items(cls, scene: Ints, values: Floats, scenes: int) -> Ratio:
+    def of_items(cls, scene: Ints, values: NDArray[Any], scenes: int) -> Ratio:
         """The mean of values (N,) of items that belong to the scenes at `scene` (N,)."""
         top = np.bincount(scene, weights=values, minlength=scenes).astype(np.float64)
         return cls(top, np.bincount(scene, minlength=scenes).astype(np.float64))
 
+    @classmethod
+    def of_scenes(cls, values: NDArray[Any], asked: NDArray[Any] | None = None) -> Ratio:
+        """The mean of values (scenes,) over the scenes that were asked about, all by default."""
+        below = np.ones(len(values)) if asked is None else asked.astype(np.float64)
+        return cls(values.astype(np.float64), below)
+
     @property
-    def scenes(self) -> int:
+    def scenes(self) -> int:  # type: ignore[override]
         return len(self.numerators)
 
     @property
-    def n(self) -> int:
+    def n(self) -> int:  # type: ignore[override]
         return round(float(self.denominators.sum()))
 
     def at(self, weight: Floats) -> float:
@@ -79,15 +208,24 @@ class Ratio(SceneMetric):
         # All resamples in two products.
         weights = scene_weights(self.scenes, resamples, seed)
         top, below = weights @ self.numerators, weights @ self.denominators
-        nothing = np.full(resamples, np.nan)
-        share: Floats = np.divide(top, below, where=below > 0, out=nothing)
+        share: Floats = np.divide(top, below, where=below > 0, out=np.full(resamples, np.nan))
         return share
 
     def mean_over_scenes(self) -> Ratio:
         """The same with every scored scene counting alike."""
         some = self.denominators > 0
         share = np.divide(self.numerators, self.denominators, where=some, out=np.zeros(len(some)))
-        return Ratio(share, some.astype(np.float64))
+        return Ratio.of_scenes(share, some)
+
+    def __sub__(self, other: Ratio) -> Ratio:
+        """The difference on the same items, as a metric with its paired interval.
+
+        Raises:
+            ValueError: they are of other items.
+        """
+        if not np.array_equal(self.denominators, other.denominators):
+            raise ValueError("the two were measured on different items")
+        return Ratio(self.numerators - other.numerators, self.denominators)
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
@@ -97,29 +235,11 @@ class Ratio(SceneMetric):
         )
 
 
-def lowest_is(scene: Ints, value: Floats, right: NDArray[np.bool_], scenes: int) -> Ratio:
-    """hit@1: share of scenes whose item of the lowest value is a right one, ties in expectation.
-
-    Args:
-        scene, value, right: (N,) of each item.
-    """
-    lowest = np.full(scenes, np.inf)
-    np.minimum.at(lowest, scene, value)
-    least = value == lowest[scene]
-    ties = np.bincount(scene[least], minlength=scenes)
-    hits = np.bincount(scene[least & right], minlength=scenes)
-    return Ratio(hits / np.maximum(ties, 1), (ties > 0).astype(np.float64))
-
-
-@dataclass(frozen=True, eq=False)
-class Macro(SceneMetric):
-    """The mean over groups (classes, say) of the mean over a group's items.
-
-    Rare groups drop out of resamples, which lifts their mean where rare groups do worse: the
-    resamples are centred on the value, so that they tell its spread alone.
+class _OfItems(Metric):
+    """A metric of N items that belong to scenes: a dataclass of columns.
 
     Attributes:
-        scene, group: (N,) of each item; value_of: (N,).
+        scene: (N,) of each item.
         count: scenes given.
 
     Raises:
@@ -127,8 +247,6 @@ class Macro(SceneMetric):
     """
 
     scene: Ints
-    group: Ints
-    value_of: Floats
     count: int
 
     def __post_init__(self) -> None:
@@ -136,11 +254,40 @@ class Macro(SceneMetric):
             raise ValueError("no scene could be scored")
 
     @property
-    def scenes(self) -> int:
+    def scenes(self) -> int:  # type: ignore[override]
         return self.count
 
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        values: dict[str, Any] = {}
+        for field in fields(cls):  # type: ignore[arg-type]
+            own = [getattr(part, field.name) for part in parts]
+            values[field.name] = np.concatenate(own) if isinstance(own[0], np.ndarray) else own[0]
+        # The scenes of each part are counted on from the parts before.
+        starts = np.cumsum([0, *(part.count for part in parts)]).tolist()
+        shifted = [part.scene + start for part, start in zip(parts, starts[:-1], strict=True)]
+        scene = np.concatenate(shifted).astype(np.int64)
+        return cls(**values | {"scene": scene, "count": starts[-1]})
+
+
+@dataclass(frozen=True, eq=False)
+class Macro(_OfItems):
+    """The mean over groups (classes, say) of the mean over a group's items.
+
+    Rare groups drop out of resamples, which lifts their mean where rare groups do worse: the
+    resamples are centred on the value.
+
+    Attributes:
+        group: (N,) of each item; value_of: (N,).
+    """
+
+    scene: Ints
+    group: Ints
+    value_of: Floats
+    count: int
+
     @property
-    def n(self) -> int:
+    def n(self) -> int:  # type: ignore[override]
         return len(np.unique(self.group))
 
     def at(self, weight: Floats) -> float:
@@ -153,24 +300,14 @@ class Macro(SceneMetric):
     def resampled(self, resamples: int, seed: int) -> Floats:
         return _centred(super().resampled(resamples, seed), self.value)
 
-    @classmethod
-    def join(cls, parts: Sequence[Self]) -> Self:
-        return cls(
-            _shifted(parts),
-            np.concatenate([part.group for part in parts]),
-            np.concatenate([part.value_of for part in parts]),
-            sum(part.count for part in parts),
-        )
-
 
 @dataclass(frozen=True, eq=False)
-class Scored(SceneMetric):
+class Scored(_OfItems):
     """A statistic of all items' scores at once: AUROC, average precision, calibration.
 
     Attributes:
         statistic: its name in `STATISTICS`.
-        scene: (N,) of each item; score: (N,); truth: (N,) bool.
-        count: scenes given.
+        score: (N,); truth: (N,) bool.
 
     Raises:
         ValueError: nothing was scored, or no such statistic.
@@ -179,44 +316,59 @@ class Scored(SceneMetric):
     statistic: str
     scene: Ints
     score: Floats
-    truth: NDArray[np.bool_]
+    truth: Flags
     count: int
 
     def __post_init__(self) -> None:
         if self.statistic not in STATISTICS:
             raise ValueError(f"unknown statistic {self.statistic!r}, not of {sorted(STATISTICS)}")
-        if not len(self.scene):
-            raise ValueError("no scene could be scored")
+        super().__post_init__()
 
     @property
-    def scenes(self) -> int:
-        return self.count
-
-    @property
-    def n(self) -> int:
+    def n(self) -> int:  # type: ignore[override]
         return len(self.scene)
 
-    def at(self, weight: Floats) -> float:
-        return self._function()(weight[self.scene])
-
-    def resampled(self, resamples: int, seed: int) -> Floats:
-        # Items are sorted once for all resamples.
-        function = self._function()
-        drawn = resample(lambda weight: function(weight[self.scene]), self.count, resamples, seed)
-        return _centred(drawn, self.value) if self.statistic in _GROWING else drawn
-
-    def _function(self) -> Callable[[Floats], float]:
+    @cached_property
+    def _prepared(self) -> Callable[[Floats], float]:
+        """Of the items' weights; the items are sorted once for all resamples."""
         return STATISTICS[self.statistic](self.score, self.truth)
 
-    @classmethod
-    def join(cls, parts: Sequence[Self]) -> Self:
-        return cls(
-            parts[0].statistic,
-            _shifted(parts),
-            np.concatenate([part.score for part in parts]),
-            np.concatenate([part.truth for part in parts]),
-            sum(part.count for part in parts),
-        )
+    def at(self, weight: Floats) -> float:
+        return self._prepared(weight[self.scene])
+
+    def resampled(self, resamples: int, seed: int) -> Floats:
+        drawn = super().resampled(resamples, seed)
+        # Calibration errors grow under resampling, as if there were fewer answers.
+        return _centred(drawn, self.value) if self.statistic == "ECE" else drawn
+
+
+@dataclass(frozen=True, eq=False)
+class Items:
+    """N scored items of some scenes, such as answers with their probability.
+
+    Attributes:
+        scene: (N,) position; score: (N,); truth: (N,) bool.
+        scenes, skipped: how many were given, and how many could not be scored.
+    """
+
+    scene: Ints
+    score: Floats
+    truth: Flags
+    scenes: int
+    skipped: int = 0
+
+    def hit_at_1(self) -> Ratio:
+        """Share of scenes whose item of the highest score is a true one, ties in expectation."""
+        highest = np.full(self.scenes, -np.inf)
+        np.maximum.at(highest, self.scene, self.score)
+        best = self.score == highest[self.scene]
+        ties = np.bincount(self.scene[best], minlength=self.scenes)
+        hits = np.bincount(self.scene[best & self.truth], minlength=self.scenes)
+        return Ratio.of_scenes(hits / np.maximum(ties, 1), ties > 0)
+
+    def metric(self, statistic: str) -> Scored:
+        """One of `STATISTICS`."""
+        return Scored(statistic, self.scene, self.score, self.truth, self.scenes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +377,7 @@ class Resampled(Metric):
 
     Attributes:
         point: the value.
-        drawn: (resamples,) by `intervals.resample` with seed 0 over the same scenes.
+        drawn: (resamples,) by `resample` with seed 0 over the same scenes.
         count: scenes; items: what was compared with them.
     """
 
@@ -241,23 +393,26 @@ class Resampled(Metric):
         """From a statistic of the scenes' weights.
 
         Distances between sets grow under resampling, as if the sets were smaller; the resamples are
-        centred on the value, so that they tell its spread alone.
+        centred on the value.
         """
         point = statistic(np.ones(scenes))
         drawn = resample(statistic, scenes, resamples)
         return cls(point, _centred(drawn, point), scenes, items)
 
     @property
-    def scenes(self) -> int:
+    def scenes(self) -> int:  # type: ignore[override]
         return self.count
 
     @property
-    def n(self) -> int:
+    def n(self) -> int:  # type: ignore[override]
         return self.items
 
     @property
     def value(self) -> float:
         return self.point
+
+    def at(self, weight: Floats) -> float:
+        raise NotImplementedError("Resampled cannot be weighted by scene")
 
     def resampled(self, resamples: int, seed: int) -> Floats:
         if seed != 0:
@@ -265,75 +420,26 @@ class Resampled(Metric):
         return self.drawn[:resamples]
 
 
-def _centred(drawn: Floats, value: float) -> Floats:
-    return drawn + (value - np.nanmean(drawn)) if np.isfinite(drawn).any() else drawn
+class MeanOverSeeds(Metric):
+    """The mean of one metric over training seeds, on the same resampled scenes for all."""
 
+    def __init__(self, members: Sequence[Metric]) -> None:
+        if not members:
+            raise ValueError("a mean over seeds needs at least one metric")
+        if len({member.scenes for member in members}) > 1:
+            raise ValueError("the seeds were measured on different numbers of scenes")
+        self.members = tuple(members)
+        self.scenes, self.n = members[0].scenes, members[0].n
 
-# Calibration errors grow under resampling, as if there were fewer answers.
-_GROWING = ("ECE",)
+    @property
+    def value(self) -> float:
+        return float(np.mean([member.value for member in self.members]))
 
-_KINDS: dict[str, type[Metric]] = {
-    "ratio": Ratio,
-    "macro": Macro,
-    "scored": Scored,
-    "resampled": Resampled,
-}
+    def at(self, weight: Floats) -> float:
+        return float(np.mean([member.at(weight) for member in self.members]))
 
-
-def pool(parts: Sequence[Metric]) -> Metric | None:
-    """One metric over the scenes of all parts; None for metrics of whole sets.
-
-    Raises:
-        ValueError: no parts, or parts of different kinds.
-    """
-    kinds = {(type(part), getattr(part, "statistic", "")) for part in parts}
-    if len(kinds) != 1:
-        raise ValueError(f"cannot pool metrics of {len(kinds)} kinds")
-    first = parts[0]
-    return type(first).join(parts) if isinstance(first, SceneMetric) else None  # type: ignore[arg-type]
-
-
-def metric_to_dict(metric: Metric) -> dict[str, Any]:
-    """JSON-able values, floats to nine significant digits."""
-    kind = next(name for name, cls in _KINDS.items() if type(metric) is cls)
-    values = {field.name: getattr(metric, field.name) for field in fields(metric)}  # type: ignore[arg-type]
-    return {"kind": kind} | {name: _plain(value) for name, value in values.items()}
-
-
-def metric_from_dict(values: dict[str, Any]) -> Metric:
-    """What `metric_to_dict` wrote.
-
-    Raises:
-        ValueError: not one of its kinds.
-    """
-    rest = dict(values)
-    kind = rest.pop("kind", None)
-    if kind not in _KINDS:
-        raise ValueError(f"kind must be one of {sorted(_KINDS)}, not {kind!r}")
-    return _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
-
-
-_TYPES: dict[str, type] = {"scene": np.int64, "group": np.int64, "truth": np.bool_}
-
-
-def _array(name: str, value: Any) -> Any:
-    if not isinstance(value, list):
-        return value
-    # JSON has no nan; a resample without a value is null.
-    values = [float("nan") if x is None else x for x in value]
-    return np.array(values, dtype=_TYPES.get(name, np.float64))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray) and value.dtype == np.float64:
-        return [float(f"{x:.9g}") if np.isfinite(x) else None for x in value.tolist()]
-    if isinstance(value, np.ndarray):
-        return value.astype(np.int64).tolist()
-    return value
-
-
-def _shifted(parts: Sequence[Any]) -> Ints:
-    """The items' scenes, those of each part counted on from the parts before."""
-    starts = np.cumsum([0, *(part.count for part in parts)])
-    shifted = [part.scene + start for part, start in zip(parts, starts[:-1], strict=True)]
-    return np.concatenate(shifted).astype(np.int64)
+    def resampled(self, resamples: int, seed: int) -> Floats:
+        draws = [member.draws(resamples, seed) for member in self.members]
+        shortest = min(len(draw) for draw in draws)
+        mean: Floats = np.mean([draw[:shortest] for draw in draws], axis=0)
+        return mean

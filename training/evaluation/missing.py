@@ -1,14 +1,24 @@
-"""T2: one class left out with all its instances and relations, ranked among all absent classes.
+"""T2: is an object that was hidden from a scene proposed? All tasks about missing objects.
 
-Every relation is unobserved, so nothing of the removed object can leak. Ties score their
-expectation under random order. Structure classes are neither removed nor candidates; scenes with
-fewer than two other classes are skipped. A mention outside the vocabulary would score 0
-(`with_unknown`).
+    T2          each class is left out in turn, with all its instances and relations
+    T2 partial  25, 50 or 75 % of the classes are shown (rounded; at least one is shown and one
+                hidden), or all but one; what is shown at 25 % is shown at 50 % too. A published
+                model answers with its default coverage, and once more with unlisted = absent
+    T2-at       each class that stood in a relation to another class is left out in turn; one of
+                these relations, drawn at random, tells where it was: its direction and the class at
+                its other end, never the removed class
+
+Every hidden class is ranked among the absent classes that are not hidden themselves: another
+hidden class above it is right, not wrong. Precision@5 is the share of the first five absent classes
+that are hidden; where fewer are hidden, it cannot reach 1. Ties score their expectation under
+random order. Structure classes are neither hidden nor candidates; scenes under two other classes
+are skipped. Relations between equal classes or with structure are not asked. In T2 every relation
+is unobserved, so that nothing of the removed object can leak.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +26,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from app.registry import Artifact
+from app.scene import CANONICAL
 from training.batches import SceneTensors
-from training.evaluation.intervals import Figure
-from training.evaluation.metrics import Macro, Ratio
+from training.cases import scene_rng
+from training.evaluation.asking import ask_rows, missing_probabilities, of_classes
+from training.evaluation.metrics import Flags, Floats, Ints, Macro, Metric, Ratio
+from training.evaluation.relations import expected_hits
+from training.evaluation.setting import Contender, Outcome, Setting
 from training.machines import BoltzmannMachine
 from training.machines.log_odds import object_log_odds
 from training.machines.mean_field import Evidence
@@ -28,71 +43,15 @@ ObjectScore = Callable[[Tensor], Tensor]
 # The same given room types (B,) as well, -1 where none is known.
 RoomScore = Callable[[Tensor, Tensor], Tensor]
 
-_PROBED = 64
-
 TOP = (1, 2, 3, 5, 10, 20, 50)
 """Lengths of the lists in which a removed object is looked for."""
 
+SHARES: dict[str, float | None] = {"50 %": 0.5, "25 %": 0.25, "75 %": 0.75, "all but one": None}
+"""What T2 partial shows of a scene, the primary one first."""
 
-class LeakError(ValueError):
-    """A score knows more than it was shown."""
-
-
-@dataclass(frozen=True)
-class LeaveOneOut:
-    """Every removed object of a set of scenes.
-
-    Attributes:
-        scene: (N,) position of the scene in the set.
-        target: (N,) the removed class.
-        above: (N,) classes ranked above the target; ties: (N,) others with exactly its score.
-        log_probability: (N,) of the target under a softmax over absent candidates.
-        scenes, skipped: how many scenes were given, and how many had too few classes.
-    """
-
-    scene: NDArray[np.int64]
-    target: NDArray[np.int64]
-    above: NDArray[np.int64]
-    ties: NDArray[np.int64]
-    log_probability: NDArray[np.float64]
-    scenes: int
-    skipped: int
-
-    def reciprocal_rank(self) -> NDArray[np.float64]:
-        """Expectation of 1 / rank under random order of ties, (N,)."""
-        # Mean of 1/r over r = above + 1 .. above + ties + 1, by harmonic numbers.
-        harmonic = np.concatenate([[0.0], np.cumsum(1.0 / np.arange(1, self._length() + 1))])
-        last = self.above + self.ties + 1
-        return (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
-
-    def top(self, k: int) -> NDArray[np.float64]:
-        """Probability that the target is among the first k, (N,)."""
-        return np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
-
-    def _length(self) -> int:
-        return int((self.above + self.ties).max(initial=0)) + 1
-
-    def ratio(self, values: NDArray[np.float64]) -> Ratio:
-        """Mean of per-object values, (N,)."""
-        return Ratio.of_items(self.scene, values, self.scenes)
-
-    def figure(self, values: NDArray[np.float64]) -> Figure:
-        """The same with its interval."""
-        return self.ratio(values).figure()
-
-    def macro(self, values: NDArray[np.float64]) -> Macro:
-        """Mean over the removed classes of their mean value: rare ones count as frequent ones."""
-        return Macro(self.scene, self.target, values, self.scenes)
-
-    def with_unknown(self, unknown: NDArray[np.int64]) -> Ratio:
-        """MRR where labels outside the vocabulary count as removed objects that score 0.
-
-        Args:
-            unknown: (scenes,) such labels of each scene; skipped scenes stay skipped.
-        """
-        known = self.ratio(self.reciprocal_rank())
-        scored = known.denominators > 0
-        return Ratio(known.numerators, known.denominators + unknown * scored)
+_FIRST = 5
+# Unlisted is absent: every object that is there was listed.
+_CLOSED = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,137 +63,355 @@ class MachineScore:
 
     machine: BoltzmannMachine
 
+    @property
+    def parameter_count(self) -> int:
+        """Trained weights."""
+        return self.machine.parameter_count
+
     def __call__(self, v: Tensor, room: Tensor | None = None) -> Tensor:
         """Scores (B, V) of presence (B, V), room types (B,) withheld unless they are given."""
         evidence = Evidence(v, self.machine.acting_units(v), room=room)
         return object_log_odds(self.machine, evidence)
 
 
-def machine_score(machine: BoltzmannMachine) -> MachineScore:
-    """A machine's score; it takes room types too."""
-    return MachineScore(machine)
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """Every hidden class of a set of scenes among the candidates.
 
-
-def removed_objects(
-    scenes: SceneTensors, structure: Tensor, score: ObjectScore, *, block: int = 256
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Remove every non-structure class of every scene in turn, block by block.
-
-    Args:
-        structure: (V,) bool.
-        score: log-odds of all classes, higher = likelier missing.
-
-    Yields:
-        Positions of the scenes (n,), the removed classes (n,), and the scores (n, V), -inf but for
-        candidates.
-    """
-    return _removed(scenes, structure, lambda v, _: score(v), block)
-
-
-@torch.no_grad()
-def _removed(
-    scenes: SceneTensors, structure: Tensor, score: RoomScore, block: int = 256
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    removable = (scenes.v > 0) & ~structure
-    enough = removable.sum(1) >= 2
-    row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
-    probe = Probe(len(row))
-    for start in range(0, len(row), block):
-        r, t = row[start : start + block], target[start : start + block]
-        v = scenes.v[r].scatter(1, t.unsqueeze(1), 0.0)
-        room = scenes.room[r]
-        values = score(v, room)
-        probe.watch(start, v, room, values)
-        yield r, t, values.masked_fill((v > 0) | structure, -torch.inf)
-    probe.ask_again(score)
-
-
-class Probe:
-    """Rows of all blocks, shown once more in another order and company.
-
-    Who knows whose turn it is, by counting or by relations that dangle where an object was, answers
-    otherwise then. (Who recognises a scene by the objects that are left has seen it before: against
-    that stand the splits by group.)
+    Attributes:
+        scene: (N,) position of the scene in the set.
+        target: (N,) the hidden class.
+        above: (N,) candidates ranked above the target; ties: (N,) others with exactly its score.
+        scenes, skipped: how many scenes were given, and how many had too few classes.
     """
 
-    def __init__(self, rows: int) -> None:
-        order = np.random.default_rng(0).permutation(rows)[:_PROBED]
-        self._rows = torch.from_numpy(order)
-        self._shown: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+    scene: Ints
+    target: Ints
+    above: Ints
+    ties: Ints
+    scenes: int
+    skipped: int
 
-    def watch(self, start: int, v: Tensor, room: Tensor, values: Tensor) -> None:
-        """Keep what was answered to chosen rows of the block that begins at `start`."""
-        here = (self._rows >= start) & (self._rows < start + len(v))
-        for k in self._rows[here].tolist():
-            self._shown[k] = (v[k - start], room[k - start], values[k - start])
-
-    def ask_again(self, score: RoomScore) -> None:
-        """Ask for these rows alone.
+    @classmethod
+    def of(
+        cls, scene: Tensor, target: Tensor, values: Tensor, scenes: int, skipped: int
+    ) -> Ranking:
+        """By scores (N, V), -inf but for candidates.
 
         Raises:
-            LeakError: an answer has changed.
+            FloatingPointError: a score is nan.
         """
-        if not self._shown:
-            return
-        shown = [self._shown[k] for k in self._rows.tolist()]
-        v, room, values = (torch.stack(column) for column in zip(*shown, strict=True))
-        if not torch.allclose(score(v, room), values, rtol=1e-3, atol=1e-3, equal_nan=True):
-            raise LeakError("the same scenes in another order get other scores: something leaks")
-
-
-def leave_one_out(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> LeaveOneOut:
-    """Rank every removed object; see `removed_objects`.
-
-    Raises:
-        LeakError: the score depends on more than the objects that are left.
-    """
-    return leave_one_out_in_rooms(scenes, structure, lambda v, _: score(v))
-
-
-def leave_one_out_in_rooms(
-    scenes: SceneTensors, structure: Tensor, score: RoomScore
-) -> LeaveOneOut:
-    """The same where the score is told the room type of each scene."""
-    enough = ((scenes.v > 0) & ~structure).sum(1) >= 2
-    blocks = _removed(scenes, structure, score)
-    return rank_blocks(blocks, len(scenes), skipped=int((~enough).sum()))
-
-
-def rank_blocks(
-    blocks: Iterable[tuple[Tensor, Tensor, Tensor]], scenes: int, skipped: int
-) -> LeaveOneOut:
-    """Rank targets by scores, blocks as `removed_objects` yields them.
-
-    Raises:
-        FloatingPointError: a score is nan.
-    """
-    empty = torch.zeros(0, dtype=torch.int64)
-    rows, targets, above, ties = [empty], [empty], [empty], [empty]
-    log_p = [torch.zeros(0, dtype=torch.float64)]
-    for row, target, values in blocks:
         if bool(values.isnan().any()):
             raise FloatingPointError("a score is not a number")
         chosen = values.gather(1, target.unsqueeze(1))
-        rows.append(row)
-        targets.append(target)
-        above.append((values > chosen).sum(1))
-        ties.append((values == chosen).sum(1) - 1)
-        log_p.append((chosen.squeeze(1) - values.logsumexp(1)).double())
-    return LeaveOneOut(
-        scene=torch.cat(rows).numpy(),
-        target=torch.cat(targets).numpy(),
-        above=torch.cat(above).numpy(),
-        ties=torch.cat(ties).numpy(),
-        log_probability=torch.cat(log_p).numpy(),
-        scenes=scenes,
-        skipped=skipped,
-    )
+        above, ties = (values > chosen).sum(1), (values == chosen).sum(1) - 1
+        return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes, skipped)
+
+    def reciprocal_rank(self) -> Floats:
+        """Expectation of 1 / rank under random order of ties, (N,)."""
+        # Mean of 1/r over r = above + 1 .. above + ties + 1, by harmonic numbers.
+        last = self.above + self.ties + 1
+        ranks = np.arange(1, int(last.max(initial=1)) + 1)
+        harmonic = np.concatenate([[0.0], np.cumsum(1.0 / ranks)])
+        mean: Floats = (harmonic[last] - harmonic[self.above]) / (self.ties + 1)
+        return mean
+
+    def top(self, k: int) -> Floats:
+        """Probability that the target is among the first k, (N,)."""
+        return np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
+
+    def mrr(self, some: Flags | slice = slice(None)) -> Ratio:
+        """Mean reciprocal rank, of some of the targets if given."""
+        return Ratio.of_items(self.scene[some], self.reciprocal_rank()[some], self.scenes)
+
+    def metrics(self) -> dict[str, Metric]:
+        """MRR and top-k, micro-averaged over hidden classes, and MRR by class."""
+        metrics: dict[str, Metric] = {"MRR": self.mrr()}
+        for k in TOP:
+            metrics[f"top-{k}"] = Ratio.of_items(self.scene, self.top(k), self.scenes)
+        macro = Macro(self.scene, self.target, self.reciprocal_rank(), self.scenes)
+        return metrics | {"MRR, macro by class": macro}
+
+    def with_unknown(self, unknown: Ints) -> Ratio:
+        """MRR where labels outside the vocabulary count as removed objects that score 0.
+
+        Args:
+            unknown: (scenes,) such labels of each scene; skipped scenes stay skipped.
+        """
+        known = self.mrr()
+        scored = known.denominators > 0
+        return Ratio(known.numerators, known.denominators + unknown * scored)
 
 
-def missing_metrics(result: LeaveOneOut) -> dict[str, Ratio | Macro]:
-    """MRR and top-k, micro-averaged over removed objects, and MRR by class."""
-    reciprocal = result.reciprocal_rank()
-    metrics: dict[str, Ratio | Macro] = {"MRR": result.ratio(reciprocal)}
-    for k in TOP:
-        metrics[f"top-{k}"] = result.ratio(result.top(k))
-    return metrics | {"MRR, macro by class": result.macro(reciprocal)}
+def leave_one_out(
+    scenes: SceneTensors,
+    structure: Tensor,
+    score: ObjectScore | RoomScore,
+    *,
+    told_room: bool = False,
+) -> Ranking:
+    """Rank every removed class.
+
+    Args:
+        structure: (V,) bool.
+        score: higher = likelier missing.
+        told_room: the score gets the room type of each scene.
+
+    Raises:
+        LeakError: the score depends on more than what is shown.
+    """
+    removable = (scenes.v > 0) & ~structure
+    enough = removable.sum(1) >= 2
+    row, target = (removable & enough.unsqueeze(1)).nonzero(as_tuple=True)
+    v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
+    values = ask_rows(score, v, scenes.room[row]) if told_room else ask_rows(score, v)
+    values = values.masked_fill((v > 0) | structure, -torch.inf)
+    return Ranking.of(row, target, values, len(scenes), int((~enough).sum()))
+
+
+# ------------------------------------------------------------------------------------- T2 partial
+
+
+@dataclass(frozen=True, eq=False)
+class Partial:
+    """Scenes of which a part is hidden.
+
+    Attributes:
+        scene: (N,) position of the scene in the set.
+        v: (N, V) presence of what is shown; hidden: (N, V) bool.
+        scenes: how many were given.
+    """
+
+    scene: Tensor
+    v: Tensor
+    hidden: Tensor
+    scenes: int
+
+
+def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int = 0) -> Partial:
+    """Hide classes of every scene that has two.
+
+    Args:
+        structure: (V,) bool.
+        share: of the classes that is shown; all but one for None.
+    """
+    plain = ~structure.numpy()
+    places: list[int] = []
+    hidden = torch.zeros_like(scenes.v, dtype=torch.bool)
+    for k, scene in enumerate(scenes.scenes):
+        classes = scene.evidence.classes[plain[scene.evidence.classes]]
+        if len(classes) < 2:
+            continue
+        order = scene_rng(scene, seed).permutation(classes)
+        hidden[k, torch.from_numpy(order[shown_classes(len(order), share) :])] = True
+        places.append(k)
+    index = torch.tensor(places, dtype=torch.int64)
+    v = scenes.v.masked_fill(hidden, 0.0)
+    return Partial(index, v[index], hidden[index], len(scenes))
+
+
+def shown_classes(classes: int, share: float | None) -> int:
+    """How many of so many classes are shown; at least one is, and one is hidden."""
+    if share is None:
+        return classes - 1
+    return min(max(int(share * classes + 0.5), 1), classes - 1)
+
+
+def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tuple[Ratio, Ratio]:
+    """(MRR over hidden classes, precision@5 over scenes).
+
+    Raises:
+        LeakError: the score depends on more than what is shown.
+        FloatingPointError: a score is nan.
+        ValueError: no scene has two classes.
+    """
+    if not len(partial.v):
+        raise ValueError("no scene has two classes, one to show and one to hide")
+    values = ask_rows(score, partial.v)
+    # The least a candidate can have: what was given no probability at all stays a candidate.
+    values = values.clamp(min=torch.finfo(values.dtype).min)
+    values = values.masked_fill((partial.v > 0) | structure, -torch.inf)
+    row, target = partial.hidden.nonzero(as_tuple=True)
+    others = partial.hidden[row].scatter(1, target.unsqueeze(1), False)
+    alone = values[row].masked_fill(others, -torch.inf)
+    ranking = Ranking.of(partial.scene[row], target, alone, partial.scenes, 0)
+    hits = []
+    for own, right in zip(values, partial.hidden, strict=True):
+        candidate = own > -torch.inf
+        found = own[candidate].double().numpy()
+        hits.append(expected_hits(found, right[candidate].numpy(), _FIRST))
+    precision = Ratio.of_items(partial.scene.numpy(), np.array(hits), partial.scenes)
+    return ranking.mrr(), Ratio(precision.numerators, _FIRST * precision.denominators)
+
+
+def partial_score(artifact: Artifact, coverage: float | None = None) -> ObjectScore:
+    """Log-probabilities of `/missing`, asked with the labels alone.
+
+    Args:
+        coverage: the model's default for None; 1 for unlisted = absent.
+    """
+
+    def log_p(row: NDArray[np.float32]) -> Floats:
+        p = missing_probabilities(artifact, of_classes(np.flatnonzero(row).tolist()), coverage)
+        found: Floats = np.log(np.maximum(p, np.finfo(np.float64).tiny))
+        return found
+
+    return lambda v: torch.from_numpy(np.stack([log_p(row) for row in v.numpy()]))
+
+
+# ------------------------------------------------------------------------------------------ T2-at
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """B scenes with a class left out, and where it stood.
+
+    Attributes:
+        v: (B, V) presence of what stayed.
+        counts: (B, V) instances of what stayed, 0 elsewhere.
+        relation: (B,) int64 canonical.
+        anchor: (B,) int64 class at the other end.
+        outgoing: (B,) bool: the missing class is the subject of the relation.
+    """
+
+    v: Tensor
+    counts: Tensor
+    relation: Tensor
+    anchor: Tensor
+    outgoing: Tensor
+
+    def rows(self, index: Tensor) -> Places:
+        """Some of them."""
+        return Places(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+# Scores (B, V) of every class: the higher, the likelier missing from that place.
+PlacedScore = Callable[[Places], Tensor]
+
+
+def removed_places(
+    scenes: SceneTensors, structure: Tensor, seed: int = 0
+) -> tuple[Tensor, Tensor, Places]:
+    """Positions of the scenes (N,), removed classes (N,), and what stayed."""
+    found: list[tuple[int, int, int, int, bool]] = []
+    plain = ~structure.numpy()
+    for k, scene in enumerate(scenes.scenes):
+        evidence = scene.evidence
+        usable = plain[evidence.classes]
+        if usable.sum() < 2:
+            continue
+        pair = usable[:, None] & usable & ~np.eye(len(usable), dtype=np.bool_)
+        triples = np.argwhere(evidence.holds & pair)
+        rng = scene_rng(scene, seed)
+        for x in np.unique(triples[:, 1:]):
+            touching = triples[(triples[:, 1:] == x).any(1)]
+            a, i, j = touching[rng.integers(len(touching))].tolist()
+            anchor = j if i == x else i
+            target, other = evidence.classes[[x, anchor]].tolist()
+            found.append((k, target, a, other, bool(i == x)))
+    table = torch.tensor(found, dtype=torch.int64).reshape(-1, 5)
+    row, target, relation, anchor, outgoing = table.unbind(1)
+    v = scenes.v[row].scatter(1, target.unsqueeze(1), 0.0)
+    counts = torch.zeros_like(v)
+    for place, k in enumerate(row.tolist()):
+        evidence = scenes.scenes[k].evidence
+        counts[place, torch.from_numpy(evidence.classes)] = torch.tensor(evidence.counts).float()
+    return row, target, Places(v, counts * v, relation, anchor, outgoing.bool())
+
+
+def leave_one_out_at(
+    scenes: SceneTensors, structure: Tensor, score: PlacedScore, *, seed: int = 0
+) -> tuple[Ranking, Ints]:
+    """Every removed class among all absent ones, and the relation (N,) that told its place.
+
+    Raises:
+        LeakError: the score depends on more than what is shown.
+    """
+    row, target, places = removed_places(scenes, structure, seed)
+    values = places.v
+    if len(row):
+        every = torch.arange(len(row))
+        values = ask_rows(lambda index: score(places.rows(index)), every, block=16)
+    values = values.masked_fill((places.v > 0) | structure, -torch.inf)
+    skipped = len(scenes) - len(row.unique())
+    return Ranking.of(row, target, values, len(scenes), skipped), places.relation.numpy()
+
+
+# ------------------------------------------------------------------------------------------ tasks
+
+
+def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T2."""
+    if contender.objects is None:
+        return None
+    scenes = setting.scenes
+    found = leave_one_out(scenes, setting.structure, contender.objects)
+    if not len(found.target):
+        return None
+    unknown = np.array([scene.unknown for scene in scenes.scenes], dtype=np.int64)
+    metrics = found.metrics() | {"MRR, unknown labels score 0": found.with_unknown(unknown)}
+    return Outcome(metrics, len(scenes), found.skipped)
+
+
+def missing_in_room_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T2 on the scenes whose room type is known and given; beside it the same with it withheld."""
+    setting = setting.at((setting.scenes.room >= 0).nonzero().squeeze(1))
+    scenes, structure, score = setting.scenes, setting.structure, contender.objects_in_rooms
+    if score is None or not len(scenes):
+        return None
+    found = leave_one_out(scenes, structure, score, told_room=True)
+    if not len(found.target):
+        return None
+    metrics = found.metrics()
+    if contender.objects is not None:
+        metrics["MRR, room type withheld"] = leave_one_out(
+            scenes, structure, contender.objects
+        ).mrr()
+    return Outcome(metrics, len(scenes), found.skipped)
+
+
+def partial_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T2 partial; a published model stands beside itself with unlisted = absent."""
+    artifact = contender.artifact
+    score = contender.objects if artifact is None else partial_score(artifact)
+    if score is None:
+        return None
+    scenes = setting.some()
+    metrics: dict[str, Metric] = {}
+    skipped = 0
+    for name, share in SHARES.items():
+        cases = hide(scenes, setting.structure, share, setting.seed)
+        if not len(cases.scene):
+            return None
+        skipped = len(scenes) - len(cases.scene)
+        mrr, precision = rank_hidden(cases, setting.structure, score)
+        metrics |= {f"MRR, {name}": mrr, f"precision@5, {name}": precision}
+        if artifact is not None:
+            closed = partial_score(artifact, _CLOSED)
+            other, other_precision = rank_hidden(cases, setting.structure, closed)
+            metrics |= {
+                f"MRR, {name}, unlisted absent": other,
+                f"change of MRR, {name}": mrr - other,
+                f"change of precision@5, {name}": precision - other_precision,
+            }
+    return Outcome(metrics, len(scenes), skipped)
+
+
+def placed_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T2-at; beside it the same questions answered without the place."""
+    if contender.placed is None:
+        return None
+    scenes, structure = setting.some(related=True, share=3), setting.structure
+    found, relation = leave_one_out_at(scenes, structure, contender.placed, seed=setting.seed)
+    if not len(relation):
+        return None
+    metrics: dict[str, Metric] = {"MRR": found.mrr()}
+    for a, name in enumerate(CANONICAL):
+        if (relation == a).any():
+            metrics[f"MRR, {name}"] = found.mrr(relation == a)
+    if (objects := contender.objects) is not None:
+        blind, _ = leave_one_out_at(
+            scenes, structure, lambda places: objects(places.v), seed=setting.seed
+        )
+        metrics["MRR, place unknown"] = blind.mrr()
+    return Outcome(metrics, len(scenes), found.skipped)

@@ -14,10 +14,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from app.scene import CANONICAL
-from training.evaluation.contenders import Contender
-from training.evaluation.intervals import Metric
-from training.evaluation.metrics import Ratio
-from training.evaluation.tasks import Outcome, Setting, Task
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.setting import Contender, Outcome, Setting
 from training.offsets import seen_offsets
 
 SHARE: Final = 0.8
@@ -60,7 +58,3 @@ def offsets_task(contender: Contender, setting: Setting) -> Outcome | None:
         distance = np.linalg.norm(vectors, axis=1)
         metrics[name] = Ratio.of_items(seen.scene, distance, len(scenes))
     return Outcome(metrics, len(scenes), len(scenes) - len(np.unique(seen.scene)))
-
-
-OFFSETS_TASKS: dict[str, Task] = {"Offsets": offsets_task}
-"""Apart from `TASKS`: all machines that were trained on the same scenes have the same offsets."""

@@ -1,197 +1,346 @@
-"""T3: one absent class added to a scene; is it the one that fits least?
+"""T3: one absent class is added to a scene; is it the one that fits least? And the alarm.
 
-Every relation is unobserved. Scenes under three classes are skipped. The intruder is drawn from the
-absent, non-structure classes by one of three laws: uniformly, by popularity in training, or
-uniformly from the classes that training saw in the same room type.
+A score answers by the log-odds of each object given the rest. A published model is asked as a robot
+asks: all instances of the scene as labels, nothing else. hit@1 then follows the service's ranking,
+the probability of being an intruder; hit@1 by log-odds stands beside it. Structure raises no alarm
+and takes no rank. Ties score their expectation.
+
+An alarm in a given share of untouched scenes is promised, by one rule for machines and baselines.
+Alarms of one place come together, places differ, and a source of one kind may be far more varied
+than another. So the threshold is kept for each source by itself, on the safe side of what resampled
+groups leave open.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from training.batches import SceneTensors
-from training.evaluation.cases import scene_rng
-from training.evaluation.metrics import Ratio, Scored, lowest_is
+from app.questions import Sensitivity
+from app.registry import Artifact, Calibration
+from app.scene import Scene
+from training.batches import SceneTensors, subset
+from training.cases import scene_rng, some_scenes
+from training.datasets import EncodedScene
+from training.evaluation.asking import (
+    SENSITIVITIES,
+    ask_every,
+    judge,
+    labels_alone,
+    things,
+    with_intruder,
+)
+from training.evaluation.intruders import (
+    IntruderScores,
+    Law,
+    by_popularity,
+    by_signature,
+    draw_intruders,
+    intruder_scores,
+)
+from training.evaluation.metrics import Flags, Floats, Ints, Metric, Ratio
 from training.evaluation.missing import ObjectScore
+from training.evaluation.setting import Contender, Outcome, Setting
+
+MEDIUM = 0.1
+"""Share of untouched scenes that raise an alarm at the default sensitivity."""
+
+_RESAMPLES = 200
+# New places differ: the threshold is on the safe side in so many of the resampled sets of groups.
+_CONFIDENCE = 0.7
+# Scenes of a source whose share of alarms is kept by itself, and of small sources together.
+_SOURCE_SCENES = 200
+_SMALL_SCENES = 30
+_SCENES = 1500
 
 
 @dataclass(frozen=True, eq=False)
-class IntruderScores:
-    """Log-odds of each object given the rest, for clean scenes and for the same with an intruder.
+class Alarm:
+    """When a scene is called wrong.
 
     Attributes:
-        scene: (N,) position of the scene; log_odds: (N,); intruder: (N,) bool; size: (N,) number of
-            distinct classes in the scene as scored; clean: (N,) bool, scored without an intruder.
-        thing: (N,) its class.
-        scenes: how many were given; skipped: too small, or without a class to add.
+        suspicion: scores (N,) of each judged object, higher = more an intruder.
+        threshold: from which an object raises the alarm.
+        short: the same for lists of 1, 2, ... classes, structure aside.
     """
 
-    scene: NDArray[np.int64]
-    log_odds: NDArray[np.float64]
-    intruder: NDArray[np.bool_]
-    size: NDArray[np.int64]
-    clean: NDArray[np.bool_]
-    thing: NDArray[np.int64]
-    scenes: int
-    skipped: int
+    suspicion: Callable[[IntruderScores], Floats]
+    threshold: float
+    short: tuple[float, ...] = ()
 
-    @property
-    def listed(self) -> NDArray[np.int64]:
-        """(N,) number of distinct classes in the scene as scored, structure aside."""
-        as_scored = 2 * self.scene + self.clean
-        counts: NDArray[np.int64] = np.bincount(as_scored)[as_scored]
-        return counts
-
-    def with_prior(self, prior: NDArray[np.float64]) -> IntruderScores:
-        """With the log-odds of being an intruder taken from each class, (V,)."""
-        return replace(self, log_odds=self.log_odds - prior[self.thing])
-
-    def hit_at_1(self) -> Ratio:
-        """Share of scenes whose intruder has the lowest log-odds (ties in expectation)."""
-        rows = ~self.clean
-        return lowest_is(self.scene[rows], self.log_odds[rows], self.intruder[rows], self.scenes)
-
-    def auroc(self) -> Scored:
-        """Area under the ROC of -log-odds, intruders against the objects they joined."""
-        return self._scored("AUROC")
-
-    def average_precision(self) -> Scored:
-        """Average precision of the same ranking."""
-        return self._scored("average precision")
-
-    def _scored(self, statistic: str) -> Scored:
-        rows = ~self.clean
-        scene, score = self.scene[rows], -self.log_odds[rows]
-        return Scored(statistic, scene, score, self.intruder[rows], self.scenes)
-
-    def false_alarms(self, loud: NDArray[np.bool_]) -> Ratio:
-        """Share of untouched scenes in which some object is loud, (N,)."""
-        return self._alarms(loud, self.clean)
-
-    def caught(self, loud: NDArray[np.bool_]) -> Ratio:
-        """Share of intruders that are loud, (N,)."""
-        return self._alarms(loud, self.intruder)
-
-    def _alarms(self, loud: NDArray[np.bool_], judged: NDArray[np.bool_]) -> Ratio:
-        there = np.bincount(self.scene[judged], minlength=self.scenes) > 0
-        alarm = np.bincount(self.scene[judged & loud], minlength=self.scenes) > 0
-        return Ratio(alarm.astype(np.float64), there.astype(np.float64))
+    def raised(self, scores: IntruderScores) -> Flags:
+        """Whether each scored object raises the alarm, (N,)."""
+        limits = np.array([*self.short, self.threshold])
+        limit = limits[np.minimum(scores.listed - 1, len(self.short))]
+        loud: Flags = self.suspicion(scores) >= limit
+        return loud
 
 
-def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Weights (N, V): in how many of the training scenes each class is."""
-    return train.v.sum(0).expand(len(scenes), -1)
+def calibrated_alarm(calibration: Calibration) -> Alarm:
+    """The service's own: its probability of an intruder, and its default threshold."""
+    entry = calibration.outlier
+    popularity = np.array(calibration.popularity)
+
+    def suspicion(scores: IntruderScores) -> Floats:
+        if len(popularity):
+            scores = scores.with_prior(calibration.popularity_weight * popularity)
+        return np.asarray(1 / (1 + np.exp(-entry.log_odds(scores.log_odds, scores.size))))
+
+    short = tuple(limits.medium for limits in calibration.short_list_thresholds)
+    return Alarm(suspicion, calibration.outlier_thresholds.medium, short)
 
 
-def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Weights (N, V): 1 for classes that training saw in the scene's room type; 0 if unknown."""
-    weights = torch.zeros_like(scenes.v)
-    for room in scenes.room.unique().tolist():
-        if room >= 0:
-            seen = (train.v[train.room == room] > 0).any(0)
-            weights[scenes.room == room] = seen.to(weights.dtype)
-    return weights
-
-
-def draw_intruders(
-    scenes: SceneTensors, structure: Tensor, weights: Tensor | None = None, seed: int = 0
-) -> Tensor:
-    """An intruder for each scene, (N,) int64; -1 where a scene is skipped.
+def fitted_alarm(
+    score: ObjectScore, validation: SceneTensors, structure: Tensor, seed: int = 0
+) -> Alarm:
+    """The alarm of a score that has no calibration, by log-odds alone.
 
     Args:
+        validation: those with complete object lists are judged, at most 1,500.
         structure: (V,) bool.
-        weights: (N, V) or None for uniform, how likely each class is to be drawn if absent.
     """
-    present = scenes.v > 0
-    absent = (~present & ~structure).double()
-    if weights is not None:
-        absent = absent * weights
-    enough = ((present & ~structure).sum(1) >= 3) & (absent.sum(1) > 0)
-    intruders = torch.full((len(scenes),), -1, dtype=torch.int64)
-    for k in enough.nonzero().squeeze(1).tolist():
-        p = absent[k].numpy()
-        rng = scene_rng(scenes.scenes[k], seed)
-        intruders[k] = int(rng.choice(len(p), p=p / p.sum()))
-    return intruders
+    complete = subset(validation, validation.complete.nonzero().squeeze(1))
+    scenes = some_scenes(complete, _SCENES, seed)
+    scores = intruder_scores(scenes, structure, score, seed=seed)
+    threshold = alarm_threshold(-scores.log_odds, scores, scenes, np.random.default_rng(seed))
+    return Alarm(lambda asked: -asked.log_odds, threshold)
 
 
-@torch.no_grad()
-def intruder_scores(
+def alarm_threshold(
+    suspicion: Floats,
+    scores: IntruderScores,
     scenes: SceneTensors,
+    rng: np.random.Generator,
+    share: float = MEDIUM,
+) -> float:
+    """The suspicion from which an object raises the alarm.
+
+    The share of false alarms is kept in each source by itself: a robot's scenes are of one kind,
+    and one quantile over all kinds would alarm often in the most varied one and never in others.
+
+    Args:
+        suspicion: (N,) of each scored object; higher = more an intruder.
+        scores: of `scenes`, with untouched ones among them.
+        share: of untouched scenes of the hardest large source that raise an alarm.
+
+    Raises:
+        ValueError: no untouched scene was scored.
+        FloatingPointError: one of them has no finite suspicion.
+    """
+    worst = np.full(len(scenes), -np.inf)
+    np.maximum.at(worst, scores.scene[scores.clean], suspicion[scores.clean])
+    judged = np.bincount(scores.scene[scores.clean], minlength=len(scenes)) > 0
+    if not judged.any():
+        raise ValueError("no untouched scene was scored: there is nothing to fit an alarm on")
+    if not np.isfinite(worst[judged]).all():
+        raise FloatingPointError("the suspicion of an untouched scene is not finite")
+    group = np.array([scene.group for scene in scenes.scenes])[judged]
+    return kept_in_each_source(worst[judged], group, scenes.source.numpy()[judged], rng, share)
+
+
+def kept_in_each_source(
+    worst: Floats,
+    group: NDArray[np.str_],
+    source: Ints,
+    rng: np.random.Generator,
+    share: float,
+) -> float:
+    """The threshold that the given share of scenes reaches in the hardest source, and less in
+    others.
+
+    Small sources are judged together, and by their quantile as it is: of few places, resampled ones
+    say little more than the strangest scene does.
+
+    Args:
+        worst: (N,) the most suspicious score of each untouched scene.
+        group: (N,) places; source: (N,) numbers.
+    """
+    kinds, sizes = np.unique(source, return_counts=True)
+    large = [source == kind for kind in kinds[sizes >= _SOURCE_SCENES]]
+    small = np.isin(source, kinds[sizes < _SOURCE_SCENES])
+    bounds = [_bound(worst[some], group[some], rng, share) for some in large]
+    if small.sum() >= _SMALL_SCENES or not large:
+        bounds.append(float(np.quantile(worst[small], 1 - share)))
+    # What reaches the threshold raises the alarm, and many scenes may have one and the same worst
+    # suspicion (a class's popularity): these stay below.
+    return float(np.nextafter(max(bounds), np.inf))
+
+
+def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator, share: float) -> float:
+    """The threshold that a share of scenes exceeds, on the safe side.
+
+    Scenes of one place raise alarms together, so the share in new places is uncertain: a high
+    quantile of the threshold over resampled groups.
+    """
+    members = [worst[group == name] for name in np.unique(group)]
+    found = []
+    for _ in range(_RESAMPLES):
+        drawn = rng.integers(len(members), size=len(members))
+        scenes = np.concatenate([members[k] for k in drawn])
+        found.append(np.quantile(scenes, 1 - share))
+    return float(np.quantile(found, _CONFIDENCE))
+
+
+# ------------------------------------------------------------------------------------------ tasks
+
+# Lists of so few classes are asked too: a robot that has just begun to look.
+_SHORT_LISTS = (1, 2, 4)
+
+
+def outliers_task(contender: Contender, setting: Setting, law: Law | None = None) -> Outcome | None:
+    """T3 by a score: uniform intruders by default."""
+    if contender.objects is None or (law is not None and setting.train is None):
+        return None
+    scenes = setting.some()
+    weights = None if law is None or setting.train is None else law(scenes, setting.train)
+    scores = intruder_scores(
+        scenes, setting.structure, contender.objects, weights=weights, seed=setting.seed
+    )
+    if not len(scores.scene):
+        return None
+    metrics: dict[str, Metric] = {
+        "hit@1": scores.hit_at_1(),
+        "AUROC": scores.dirty.metric("AUROC"),
+        "average precision": scores.dirty.metric("average precision"),
+    }
+    if contender.alarm is not None:
+        loud = contender.alarm.raised(scores)
+        metrics["alarms in untouched scenes"] = scores.false_alarms(loud)
+        metrics["intruders caught"] = scores.caught(loud)
+    return Outcome(metrics, len(scenes), scores.skipped)
+
+
+def signature_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T3 signature; a baseline ranks by log-odds alone."""
+    if setting.train is None:
+        return None
+    structure, seed = setting.structure, setting.seed
+    every = by_signature(setting.scenes, setting.train)
+    drawn = draw_intruders(setting.scenes, structure, every, seed)
+    index = (drawn >= 0).nonzero().squeeze(1)
+    if not len(index):
+        return None
+    scenes = setting.at(index).some()
+    own = by_signature(scenes, setting.train)
+    if contender.artifact is not None:
+        intruders = draw_intruders(scenes, structure, own, seed)
+        metrics = judge_intruders(contender.artifact, scenes, structure, intruders)
+    elif contender.objects is not None:
+        scores = intruder_scores(scenes, structure, contender.objects, weights=own, seed=seed)
+        metrics = dict.fromkeys(("hit@1", "hit@1, log-odds alone"), scores.hit_at_1())
+    else:
+        return None
+    return Outcome(metrics, len(scenes), 0)
+
+
+def sensitivity_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """Alarms in untouched scenes, and intruders caught, at each sensitivity."""
+    artifact = contender.artifact
+    if artifact is None:
+        return None
+    scenes, structure = setting.some(), setting.structure
+    laws: dict[str, Tensor | None] = {"uniform": None}
+    if setting.train is not None:
+        laws["by popularity"] = by_popularity(scenes, setting.train)
+    metrics: dict[str, Metric] = {}
+    judged = np.zeros(len(scenes), dtype=np.bool_)
+    for name, weights in laws.items():
+        intruders = draw_intruders(scenes, structure, weights, setting.seed)
+        if (intruders >= 0).any():
+            judged |= (intruders >= 0).numpy()
+            metrics |= judge_intruders(artifact, scenes, structure, intruders, f", {name}")
+    if not metrics:
+        return None
+    cases = [labels_alone(scene) for scene in scenes.scenes]
+    for sensitivity in SENSITIVITIES:
+        share = alarms(artifact, cases, structure, sensitivity, judged)
+        metrics[f"alarms, {sensitivity}"] = share
+    plain = ((scenes.v > 0) & ~structure).sum(1).numpy()
+    for listed in _SHORT_LISTS:
+        large = judged & (plain > listed)
+        if large.any():
+            cases = [
+                first_classes(scene, structure, listed, scene_rng(scene, setting.seed))
+                for scene in scenes.scenes
+            ]
+            share = alarms(artifact, cases, structure, "medium", large)
+            metrics[f"alarms, medium, {listed} listed"] = share
+    return Outcome(metrics, len(scenes), int((~judged).sum()))
+
+
+def judge_intruders(
+    artifact: Artifact, scenes: SceneTensors, structure: Tensor, intruders: Tensor, law: str = ""
+) -> dict[str, Metric]:
+    """hit@1 by probability and by log-odds, and the share caught at each sensitivity.
+
+    Args:
+        intruders: (N,) classes, -1 for scenes that are not asked.
+        law: what the names of the metrics say of the intruders.
+
+    Raises:
+        LeakError: see `ask_every`.
+    """
+    asked = (intruders >= 0).numpy()
+    places = np.flatnonzero(asked).tolist()
+    cases = [
+        with_intruder(artifact, labels_alone(scenes.scenes[k]), int(intruders[k])) for k in places
+    ]
+    hits, hits_by_odds = np.zeros(len(asked)), np.zeros(len(asked))
+    caught: dict[str, Metric] = {}
+    for name in SENSITIVITIES:
+        flagged = np.zeros(len(asked))
+        found = ask_every(partial(verdict, artifact, name), cases)
+        for k, case, columns in zip(places, cases, found, strict=True):
+            flagged[k] = columns[-1, 2]
+            if name == "medium":
+                plain = things(case, structure.numpy())
+                hits[k] = share_of_first(np.where(plain, columns[:, 0], -np.inf), -1)
+                hits_by_odds[k] = share_of_first(np.where(plain, -columns[:, 1], -np.inf), -1)
+        caught[f"caught{law}, {name}"] = Ratio.of_scenes(flagged, asked)
+    return {
+        f"hit@1{law}": Ratio.of_scenes(hits, asked),
+        f"hit@1{law}, log-odds alone": Ratio.of_scenes(hits_by_odds, asked),
+    } | caught
+
+
+def verdict(artifact: Artifact, sensitivity: Sensitivity, scene: Scene) -> Floats:
+    """(n, 3) of its objects: probability, log-odds, called an outlier."""
+    found = judge(artifact, scene, sensitivity)
+    return np.column_stack([found.probability, found.log_odds, found.is_outlier])
+
+
+def share_of_first(values: Floats, target: int) -> float:
+    """Whether the value at `target` is the highest; ties in expectation."""
+    best = values == values.max()
+    return float(best[target] / best.sum())
+
+
+def alarms(
+    artifact: Artifact,
+    cases: Sequence[Scene],
     structure: Tensor,
-    score: ObjectScore,
-    *,
-    weights: Tensor | None = None,
-    seed: int = 0,
-    block: int = 32,
-) -> IntruderScores:
-    """Score every object of every scene, clean and with one intruder; see `draw_intruders`."""
-    added = draw_intruders(scenes, structure, weights, seed)
-    kept = (added >= 0).nonzero().squeeze(1)
-    blocks = (
-        part
-        for index in kept.split(block)
-        if len(index)
-        for part in _scored_blocks(scenes.v[index], index, added[index], structure, score)
-    )
-    return _scores(blocks, len(scenes), len(kept))
+    sensitivity: Sensitivity,
+    judged: Flags,
+) -> Ratio:
+    """Share of the judged of N untouched scenes with an object that is called an outlier."""
+    found = ask_every(partial(verdict, artifact, sensitivity), cases)
+    loud = [
+        bool(((columns[:, 2] > 0) & things(case, structure.numpy())).any())
+        for case, columns in zip(cases, found, strict=True)
+    ]
+    return Ratio.of_scenes(np.array(loud) & judged, judged)
 
 
-@torch.no_grad()
-def clean_scores(
-    v: Tensor, structure: Tensor, score: ObjectScore, block: int = 64
-) -> IntruderScores:
-    """Score every object of every scene (N, V) as it is."""
-    index = torch.arange(len(v))
-    blocks = (
-        _scored(v[some], some, torch.full_like(some, -1), structure, score, clean=True)
-        for some in index.split(block)
-        if len(some)
-    )
-    return _scores(blocks, len(v), len(v))
-
-
-_Columns = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-
-
-def _scores(blocks: Iterable[_Columns], scenes: int, kept: int) -> IntruderScores:
-    nothing = torch.zeros(0, dtype=torch.int64)
-    parts = [(nothing, nothing.double(), nothing.bool(), nothing, nothing.bool(), nothing), *blocks]
-    placed, log_odds, intruder, sizes, untouched, thing = (
-        torch.cat(column).numpy() for column in zip(*parts, strict=True)
-    )
-    return IntruderScores(
-        placed,
-        log_odds,
-        intruder,
-        sizes,
-        untouched,
-        thing,
-        scenes=scenes,
-        skipped=scenes - kept,
-    )
-
-
-def _scored_blocks(
-    clean: Tensor, index: Tensor, added: Tensor, structure: Tensor, score: ObjectScore
-) -> Iterator[_Columns]:
-    dirty = clean.scatter(1, added.unsqueeze(1), 1.0)
-    yield _scored(clean, index, added, structure, score, clean=True)
-    yield _scored(dirty, index, added, structure, score, clean=False)
-
-
-def _scored(
-    v: Tensor, index: Tensor, added: Tensor, structure: Tensor, score: ObjectScore, *, clean: bool
-) -> _Columns:
-    row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
-    rest = v[row].scatter(1, thing.unsqueeze(1), 0.0)
-    odds = score(rest).gather(1, thing.unsqueeze(1)).squeeze(1)
-    bad = (thing == added[row]) & (not clean)
-    size = (v > 0).sum(1)[row]
-    return index[row], odds.double(), bad, size, torch.full_like(bad, clean), thing
+def first_classes(
+    encoded: EncodedScene, structure: Tensor, listed: int, rng: np.random.Generator
+) -> Scene:
+    """All instances of so many of its classes, drawn at random, and its structure."""
+    every = np.unique(encoded.instance_classes)
+    hidden = rng.permutation(every[~structure.numpy()[every]])[listed:]
+    kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden))
+    return labels_alone(encoded, kept.tolist())

@@ -26,12 +26,9 @@ from app.scene import CANONICAL
 from training.batches import SceneTensors, seen_triples
 from training.datasets import EncodedScene
 from training.evaluation.asking import ask_every, labels_alone, relation_probabilities
-from training.evaluation.contenders import Contender
-from training.evaluation.intervals import Metric
-from training.evaluation.metrics import Ratio
+from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.relations import RelationScore, telling
-from training.evaluation.setting import Outcome, Setting
-from training.trainer import subset
+from training.evaluation.setting import Contender, Outcome, Setting
 
 RARE = 10
 """A class that is related to so many classes at most in training is rare."""
@@ -108,8 +105,7 @@ def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
     @torch.no_grad()
     def score(asked: ScenePairs) -> Floats:
         batch = scenes.batch(torch.tensor([asked.place]))
-        blind = telling(batch, torch.zeros_like(batch.observed))
-        p = relations(blind)[0].double().sigmoid().numpy()
+        p = relations(telling(batch))[0].double().sigmoid().numpy()
         x, y = asked.ends.T
         return np.concatenate([p[:, x, y], p[:, y, x]]).T
 
@@ -179,7 +175,7 @@ def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
     if not related:
         return None
     index = torch.tensor(sorted(related), dtype=torch.int64)
-    scenes = replace(setting, scenes=subset(setting.scenes, index)).some()
+    scenes = setting.at(index).some()
     asked = vertical_pairs(scenes, setting.structure)
     if contender.artifact is not None:
         score = service_score(contender.artifact)

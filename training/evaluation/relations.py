@@ -1,9 +1,19 @@
-"""T1a: the annotated relations of a scene, given its classes alone.
+"""T1a, T1b and T3b: the annotated relations of a scene, by classes.
 
-R-precision over all ordered pairs i ≠ j of present classes × canonical relations: as many
+    T1a   given the classes alone
+    T1b   given the classes and a random half of the triples; given triples are no candidates, nor
+          are their mirror images a(y, x), which a given a(x, y) all but excludes
+    T3b   one triple is false; is it the one that fits least, each judged given the others?
+
+T1 is R-precision over all ordered pairs i ≠ j of present classes × canonical relations: as many
 predictions as there are annotated triples. Unlisted is counted as wrong although annotators list
 only a few relations a scene. Structure classes are no ends. Scenes without annotated triples are
-skipped. What is scored sees no relation, given or held out.
+skipped; T1b and T3b need two. Triples are canonical and distinct, so that none is held out in one
+spelling (left) and given in the other (right). Everything that is not given is unobserved.
+
+The false triple of T3b has, half of the time, another relation between the two classes, otherwise
+another present class at one end. Neither it nor its mirror image, which the rest of the triples
+would contradict outright, is true in the scene.
 """
 
 from __future__ import annotations
@@ -13,11 +23,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from app.scene import CANONICAL
 from training.batches import Batch, SceneTensors
-from training.evaluation.metrics import Ratio
+from training.cases import Triple, scene_rng
+from training.evaluation.metrics import Flags, Floats, Ints, Items, Metric, Ratio
+from training.evaluation.setting import Contender, Outcome, Setting
 from training.machines import BoltzmannMachine
 from training.machines.edges import triple_keys
 from training.machines.log_odds import relation_log_odds
@@ -25,6 +37,11 @@ from training.machines.mean_field import Evidence
 
 # Scores (B, A, n, n) of the relations between the classes of a batch.
 RelationScore = Callable[[Batch], Tensor]
+
+FIRST = (1, 2, 5, 10, 20, 50, 100)
+"""Numbers of predictions, per scene, among which annotated relations are looked for."""
+_RECALLS = (20, 50, 100)
+_TRIES = 50
 
 
 def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScore:
@@ -38,6 +55,16 @@ def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScor
     return score
 
 
+def transitive_closure(given: Tensor) -> Tensor:
+    """All pairs joined by a chain of given ones, (..., n, n) bool, by repeated squaring."""
+    reach = given.float()
+    while True:
+        further = ((reach + reach @ reach) > 0).float()
+        if torch.equal(further, reach):
+            return reach > 0
+        reach = further
+
+
 @dataclass(frozen=True, eq=False)
 class Candidates:
     """The triples of one scene that are ranked, k of them.
@@ -49,12 +76,12 @@ class Candidates:
     """
 
     scene: int
-    relation: NDArray[np.int64]
-    key: NDArray[np.int64]
-    score: NDArray[np.float64]
-    truth: NDArray[np.bool_]
+    relation: Ints
+    key: Ints
+    score: Floats
+    truth: Flags
 
-    def where(self, mask: NDArray[np.bool_]) -> Candidates:
+    def where(self, mask: Flags) -> Candidates:
         """Some of them."""
         return Candidates(
             self.scene, self.relation[mask], self.key[mask], self.score[mask], self.truth[mask]
@@ -69,68 +96,97 @@ def scorable(batch: Batch, structure: Tensor) -> Tensor:
     return pair[:, None].expand_as(batch.holds)
 
 
-def telling(batch: Batch, given: Tensor) -> Batch:
-    """The batch with nothing known of its relations but those that are given, (B, A, n, n) bool."""
+def telling(batch: Batch, given: Tensor | None = None) -> Batch:
+    """The batch with no relation observed but those that are given, (B, A, n, n) bool."""
+    if given is None:
+        given = torch.zeros_like(batch.observed)
     return replace(batch, holds=given.to(batch.holds.dtype), observed=given)
 
 
-@torch.no_grad()
-def score_scenes(
-    scenes: SceneTensors, score: RelationScore, *, counts: bool = True, block: int = 32
-) -> list[tuple[Batch, Tensor]]:
-    """Batches of the scenes that have annotated triples, with their scores (B, A, n, n).
+def _batches(
+    scenes: SceneTensors, triples: int, block: int = 16
+) -> Iterator[tuple[list[int], Batch]]:
+    """(positions, batch) of the scenes that have so many triples."""
+    related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.sum() >= triples]
+    for start in range(0, len(related), block):
+        index = related[start : start + block]
+        yield index, scenes.batch(torch.tensor(index, dtype=torch.int64))
+
+
+def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candidates]:
+    """Candidates of every scene, numbered in their order.
 
     Args:
-        counts: say how many instances of each class there are; otherwise 0, nobody counted.
-    """
-    scored = []
-    related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
-    for index in torch.tensor(related, dtype=torch.int64).split(block):
-        if len(index):
-            batch = scenes.batch(index)
-            asked = telling(batch, torch.zeros_like(batch.observed))
-            if not counts:
-                asked = replace(asked, counts=torch.zeros_like(asked.counts))
-            scored.append((batch, score(asked)))
-    return scored
-
-
-def candidates(scored: Iterable[tuple[Batch, Tensor]], structure: Tensor) -> list[Candidates]:
-    """The candidates of every scored scene, see `score_scenes`."""
-    return number(
-        scene
-        for batch, values in scored
-        for scene in candidates_of(batch, values, scorable(batch, structure))
-    )
-
-
-def candidates_of(batch: Batch, values: Tensor, mask: Tensor) -> Iterator[Candidates]:
-    """Candidates of each scene of a batch, by its place there.
-
-    Args:
-        values, mask: (B, A, n, n) scores, and which triples are candidates.
+        batches: with scores and masks (B, A, n, n), the latter of the triples that are candidates.
 
     Raises:
         FloatingPointError: the score of a candidate is nan.
     """
-    for row in range(len(batch)):
-        relation, x, y = mask[row].nonzero(as_tuple=True)
-        own = batch.classes[row]
-        score = values[row, relation, x, y].double().numpy()
-        if np.isnan(score).any():
-            raise FloatingPointError(f"the score of scene {row} of a batch is not a number")
-        yield Candidates(
-            scene=row,
-            relation=relation.numpy(),
-            key=triple_keys(relation, own[x], own[y], batch.v.shape[1]).numpy(),
-            score=score,
-            truth=(batch.holds[row, relation, x, y] > 0).numpy(),
-        )
+    found: list[Candidates] = []
+    for batch, values, mask in batches:
+        for row, own in enumerate(batch.classes):
+            relation, x, y = mask[row].nonzero(as_tuple=True)
+            score = values[row, relation, x, y].double().numpy()
+            if np.isnan(score).any():
+                raise FloatingPointError(f"the score of scene {row} of a batch is not a number")
+            key = triple_keys(relation, own[x], own[y], batch.v.shape[1]).numpy()
+            truth = (batch.holds[row, relation, x, y] > 0).numpy()
+            found.append(Candidates(len(found), relation.numpy(), key, score, truth))
+    return found
 
 
-def number(scenes: Iterable[Candidates]) -> list[Candidates]:
-    """The scenes numbered in the order in which they come."""
-    return [replace(scene, scene=place) for place, scene in enumerate(scenes)]
+@torch.no_grad()
+def score_scenes(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, counts: bool = True
+) -> list[Candidates]:
+    """T1a: the candidates of the scenes that have annotated triples.
+
+    Args:
+        structure: (V,) bool.
+        counts: say how many instances of each class there are; otherwise 0, nobody counted.
+    """
+
+    def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
+        for _, batch in _batches(scenes, 1, block=32):
+            asked = telling(batch)
+            if not counts:
+                asked = replace(asked, counts=torch.zeros_like(asked.counts))
+            yield batch, score(asked), scorable(batch, structure)
+
+    return _candidates(scored())
+
+
+@torch.no_grad()
+def complete_scenes(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
+) -> list[Candidates]:
+    """T1b: the candidates of every scene with two triples or more, given half of the triples."""
+
+    def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
+        for index, batch in _batches(scenes, 2):
+            mask = scorable(batch, structure)
+            given = random_half((batch.holds > 0) & mask, scenes, index, seed)
+            # A single triple cannot be divided: nothing of it was given.
+            divided = given.flatten(1).any(1)[:, None, None, None]
+            yield batch, score(telling(batch, given)), mask & ~given & ~given.mT & divided
+
+    return _candidates(scored())
+
+
+def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed: int) -> Tensor:
+    """Half of each scene's triples (rounded down), (B, A, n, n) bool.
+
+    Args:
+        truth: (B, A, n, n) bool, the triples to choose from.
+        index: positions of the B scenes.
+    """
+    given = torch.zeros_like(truth)
+    for row, k in enumerate(index):
+        triples = truth[row].nonzero()
+        order = scene_rng(scenes.scenes[k], seed).permutation(len(triples))
+        chosen = triples[torch.from_numpy(order[: len(triples) // 2])]
+        given[row][tuple(chosen.T)] = True
+    return given
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,12 +195,15 @@ class RelationRanking:
 
     Attributes:
         annotated: (scenes,) int64, 0 where skipped; hits: (scenes,).
-        skipped: scenes without annotated triples among the candidates.
     """
 
-    annotated: NDArray[np.int64]
-    hits: NDArray[np.float64]
-    skipped: int
+    annotated: Ints
+    hits: Floats
+
+    @property
+    def skipped(self) -> int:
+        """Scenes without annotated triples among the candidates."""
+        return int((self.annotated == 0).sum())
 
     def pooled(self) -> Ratio:
         """R-precision pooled over scenes."""
@@ -168,19 +227,14 @@ def rank(scored: Iterable[Candidates], scenes: int, *, first: int | None = None)
         if count := int(scene.truth.sum()):
             annotated[scene.scene] = count
             hits[scene.scene] = expected_hits(scene.score, scene.truth, first or count)
-    return RelationRanking(annotated, hits, skipped=int((annotated == 0).sum()))
+    return RelationRanking(annotated, hits)
 
 
-def rank_scored(
-    scored: Iterable[tuple[Batch, Tensor]], structure: Tensor, scenes: int
+def rank_relations(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore
 ) -> RelationRanking:
-    """R-precision of scores, see `score_scenes`; `scenes` is how many there were in all."""
-    return rank(candidates(scored, structure), scenes)
-
-
-def of_relation(scored: Sequence[Candidates], relation: int) -> list[Candidates]:
-    """Candidates of one canonical relation."""
-    return [scene.where(scene.relation == relation) for scene in scored]
+    """R-precision of a score on a set of scenes."""
+    return rank(score_scenes(scenes, structure, score), len(scenes))
 
 
 def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Candidates]:
@@ -195,14 +249,7 @@ def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Can
     return [scene.where(~np.isin(scene.key, keys)) for scene in scored]
 
 
-def rank_relations(
-    scenes: SceneTensors, structure: Tensor, score: RelationScore
-) -> RelationRanking:
-    """R-precision of a score on a set of scenes."""
-    return rank_scored(score_scenes(scenes, score), structure, len(scenes))
-
-
-def expected_hits(score: NDArray[np.float64], truth: NDArray[np.bool_], count: int) -> float:
+def expected_hits(score: Floats, truth: Flags, count: int) -> float:
     """True items among the first `count`, in expectation under random order of ties."""
     if count >= len(score):
         return float(truth.sum())
@@ -210,3 +257,141 @@ def expected_hits(score: NDArray[np.float64], truth: NDArray[np.bool_], count: i
     above, level = score > threshold, score == threshold
     share = (count - above.sum()) / level.sum()
     return float(truth[above].sum() + share * truth[level].sum())
+
+
+# -------------------------------------------------------------------------------------------- T3b
+
+
+def alter(holds: Flags, usable: Flags, rng: np.random.Generator) -> tuple[Triple, Triple] | None:
+    """A triple of a scene and the false one in its place; None where there is none.
+
+    Args:
+        holds: (A, n, n) what is true; usable: (A, n, n) which triples may be asked for.
+    """
+    triples = np.argwhere(holds & usable)
+    if len(triples) < 2:
+        return None
+    A, n, _ = holds.shape
+    a, x, y = triples[rng.integers(len(triples))].tolist()
+    for _ in range(_TRIES):
+        kind, other = rng.random(), int(rng.integers(n))
+        if kind < 0.5:
+            false = (int(rng.integers(A)), x, y)
+        elif kind < 0.75:
+            false = (a, x, other)
+        else:
+            false = (a, other, y)
+        b, i, j = false
+        if usable[false] and not holds[b, i, j] and not holds[b, j, i]:
+            return (a, x, y), false
+    return None
+
+
+@torch.no_grad()
+def placement_scores(
+    scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
+) -> Items:
+    """Every triple of every scene of which one is false: its suspicion, and whether it is false.
+
+    Args:
+        score: gets the triples as observed ones; it must judge each without itself; higher =
+            likelier true.
+    """
+    scene = [torch.zeros(0, dtype=torch.int64)]
+    values = [torch.zeros(0, dtype=torch.float64)]
+    false = [torch.zeros(0, dtype=torch.bool)]
+    for index, batch in _batches(scenes, 2):
+        usable = scorable(batch, structure)
+        truth = (batch.holds > 0) & usable
+        stated, wrong = torch.zeros_like(truth), torch.zeros_like(truth)
+        for row, k in enumerate(index):
+            rng = scene_rng(scenes.scenes[k], seed)
+            case = alter(batch.holds[row].numpy() > 0, usable[row].numpy(), rng)
+            if case is not None:
+                before, after = case
+                stated[row] = truth[row]
+                stated[row][before] = False
+                stated[row][after] = wrong[row][after] = True
+        result = score(telling(batch, stated))
+        scene.append(torch.tensor(index)[stated.nonzero()[:, 0]])
+        values.append(result[stated].double())
+        false.append(wrong[stated])
+    place, likely, is_false = (torch.cat(column).numpy() for column in (scene, values, false))
+    skipped = len(scenes) - len(np.unique(place))
+    return Items(place, -likely, is_false, len(scenes), skipped)
+
+
+# ------------------------------------------------------------------------------------------ tasks
+
+
+def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T1a."""
+    if contender.relations is None:
+        return None
+    scenes, structure, score = setting.scenes, setting.structure, contender.relations
+    with_counts = score_scenes(scenes, structure, score)
+    plain = score_scenes(scenes, structure, score, counts=False)
+    if not _any_true(plain):
+        return None
+    ranking, counted = rank(plain, len(scenes)), rank(with_counts, len(scenes))
+    metrics: dict[str, Metric] = {
+        "R-precision, distinct classes": ranking.pooled(),
+        "R-precision, instance counts": counted.pooled(),
+        "R-precision, distinct classes, mean over scenes": ranking.per_scene(),
+        "R-precision, mean over scenes": counted.per_scene(),
+    }
+    metrics |= _parts(with_counts, setting, FIRST)
+    return Outcome(metrics, len(scenes), ranking.skipped)
+
+
+def completion_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T1b; beside it the same candidates with nothing given."""
+    if contender.completion is None:
+        return None
+    scenes, structure, seed = setting.scenes, setting.structure, setting.seed
+    given = complete_scenes(scenes, structure, contender.completion, seed=seed)
+    if not _any_true(given):
+        return None
+    ranking = rank(given, len(scenes))
+    metrics: dict[str, Metric] = {
+        "R-precision": ranking.pooled(),
+        "R-precision, mean over scenes": ranking.per_scene(),
+    }
+    metrics |= _parts(given, setting, _RECALLS)
+    if contender.relations is not None:
+        blind = complete_scenes(scenes, structure, contender.relations, seed=seed)
+        metrics["R-precision, nothing given"] = rank(blind, len(scenes)).pooled()
+    return Outcome(metrics, len(scenes), ranking.skipped)
+
+
+def _any_true(scored: list[Candidates]) -> bool:
+    return any(scene.truth.any() for scene in scored)
+
+
+def _parts(scored: list[Candidates], setting: Setting, first: Sequence[int]) -> dict[str, Metric]:
+    """R-precision by relation, recall among the first, R-precision of unseen triples."""
+    count = len(setting.scenes)
+    metrics: dict[str, Metric] = {}
+    for a, name in enumerate(CANONICAL):
+        some = [scene.where(scene.relation == a) for scene in scored]
+        if _any_true(some):
+            metrics[f"R-precision, {name}"] = rank(some, count).pooled()
+    for k in first:
+        metrics[f"R@{k}"] = rank(scored, count, first=k).per_scene()
+    if setting.seen is not None:
+        new = unseen(scored, setting.seen, setting.scenes.v.shape[1])
+        if _any_true(new):
+            metrics["R-precision, zero-shot"] = rank(new, count).pooled()
+    return metrics
+
+
+def placement_task(contender: Contender, setting: Setting) -> Outcome | None:
+    """T3b."""
+    if contender.placement is None:
+        return None
+    scenes = setting.some(related=True)
+    scores = placement_scores(scenes, setting.structure, contender.placement, seed=setting.seed)
+    if not len(scores.scene):
+        return None
+    metrics: dict[str, Metric] = {"hit@1": scores.hit_at_1(), "AUROC": scores.metric("AUROC")}
+    return Outcome(metrics, len(scenes), scores.skipped)

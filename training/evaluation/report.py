@@ -11,55 +11,23 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from app.registry import Artifact
-from training.batches import SceneTensors
-from training.evaluation.answers import QUESTIONS
-from training.evaluation.asking import SENSITIVITIES
-from training.evaluation.contenders import Contender, artifact_contender
-from training.evaluation.everyday import LINES, SOURCE, facts_digest
-from training.evaluation.evidence import KINDS
-from training.evaluation.intervals import Figure
-from training.evaluation.metrics import metric_from_dict, metric_to_dict, pool
-from training.evaluation.offsets import METRICS, OFFSETS_TASKS
-from training.evaluation.seed_protocol import SEED_TASKS
-from training.evaluation.tasks import ONCE, TASKS, WHOLE_SET, Outcome, Setting
-from training.trainer import subset
+from training.batches import SceneTensors, subset
+from training.evaluation.contenders import artifact_contender
+from training.evaluation.everyday import SOURCE, facts_digest
+from training.evaluation.metrics import Figure, Macro, Metric, Ratio, Resampled, Scored
+from training.evaluation.setting import Contender, Outcome, Setting
+from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
-_EVERY_TASK = TASKS | SEED_TASKS | OFFSETS_TASKS
-# What a model card shows: by task, the metrics. The benchmark's reports hold every one.
-_PUBLISHED: dict[str, tuple[str, ...]] = {
-    "T1a relations": ("R-precision, distinct classes", "R-precision, instance counts"),
-    "T1 pairs": ("accuracy", "log-loss"),
-    "T1 with evidence": tuple(f"change of R-precision, {kind}" for kind in KINDS[:2]),
-    "T1b completion": ("R-precision",),
-    "T2 missing": ("MRR", "top-1", "top-10"),
-    "T2 partial": ("MRR, 50 %", "precision@5, 50 %", "change of MRR, 50 %"),
-    "T2 with evidence": tuple(f"change of MRR, {kind}" for kind in KINDS),
-    "T2-at missing at a place": ("MRR",),
-    "T3 outliers, uniform": ("hit@1", "AUROC", "alarms in untouched scenes"),
-    "T3 signature": ("hit@1", "caught, medium"),
-    "T3 sensitivity": tuple(
-        f"{figure}, {name}"
-        for name in SENSITIVITIES
-        for figure in ("alarms", "caught, uniform", "caught, by popularity")
-    ),
-    "T3 with evidence": tuple(f"change of hit@1, {kind}" for kind in KINDS),
-    "T3b placement": ("hit@1",),
-    "T4 generate": ("MMD², free", "pair correlation, free"),
-    "Calibration": tuple(
-        f"{figure}, {question}" for question in QUESTIONS for figure in ("ECE", "Brier skill")
-    ),
-    "Offsets": METRICS,
-    "Everyday": LINES,
-}
 # Scenes of a source where a task is slow; and where the machine has no closed form and draws too.
 _LIMIT = 200
 _LIMIT_OF_DRAWS = 20
@@ -97,15 +65,6 @@ class SourceReport:
     outcomes: dict[str, Outcome | None] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def rows(self) -> list[Row]:
-        """Every figure with its interval."""
-        return [
-            Row(task, self.source, name, metric.figure())
-            for task, outcome in self.outcomes.items()
-            if outcome is not None
-            for name, metric in outcome.metrics.items()
-        ]
-
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; figures are written beside the metrics for whoever reads the file."""
         return {
@@ -127,6 +86,14 @@ class SourceReport:
             {task: _from_dict(entry["outcome"]) for task, entry in tasks},
             {task: float(entry["seconds"]) for task, entry in tasks},
         )
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Replace a file as a whole: an interrupted run leaves the earlier one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".part")
+    draft.write_text(text, encoding="utf-8")
+    draft.replace(path)
 
 
 def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
@@ -175,14 +142,14 @@ def run(
     if report.scenes != digest(setting):
         raise ValueError(f"the report on {report.source} is of other scenes or questions")
     wanted = list(tasks)
-    if unknown := sorted(set(wanted) - set(_EVERY_TASK)):
-        raise ValueError(f"unknown tasks {unknown}, must be of {list(_EVERY_TASK)}")
+    if unknown := sorted(set(wanted) - set(EVERY_TASK)):
+        raise ValueError(f"unknown tasks {unknown}, must be of {list(EVERY_TASK)}")
     for task in wanted:
         if task in report.outcomes:
             continue
         progress(f"{report.source}: {task}")
         began = time.perf_counter()
-        report.outcomes[task] = _EVERY_TASK[task](contender, setting)
+        report.outcomes[task] = EVERY_TASK[task](contender, setting)
         report.seconds[task] = time.perf_counter() - began
         yield task
 
@@ -205,10 +172,7 @@ def measure(
     if path.exists():
         report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
     for _ in run(contender, setting, report, tasks=tasks, progress=progress):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(path.name + ".part")
-        draft.write_text(json.dumps(report.to_dict(), allow_nan=False), encoding="utf-8")
-        draft.replace(path)
+        write_whole(path, json.dumps(report.to_dict(), allow_nan=False))
     return report
 
 
@@ -260,7 +224,7 @@ def evaluate(
     if limit is None:
         limit = _LIMIT if artifact.oracle is None else _LIMIT_OF_DRAWS
     contender = artifact_contender(artifact, train)
-    single = [task for task in _PUBLISHED if task not in WHOLE_SET]
+    single = [task for task, one in EVERY_TASK.items() if one.card and task not in WHOLE_SET]
     sources = list(by_source(scenes))
     training = dict(by_source(train))
     rows: list[Row] = []
@@ -289,7 +253,7 @@ def _published(
         Row(task, source, name, outcome.metrics[name].figure())
         for task, outcome in report.outcomes.items()
         if outcome is not None
-        for name in _PUBLISHED[task]
+        for name in EVERY_TASK[task].card
         # Not every source has every question: some list no relations.
         if name in outcome.metrics
     ]
@@ -319,3 +283,64 @@ def _from_dict(values: dict[str, Any] | None) -> Outcome | None:
         values["skipped"],
         values["notes"],
     )
+
+
+# ------------------------------------------------------------------------------ metrics as JSON
+
+
+def pool(parts: Sequence[Metric]) -> Metric | None:
+    """One metric over the scenes of all parts; None for metrics of whole sets.
+
+    Raises:
+        ValueError: no parts, or parts of different kinds.
+    """
+    kinds = {(type(part), getattr(part, "statistic", "")) for part in parts}
+    if len(kinds) != 1:
+        raise ValueError(f"cannot pool metrics of {len(kinds)} kinds")
+    return type(parts[0]).join(parts)
+
+
+_KINDS: dict[str, type[Any]] = {
+    "ratio": Ratio,
+    "macro": Macro,
+    "scored": Scored,
+    "resampled": Resampled,
+}
+_TYPES: dict[str, type] = {"scene": np.int64, "group": np.int64, "truth": np.bool_}
+
+
+def metric_to_dict(metric: Metric) -> dict[str, Any]:
+    """JSON-able values, floats to nine significant digits."""
+    kind = next(name for name, cls in _KINDS.items() if type(metric) is cls)
+    names = [field.name for field in fields(_KINDS[kind])]
+    return {"kind": kind} | {name: _plain(getattr(metric, name)) for name in names}
+
+
+def metric_from_dict(values: dict[str, Any]) -> Metric:
+    """What `metric_to_dict` wrote.
+
+    Raises:
+        ValueError: not one of its kinds.
+    """
+    rest = dict(values)
+    kind = rest.pop("kind", None)
+    if kind not in _KINDS:
+        raise ValueError(f"kind must be one of {sorted(_KINDS)}, not {kind!r}")
+    found: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
+    return found
+
+
+def _array(name: str, value: Any) -> Any:
+    if not isinstance(value, list):
+        return value
+    # JSON has no nan; a resample without a value is null.
+    values = [float("nan") if x is None else x for x in value]
+    return np.array(values, dtype=_TYPES.get(name, np.float64))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype == np.float64:
+        return [float(f"{x:.9g}") if np.isfinite(x) else None for x in value.tolist()]
+    if isinstance(value, np.ndarray):
+        return value.astype(np.int64).tolist()
+    return value

@@ -27,12 +27,10 @@ import torch
 from torch import Tensor
 
 from training.batches import Batch, SceneTensors, relation_units
-from training.evaluation.cases import scene_rng
-from training.evaluation.contenders import Contender
-from training.evaluation.intervals import Metric
-from training.evaluation.metrics import Ratio
-from training.evaluation.outliers import draw_intruders
-from training.evaluation.tasks import Outcome, Setting, Task
+from training.cases import scene_rng
+from training.evaluation.intruders import draw_intruders
+from training.evaluation.metrics import Metric, Ratio
+from training.evaluation.setting import Contender, Outcome, Setting
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.edges import Edges
@@ -66,11 +64,10 @@ def relations_switched_on(contender: Contender, setting: Setting) -> Outcome | N
         on[place] = total.double().numpy()
         labelled[place] = batch.holds.sum((1, 2, 3)).double().numpy()
         hit[place] = (batch.holds * grid).sum((1, 2, 3)).double().numpy()
-    one = np.ones(len(scenes))
     metrics: dict[str, Metric] = {
         "labelled relations switched on": Ratio(hit, labelled),
-        "relations switched on per scene": Ratio(on, one),
-        "labelled relations per scene": Ratio(labelled, one),
+        "relations switched on per scene": Ratio.of_scenes(on),
+        "labelled relations per scene": Ratio.of_scenes(labelled),
     }
     return Outcome(metrics, len(scenes), 0)
 
@@ -129,13 +126,6 @@ def reconstruction_after_addition(contender: Contender, setting: Setting) -> Out
         "objects of the scene kept on": Ratio(kept, there),
     }
     return Outcome(metrics, len(scenes), int((asked == 0).sum()))
-
-
-SEED_TASKS: dict[str, Task] = {
-    "Seed T1": relations_switched_on,
-    "Seed T2": removed_switched_on,
-    "Seed T3": reconstruction_after_addition,
-}
 
 
 @torch.no_grad()

@@ -1,21 +1,61 @@
-"""What a contender is asked about, and what comes of it."""
+"""What is evaluated, what it is asked about, and what comes of it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, wraps
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from training.batches import SceneTensors
-from training.evaluation.cases import some_scenes
-from training.evaluation.contenders import Contender
-from training.evaluation.generation import halves
-from training.evaluation.intervals import Metric
-from training.trainer import subset
+from training.batches import SceneTensors, subset
+from training.cases import some_scenes
+from training.evaluation.metrics import Metric
+
+if TYPE_CHECKING:
+    from app.registry import Artifact
+    from training.evaluation.density import ObjectDensity
+    from training.evaluation.generation import Sampler
+    from training.evaluation.missing import ObjectScore, PlacedScore, RoomScore
+    from training.evaluation.outliers import Alarm
+    from training.evaluation.relations import RelationScore
+    from training.machines import BoltzmannMachine
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """One row of the tables: a callable for each task; None where it does not take part.
+
+    Attributes:
+        objects: T2 and T3.
+        relations: T1a.
+        completion: T1b; gets the given triples as the batch's relations.
+        placed: T2-at.
+        placement: T3b; gets the triples, a false one among them, as the batch's relations.
+        sampler: T4.
+        density: Density; called once, when it is needed.
+        alarm: T3, the share of untouched scenes that raise one.
+        artifact: Calibration, and all that is asked as a robot asks.
+        objects_in_rooms: T2 where the room type is given.
+        machine: the seed protocol, which samples.
+        parameters: number of trained weights, None where that says nothing.
+    """
+
+    objects: ObjectScore | None = None
+    relations: RelationScore | None = None
+    completion: RelationScore | None = None
+    placed: PlacedScore | None = None
+    placement: RelationScore | None = None
+    sampler: Sampler | None = None
+    density: Callable[[], ObjectDensity] | None = None
+    alarm: Alarm | None = None
+    artifact: Artifact | None = None
+    objects_in_rooms: RoomScore | None = None
+    machine: BoltzmannMachine | None = None
+    parameters: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,23 +91,21 @@ class Setting:
         most = None if self.limit is None else max(1, self.limit // share)
         return some_scenes(scenes, most, self.seed)
 
+    def at(self, index: Tensor) -> Setting:
+        """Of the scenes at the given positions alone."""
+        return replace(self, scenes=subset(self.scenes, index))
+
     @cached_property
     def complete(self) -> Setting:
         """The scenes with complete object lists: in others, unlisted objects may be there."""
         train = None if self.train is None else _complete(self.train)
-        return replace(
-            self,
-            scenes=_complete(self.scenes),
-            train=train if train is not None and len(train) else None,
-        )
+        return replace(self, scenes=_complete(self.scenes), train=train if train else None)
 
-    def halves(self) -> tuple[SceneTensors, SceneTensors]:
-        """Scenes to compare drawn ones with, and a second half, each within the limit."""
-        first, second = halves(self.scenes)
-        return (
-            some_scenes(first, self.limit, self.seed),
-            some_scenes(second, self.limit, self.seed),
-        )
+
+def _complete(scenes: SceneTensors) -> SceneTensors:
+    if bool(scenes.complete.all()):
+        return scenes
+    return subset(scenes, scenes.complete.nonzero().squeeze(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +122,3 @@ class Outcome:
     scenes: int
     skipped: int
     notes: dict[str, float] = field(default_factory=dict)
-
-
-Task = Callable[[Contender, Setting], Outcome | None]
-
-
-def about_objects(task: Task) -> Task:
-    """A task about the objects of a scene: it sees scenes with complete object lists alone."""
-
-    @wraps(task)
-    def asked(contender: Contender, setting: Setting) -> Outcome | None:
-        setting = setting.complete
-        return task(contender, setting) if len(setting.scenes) else None
-
-    return asked
-
-
-def _complete(scenes: SceneTensors) -> SceneTensors:
-    if bool(scenes.complete.all()):
-        return scenes
-    return subset(scenes, scenes.complete.nonzero().squeeze(1))

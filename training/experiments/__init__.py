@@ -12,8 +12,7 @@ benchmark.py    all baselines and machines on the same scenes; the seed protocol
 ablate.py       a configuration and the same with one thing changed
 compare.py      two models on scenes that neither has learnt from
 tune.py         settings searched on validation scenes
-sides.py        the two models of a comparison
-heldout.py      scenes that neither of two models has learnt from
+sides.py        the two models of a comparison, and scenes that neither has learnt from
 translation.py  a model asked in another model's classes
 gate.py         whether a version may replace the served one
 """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,15 +13,14 @@ from rich.console import Console
 
 from training.batches import seen_triples
 from training.config import Config, ConfigError, data_folder, load_config, with_settings
-from training.datasets import DatasetError
 from training.evaluation.report import SourceReport, pooled, settings_by_source
 from training.evaluation.setting import Setting
 from training.experiments.measure import (
-    BenchmarkError,
     Plan,
     Reports,
     measure_rows,
     place_of,
+    resumable,
     shown,
 )
 from training.experiments.results import grid, only, summarise, write
@@ -67,7 +65,7 @@ def ablate(
     reported and left out. Ctrl-C loses at most an epoch or a task; the same command goes on from
     there.
     """
-    try:
+    with resumable(console):
         configs = _configs(configuration, rows, row, limit, epochs)
         place = folder / configs[0].name
         with console.status("reading and encoding scenes"):
@@ -87,14 +85,6 @@ def ablate(
                 fresh=fresh,
                 failures=(FloatingPointError,),
             )
-    except (
-        ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool,
-    ) as error:  # fmt: skip
-        console.print(f"[red]error:[/red] {error}")
-        raise typer.Exit(1) from None
-    except KeyboardInterrupt:
-        console.print("stopped; the same command goes on from there")
-        raise typer.Exit(130) from None
     if configs[0].name in failures:
         console.print(f"[red]error:[/red] {configs[0].name}: {failures[configs[0].name]}")
         raise typer.Exit(1)

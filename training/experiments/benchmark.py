@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from training.baselines import OBJECTS, RELATIONS
+from training.baselines import BASELINES, RELATIONS
 from training.batches import seen_triples
 from training.config import (
     Config,
@@ -27,25 +26,23 @@ from training.config import (
     shipped_configs,
     with_settings,
 )
-from training.datasets import DatasetError
 from training.evaluation.everyday import EVERYDAY, facts_file
 from training.evaluation.report import settings_by_source
-from training.evaluation.seed_protocol import PAPER, SEED_TASKS
+from training.evaluation.seed_protocol import PAPER
 from training.evaluation.setting import Setting
-from training.evaluation.tasks import TASKS
+from training.evaluation.tasks import SEED_TASKS, TASKS
 from training.experiments.measure import (
     POOLED,
-    BenchmarkError,
     Plan,
     Reports,
     measure_rows,
     parameters,
+    resumable,
     shown,
     slug,
 )
 from training.experiments.plots import write_plots
 from training.experiments.results import (
-    SEED_PRIMARY,
     Results,
     grid,
     only,
@@ -57,11 +54,9 @@ from training.experiments.rows import (
     Row,
     baseline_rows,
     machine_row,
-    plain_rows,
     reference_rows,
 )
 from training.pipeline import SplitScenes, prepare
-from training.runs import RunError
 
 DOMAINS = ("indoor", "everyday")
 """Measured when no configuration is given."""
@@ -208,7 +203,7 @@ def benchmark(
     the shuffled scenes have folders of their own there. Ctrl-C loses at most the task at hand; the
     same command goes on from there.
     """
-    try:
+    with resumable(console, ValueError, FloatingPointError):
         wanted = None if baseline is None else tuple(b for b in baseline if b != "none")
         names = machines or default_configs()
         domains = read_domains(names)
@@ -237,15 +232,6 @@ def benchmark(
             if shuffled:
                 compare_on_shuffled(domain, place / "shuffled", options)
             console.print(f"every figure: {place}/**/results.json; plots beside it")
-    except (
-        ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool,
-        ValueError, FloatingPointError,
-    ) as error:  # fmt: skip
-        console.print(f"[red]error:[/red] {error}")
-        raise typer.Exit(1) from None
-    except KeyboardInterrupt:
-        console.print("stopped; the same command goes on from there")
-        raise typer.Exit(130) from None
 
 
 def default_configs() -> list[str]:
@@ -371,12 +357,11 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
         plan = replace(plan, tasks=asked)
     rows = [machine_row(config, calibrated=False) for config in options.configs(domain, 0)]
     # A baseline is fitted once, whichever tasks it is asked.
-    every = [
-        *(plain_rows(RELATIONS, "relations", "placement") if plan.material.related else ()),
-        *plain_rows(OBJECTS, "objects"),
-    ]
-    wanted = {YARDSTICKS[task][0] for task in asked} | set(options.baselines or ())
-    rows += [row for row in every if options.baselines is None or row.name in wanted]
+    names = [name for name, one in BASELINES.items() if one.scores in (("objects",), RELATIONS)]
+    if options.baselines is not None:
+        yardsticks = {YARDSTICKS[task][0] for task in asked}
+        names = [name for name in names if name in yardsticks | set(options.baselines)]
+    rows += baseline_rows(0, names, related=plan.material.related, whole=False)
     reports = _measured(plan, rows, options, f"{domain.name}, shuffled")
     weights = parameters(folder, rows)
     results = {}
@@ -447,7 +432,7 @@ are not comparable with other tables, and they leak: near-duplicates of test sce
 training part; relations that are left on hold or betray the removed object; switching on more
 relations can only help T1, and returning a scene as it was given scores 1/V in T3.
 
-{results.markdown(SEED_PRIMARY)}
+{results.markdown({name: task.shown for name, task in SEED_TASKS.items()})}
 The paper's own figures, on its own data:
 
 {paper}

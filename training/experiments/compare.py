@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,19 +18,25 @@ from torch import Tensor
 from app.registry import RegistryError, Store
 from app.scene import Vocabulary
 from training.batches import SceneTensors, scene_tensors
+from training.cases import some_scenes
 from training.config import DATA, ConfigError
 from training.datasets import AnnotatedScene, DatasetError, annotated_classes, encode
-from training.evaluation.cases import some_scenes
 from training.evaluation.missing import ObjectScore, leave_one_out
 from training.evaluation.report import Progress, SourceReport, digest, run, silent
 from training.evaluation.setting import Setting
-from training.experiments.heldout import HeldOut, held_out
 from training.experiments.results import Difference, Results, only, summarise
-from training.experiments.sides import BASELINES, Rival, Say, Side, find
+from training.experiments.sides import (
+    BASELINE_SIDE,
+    HeldOut,
+    Rival,
+    Say,
+    Side,
+    find,
+    held_out,
+)
 from training.experiments.translation import BEYOND, Translation, same_classes
 from training.pipeline import read_sources, split_and_encode
 from training.runs import RunError
-from training.trainer import TrainingData
 
 COMPARED: dict[str, tuple[str, ...]] = {
     "T2 missing": ("MRR", "top-1", "top-10"),
@@ -128,8 +134,8 @@ def compare_command(
     old: Annotated[
         str | None,
         typer.Argument(
-            help=f"another one, or {BASELINES}; by default what `default` serves, and {BASELINES} "
-            "where nothing is"
+            help=f"another one, or {BASELINE_SIDE}; by default what `default` serves, and "
+            f"{BASELINE_SIDE} where nothing is"
         ),
     ] = None,
     data: Annotated[
@@ -162,7 +168,7 @@ def compare_command(
 
 def _served(store: Path) -> str:
     """The alias `default`, where the store has one."""
-    return "default" if "default" in Store(store).aliases() else BASELINES
+    return "default" if "default" in Store(store).aliases() else BASELINE_SIDE
 
 
 def _root(given: Path | None, *sides: Side) -> Path:
@@ -242,19 +248,18 @@ def compare(
         raise ConfigError(f"none of the {len(scenes)} scenes that are held out can be asked about")
     groups = len({scene.group for scene in scenes.scenes})
     say("looking for examples")
+    first, second = (rival("T2 missing").objects for rival in rivals)
+    found: list[Example] = []
+    if first is not None and second is not None:
+        found = changed_most(first, second, scenes, data.structure, a.vocabulary, examples)
     return Comparison(
         results=results,
         b=titles[1],
         scenes=len(scenes),
         groups=groups,
         certain=held.certain,
-        notes=(
-            *held.notes,
-            *_classes_note(a, b, held),
-            *_limit_note(held, limit),
-            *_groups_note(groups),
-        ),
-        examples=tuple(_examples(rivals, scenes, data, a.vocabulary, examples)),
+        notes=tuple(_notes(a, b, held, limit, groups)),
+        examples=tuple(found),
         unmeasured=unmeasured(results.differences, b),
     )
 
@@ -306,49 +311,29 @@ def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneT
     return scene_tensors(encoded, annotated_classes(encoded, vocabulary), len(vocabulary))
 
 
-def _examples(
-    rivals: tuple[Rival, Rival],
-    scenes: SceneTensors,
-    data: TrainingData,
-    vocabulary: Vocabulary,
-    count: int,
-) -> list[Example]:
-    first, second = (rival("T2 missing").objects for rival in rivals)
-    if first is None or second is None:
-        return []
-    return changed_most(first, second, scenes, data.structure, vocabulary, count)
+def _notes(a: Side, b: Side, held: HeldOut, limit: int | None, groups: int) -> Iterator[str]:
+    """Remarks on the figures."""
+    yield from held.notes
+    asked, other = a.vocabulary, b.vocabulary
+    if asked is not None and other is not None and not same_classes(asked, other):
+        yield _classes_note(a, b, asked, other, held)
+    if limit is not None and len(held.scenes) > limit:
+        yield f"{limit} of {len(held.scenes)} held-out scenes, by --limit"
+    if groups < _ENOUGH_GROUPS:
+        yield f"{groups} groups are few: intervals over them are rough, and too narrow"
 
 
-def _classes_note(a: Side, b: Side, held: HeldOut) -> list[str]:
+def _classes_note(a: Side, b: Side, asked: Vocabulary, other: Vocabulary, held: HeldOut) -> str:
     """What the second does not know of the first one's classes."""
-    if a.vocabulary is None or b.vocabulary is None or same_classes(a.vocabulary, b.vocabulary):
-        return []
-    own = Translation.between(a.vocabulary, b.vocabulary).own
-    unknown = {label for label, index in zip(a.vocabulary.labels, own, strict=True) if index < 0}
-    mentions = [
-        a.vocabulary.labels[index]
-        for scene in held.scenes
-        for thing in scene.objects
-        if (index := a.vocabulary.index(thing.label)) is not None
-    ]
-    lost = sum(label in unknown for label in mentions)
-    return [
-        f"asked in the {len(a.vocabulary)} classes of {a.title}; {b.title} does not know "
-        f"{len(unknown)} of them, {lost / max(len(mentions), 1):.0%} of the mentions here: it is "
-        "not shown these, and ranks them last, in no order"
-    ]
-
-
-def _groups_note(groups: int) -> list[str]:
-    if groups >= _ENOUGH_GROUPS:
-        return []
-    return [f"{groups} groups are few: intervals over them are rough, and too narrow"]
-
-
-def _limit_note(held: HeldOut, limit: int | None) -> list[str]:
-    if limit is None or len(held.scenes) <= limit:
-        return []
-    return [f"{limit} of {len(held.scenes)} held-out scenes, by --limit"]
+    own = Translation.between(asked, other).own
+    labels = [thing.label for scene in held.scenes for thing in scene.objects]
+    mentions = [index for label in labels if (index := asked.index(label)) is not None]
+    lost = sum(int(own[index]) < 0 for index in mentions)
+    return (
+        f"asked in the {len(asked)} classes of {a.title}; {b.title} does not know "
+        f"{int((own < 0).sum())} of them, {lost / max(len(mentions), 1):.0%} of the mentions here: "
+        "it is not shown these, and ranks them last, in no order"
+    )
 
 
 def changed_most(
@@ -369,48 +354,32 @@ def changed_most(
         chosen.setdefault(scenes.scenes[int(first.scene[place])].group, place)
     found = []
     for place in chosen.values():
-        scene = int(first.scene[place])
-        target = int(first.target[place])
+        row, target = int(first.scene[place]), int(first.target[place])
+        scene, v = scenes.scenes[row], scenes.v[row].clone()
+        v[target] = 0.0
+        room = vocabulary.room_types[scene.room_type] if scene.room_type >= 0 else ""
         found.append(
             Example(
-                scene=scenes.scenes[scene].scene_id,
-                room_type=_room(vocabulary, scenes.scenes[scene].room_type),
-                shown=_shown(scenes, scene, target, vocabulary),
+                scene=scene.scene_id,
+                room_type=room,
+                shown=tuple(vocabulary.labels[k] for k in v.nonzero().squeeze(1).tolist()),
                 removed=vocabulary.labels[target],
                 ranks=(int(first.above[place]) + 1, int(second.above[place]) + 1),
                 answers=(
-                    _answers(a, scenes, scene, target, structure, vocabulary),
-                    _answers(b, scenes, scene, target, structure, vocabulary),
+                    _answers(a, v, structure, vocabulary),
+                    _answers(b, v, structure, vocabulary),
                 ),
             )
         )
     return found
 
 
-def _room(vocabulary: Vocabulary, index: int) -> str:
-    return vocabulary.room_types[index] if index >= 0 else ""
-
-
-def _shown(
-    scenes: SceneTensors, scene: int, target: int, vocabulary: Vocabulary
-) -> tuple[str, ...]:
-    present = scenes.v[scene].nonzero().squeeze(1).tolist()
-    return tuple(vocabulary.labels[index] for index in present if index != target)
-
-
+@torch.no_grad()
 def _answers(
-    score: ObjectScore,
-    scenes: SceneTensors,
-    scene: int,
-    target: int,
-    structure: Tensor,
-    vocabulary: Vocabulary,
+    score: ObjectScore, v: Tensor, structure: Tensor, vocabulary: Vocabulary
 ) -> tuple[str, ...]:
     """The likeliest missing objects, as they are asked for in the task."""
-    v = scenes.v[scene].clone()
-    v[target] = 0.0
-    with torch.no_grad():
-        values = score(v.unsqueeze(0))[0].masked_fill((v > 0) | structure, -torch.inf)
+    values = score(v.unsqueeze(0))[0].masked_fill((v > 0) | structure, -torch.inf)
     order = values.argsort(descending=True, stable=True)[:_FIRST].tolist()
     # What a model has no class for is no answer of it.
     return tuple(vocabulary.labels[index] for index in order if values[index] > -BEYOND)

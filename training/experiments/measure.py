@@ -20,6 +20,7 @@ import shutil
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -27,13 +28,18 @@ from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
 import torch
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
-from training.evaluation.report import SourceReport, digest, measure, pooled
-from training.evaluation.tasks import ONCE, WHOLE_SET, Setting
+from training.config import ConfigError
+from training.datasets import DatasetError
+from training.evaluation.report import SourceReport, digest, measure, pooled, write_whole
+from training.evaluation.setting import Setting
+from training.evaluation.tasks import ONCE, WHOLE_SET
 from training.experiments.rows import Material, Rival, Row
+from training.runs import RunError
 
 # Called with (row, source, what is being done).
 Progress = Callable[[str, str, str], None]
@@ -47,6 +53,23 @@ POOLED = "pooled"
 
 class BenchmarkError(RuntimeError):
     """Files in the folder of another experiment; says which."""
+
+
+@contextmanager
+def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
+    """A command that goes on where it was stopped; errors end it with their text."""
+    expected: tuple[type[Exception], ...] = (
+        *(ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool),
+        *others,
+    )
+    try:
+        yield
+    except expected as error:
+        console.print(f"[red]error:[/red] {error}")
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        console.print("stopped; the same command goes on from there")
+        raise typer.Exit(130) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,9 +269,8 @@ def claim(place: Path, row: Row, material: str) -> None:
                 "file, source, limit, split or vocabulary; give --fresh or another folder"
             )
         return
-    place.mkdir(parents=True, exist_ok=True)
     values = {"name": row.name, "seed": row.seed, "identity": row.identity}
-    _write(path, values | {"material": material})
+    write_whole(path, json.dumps(values | {"material": material}))
 
 
 def read_report(path: Path, setting: Setting) -> SourceReport:
@@ -269,13 +291,7 @@ def _note_parameters(place: Path, count: int | None) -> None:
     path = place / "row.json"
     values = json.loads(path.read_text(encoding="utf-8"))
     if values.get("parameters") != count:
-        _write(path, values | {"parameters": count})
-
-
-def _write(path: Path, values: Mapping[str, object]) -> None:
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(json.dumps(values), encoding="utf-8")
-    draft.replace(path)
+        write_whole(path, json.dumps(values | {"parameters": count}))
 
 
 # ------------------------------------------------------------------------------------- processes

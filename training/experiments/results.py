@@ -8,77 +8,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from training.evaluation.answers import QUESTIONS
-from training.evaluation.asking import SENSITIVITIES
-from training.evaluation.everyday import LINES
-from training.evaluation.evidence import KINDS
-from training.evaluation.intervals import Figure, Floats, Metric, paired_difference
-from training.evaluation.partial import SHARES
-from training.evaluation.report import SourceReport
+from training.evaluation.metrics import Figure, MeanOverSeeds, Metric, paired_difference
+from training.evaluation.report import SourceReport, write_whole
+from training.evaluation.tasks import TASKS
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
-
-PRIMARY: dict[str, tuple[str, ...]] = {
-    "T1a relations": ("R-precision, distinct classes", "R-precision, instance counts"),
-    "T1 pairs": ("accuracy", "log-loss", "accuracy, unseen pairs", "accuracy, rare classes"),
-    "T1 with evidence": tuple(f"change of R-precision, {kind}" for kind in KINDS[:2]),
-    "T1b completion": ("R-precision",),
-    "T2 missing": ("MRR", "top-1", "top-10"),
-    "T2 missing, room type given": ("MRR", "MRR, room type withheld"),
-    "T2 partial": (
-        *(f"MRR, {share}" for share in SHARES),
-        "precision@5, 50 %",
-        "change of MRR, 50 %",
-    ),
-    "T2 with evidence": tuple(f"change of MRR, {kind}" for kind in KINDS),
-    "T2-at missing at a place": ("MRR", "MRR, on-top"),
-    "T3 outliers, uniform": ("hit@1", "AUROC", "alarms in untouched scenes", "intruders caught"),
-    "T3 outliers, by popularity": ("hit@1",),
-    "T3 outliers, same room type": ("hit@1",),
-    "T3 signature": (
-        "hit@1",
-        "hit@1, log-odds alone",
-        *(f"caught, {name}" for name in SENSITIVITIES),
-    ),
-    "T3 sensitivity": tuple(
-        f"{figure}, {name}"
-        for name in SENSITIVITIES
-        for figure in ("alarms", "caught, uniform", "caught, by popularity")
-    ),
-    "T3 with evidence": tuple(f"change of hit@1, {kind}" for kind in KINDS),
-    "T3b placement": ("hit@1",),
-    "T4 generate": (
-        "MMD², free",
-        "MMD², given room types",
-        "pair correlation, free",
-        "marginal error, free",
-        "copies of training scenes, free",
-        "mirrored relations, free",
-        "on-top cycles, free",
-    ),
-    "Density": ("gain over independent classes, upper log Z",),
-    "Calibration": tuple(
-        f"{figure}, {question}" for figure in ("ECE", "Brier skill") for question in QUESTIONS
-    ),
-    "Everyday": LINES,
-}
-"""What the Markdown tables show; the JSON holds every metric."""
-
-SEED_PRIMARY: dict[str, tuple[str, ...]] = {
-    "Seed T1": (
-        "labelled relations switched on",
-        "relations switched on per scene",
-        "labelled relations per scene",
-    ),
-    "Seed T2": (
-        "removed objects switched on, relations left on",
-        "removed objects switched on, relations deleted",
-    ),
-    "Seed T3": ("error measure", "error measure, doing nothing"),
-}
-"""The same of the seed protocol."""
 
 # Annotators list a part of the relations that hold.
 UNLISTED = "An unlisted relation counts as wrong"
@@ -99,43 +33,6 @@ _LOWER_IS_BETTER = (
     "generate: the scene has what never belongs",
     "generate: scenes of fewer",
 )
-
-
-class MeanOverSeeds(Metric):
-    """The mean of one metric over training seeds, on the same resampled scenes for all."""
-
-    def __init__(self, members: Sequence[Metric]) -> None:
-        if not members:
-            raise ValueError("a mean over seeds needs at least one metric")
-        if len({member.scenes for member in members}) > 1:
-            raise ValueError("the seeds were measured on different numbers of scenes")
-        self.members = tuple(members)
-
-    @property
-    def scenes(self) -> int:
-        """Scenes of each member."""
-        return self.members[0].scenes
-
-    @property
-    def n(self) -> int:
-        """Scored items of each member."""
-        return self.members[0].n
-
-    @property
-    def value(self) -> float:
-        """The mean."""
-        return float(np.mean([member.value for member in self.members]))
-
-    def at(self, weight: Floats) -> float:
-        """The mean where scene k counts weight[k] times."""
-        return float(np.mean([member.at(weight) for member in self.members]))
-
-    def resampled(self, resamples: int, seed: int) -> Floats:
-        """The mean in each resample, (resamples,)."""
-        draws = [member.draws(resamples, seed) for member in self.members]
-        shortest = min(len(draw) for draw in draws)
-        mean: Floats = np.mean([draw[:shortest] for draw in draws], axis=0)
-        return mean
 
 
 @dataclass(frozen=True)
@@ -222,17 +119,20 @@ class Results:
         }
 
     def markdown(
-        self, primary: Mapping[str, tuple[str, ...]] = PRIMARY, *, changes: bool = False
+        self, shown: Mapping[str, tuple[str, ...]] | None = None, *, changes: bool = False
     ) -> str:
-        """One table for each primary metric, rows by sources, and remarks on each task.
+        """One table for each shown metric, rows by sources, and remarks on each task.
 
         A star marks a row that ours is better than, by the whole paired interval.
 
         Args:
+            shown: by task its metrics; those of `TASKS` by default.
             changes: brackets hold the interval of the row minus ours, in place of the row's own.
         """
         parts: list[str] = []
-        for task, metrics in primary.items():
+        if shown is None:
+            shown = {name: task.shown for name, task in TASKS.items()}
+        for task, metrics in shown.items():
             tables = [table for name in metrics if (table := self._table(task, name, changes))]
             if tables:
                 asked = [asked for asked in self.asked if asked.task == task]
@@ -248,7 +148,7 @@ class Results:
             for gap in self.differences
             if (gap.task, gap.metric) == (task, metric)
         }
-        shown = {
+        texts = {
             (cell.row, cell.source): _text(cell, gaps.get((cell.row, cell.source)), changes)
             for cell in cells
         }
@@ -257,7 +157,7 @@ class Results:
         for row in dict.fromkeys(cell.row for cell in cells):
             name = f"**{row}**" if row == self.ours else row
             weights = f"{self.parameters[row]:,}" if row in self.parameters else ""
-            lines.append([name, weights, *(shown.get((row, source), "") for source in sources)])
+            lines.append([name, weights, *(texts.get((row, source), "") for source in sources)])
         parts = [f"### {task}: {metric}"]
         if task.startswith(_RELATION_TASKS):
             parts.append(f"{UNLISTED}.")
@@ -283,11 +183,8 @@ def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
     """results.json and results.md of a folder, each replaced as a whole."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, content in (("md", text), ("json", json.dumps(values, indent=1) + "\n")):
-        draft = folder / f"results.{name}.part"
-        draft.write_text(content, encoding="utf-8")
-        draft.replace(folder / f"results.{name}")
+    write_whole(folder / "results.md", text)
+    write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
 
 
 def summarise(
@@ -322,7 +219,10 @@ def summarise(
             paired_difference(mine, mean, groups=None if groups is None else groups(task)),
         )
         for (row, source, task, name), mean in means.items()
-        if row != ours and (mine := means.get((ours, source, task, name))) is not None
+        if row != ours
+        and (mine := means.get((ours, source, task, name))) is not None
+        # Of several sources, either may have answered in fewer.
+        and mine.scenes == mean.scenes
     )
     return Results(ours, cells, differences, parameters or {}, tuple(_asked(reports)))
 
@@ -392,9 +292,9 @@ def _range(counts: Iterable[int]) -> str:
 def _notes(asked: Sequence[Asked]) -> str:
     """By source where the rows agree, by row where the sources agree, else by both."""
     found: dict[str, Mapping[str, float]] = {}
-    for key in (_of_source, _of_row, _of_both):
-        found = {key(one): one.notes for one in asked}
-        if all(found[key(one)] == one.notes for one in asked):
+    for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
+        found = {place.format(one): one.notes for one in asked}
+        if all(found[place.format(one)] == one.notes for one in asked):
             break
     names = list(dict.fromkeys(name for values in found.values() for name in values))
     rows = (
@@ -402,18 +302,6 @@ def _notes(asked: Sequence[Asked]) -> str:
         for key, values in found.items()
     )
     return grid(["", *names], rows)
-
-
-def _of_source(one: Asked) -> str:
-    return one.source
-
-
-def _of_row(one: Asked) -> str:
-    return f"{one.row}, seed {one.seed}"
-
-
-def _of_both(one: Asked) -> str:
-    return f"{_of_row(one)}, {one.source}"
 
 
 def _number(value: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -11,24 +11,18 @@ from typing import Any
 
 from app.registry import Calibration
 from app.scene import Vocabulary
-from training.baselines import (
-    COMPLETIONS,
-    DENSITIES,
-    OBJECTS,
-    PLACED,
-    RELATIONS,
-    Baseline,
-    Fitted,
-    placed_product,
-)
-from training.baselines.size import parameter_count
+from training.baselines import BASELINES, PLACED, Baseline, Fitted, placed_product
 from training.batches import SceneTensors
 from training.calibrate import calibrate
 from training.config import Config, ConfigError
-from training.evaluation.alarms import fitted_alarm
-from training.evaluation.contenders import Contender, artifact_contender
-from training.evaluation.setting import Setting
-from training.evaluation.tasks import floor_contender, independent_contender
+from training.evaluation.contenders import (
+    artifact_contender,
+    floor_contender,
+    independent_contender,
+)
+from training.evaluation.outliers import fitted_alarm
+from training.evaluation.report import write_whole
+from training.evaluation.setting import Contender, Setting
 from training.machines import BoltzmannMachine
 from training.pipeline import SplitScenes
 from training.publish import as_stored, draft_artifact
@@ -37,15 +31,6 @@ from training.trainer import Trainer, TrainingData
 
 CALIBRATION = "calibration.json"
 """A machine's calibration, beside its run."""
-
-# Registry, end of the row's name, the tasks' scores that it gives, whether it learns relations.
-_KINDS: tuple[tuple[Sequence[Baseline[Any]], str, tuple[str, ...], bool], ...] = (
-    (OBJECTS, "", ("objects",), False),
-    (RELATIONS, "", ("relations", "placement"), True),
-    (COMPLETIONS, ", completing", ("completion",), True),
-    (PLACED, "", ("placed",), True),
-    (DENSITIES, "", ("density",), False),
-)
 
 Say = Callable[[str], None]
 # What answers for a row before some scenes: the same before all of them if it was trained.
@@ -109,45 +94,42 @@ class Row:
 
 
 def baseline_rows(
-    seed: int, names: Sequence[str] | None = None, *, related: bool = True
+    seed: int,
+    names: Sequence[str] | None = None,
+    *,
+    related: bool = True,
+    whole: bool = True,
 ) -> Iterator[Row]:
-    """Every baseline of the registries, or those named, where the seed changes anything.
+    """Every baseline, or those named, where the seed changes anything.
 
     Args:
         related: there are relations to learn from; otherwise baselines of relations are left out.
+        whole: with an alarm, and places for scores of objects.
 
     Raises:
         ValueError: an unknown name.
     """
-    every = [
-        (f"{baseline.name}{end}", baseline, scores, needy)
-        for registry, end, scores, needy in _KINDS
-        for baseline in registry
-    ]
-    known = [name for name, *_ in every]
-    if unknown := sorted(set(names or ()) - set(known)):
-        raise ValueError(f"unknown baselines {unknown}, must be of {known}")
-    for name, baseline, scores, needy in every:
-        wanted = (names is None or name in names) and (related or not needy)
+    if unknown := sorted(set(names or ()) - set(BASELINES)):
+        raise ValueError(f"unknown baselines {unknown}, must be of {list(BASELINES)}")
+    for name, baseline in BASELINES.items():
+        wanted = (names is None or name in names) and (related or not baseline.learns_relations)
         if wanted and (baseline.stochastic or seed == 0):
-            make = partial(_fitted, baseline, scores, seed, True)
+            make = partial(_fitted, baseline, seed, whole)
             yield Row(name, seed, f"{name}, seed {seed}", make)
-
-
-def plain_rows(baselines: Iterable[Baseline[Any]], *scores: str) -> Iterator[Row]:
-    """Baselines with seed 0 and only the given scores of `Contender`: no alarm, no places."""
-    for baseline in baselines:
-        make = partial(_fitted, baseline, scores, 0, False)
-        yield Row(baseline.name, 0, f"{baseline.name}, seed 0", make)
 
 
 def reference_rows() -> Iterator[Row]:
     """References for drawn scenes and densities; nothing is trained."""
-    for name, rival in (
-        ("independent classes", independent_contender),
-        ("held-out scenes (floor)", floor_contender),
-    ):
+    references: dict[str, Rival] = {
+        "independent classes": independent_contender,
+        "held-out scenes (floor)": floor_contender,
+    }
+    for name, rival in references.items():
         yield Row(name, 0, name, partial(_reference, rival))
+
+
+def _reference(rival: Rival, material: Material, folder: Path, say: Say) -> Rival:  # noqa: ARG001
+    return rival
 
 
 def machine_row(config: Config, *, calibrated: bool = True) -> Row:
@@ -163,33 +145,22 @@ def machine_row(config: Config, *, calibrated: bool = True) -> Row:
     return Row(config.name, config.training.seed, identity, make)
 
 
-def _reference(rival: Rival, material: Material, folder: Path, say: Say) -> Rival:  # noqa: ARG001
-    return rival
-
-
 def _fitted(
-    baseline: Baseline[Any],
-    scores: tuple[str, ...],
-    seed: int,
-    whole: bool,
-    material: Material,
-    folder: Path,
-    say: Say,
+    baseline: Baseline[Any], seed: int, whole: bool, material: Material, folder: Path, say: Say
 ) -> Rival:
     """A score of objects also answers T2-at, by the product with the frequency table."""
     data = material.data
-    fitted = _fit(baseline, data, seed, folder, say)
-    score = fitted.score
-    values: dict[str, Any] = dict.fromkeys(scores, score)
-    if "density" in scores:
+    score = _fit(baseline, data, seed, folder, say).score
+    values: dict[str, Any] = dict.fromkeys(baseline.scores, score)
+    if "density" in values:
         values["density"] = lambda: score
-    if "objects" in scores:
-        values["parameters"] = parameter_count(score)
+    if "objects" in values:
+        values["parameters"] = getattr(score, "parameter_count", None)
         if whole:
             values["alarm"] = fitted_alarm(score, data.validation, data.structure, seed)
         if whole and material.related:
-            table = _fit(PLACED[0], data, seed, folder, say)
-            product = placed_product(fitted, table.score)
+            table = _fit(PLACED, data, seed, folder, say).score
+            product = placed_product(baseline.name, score, table)
             values["placed"] = _fit(product, data, seed, folder, say).score
     return always(Contender(**values))
 
@@ -203,9 +174,7 @@ def _calibrated(config: Config, material: Material, folder: Path, say: Say) -> R
     else:
         say("calibrating")
         calibration = calibrate(draft, material.data.validation, material.data.train, seed)
-        partial_file = place.with_suffix(".part")
-        partial_file.write_text(calibration.model_dump_json(indent=1), encoding="utf-8")
-        partial_file.replace(place)
+        write_whole(place, calibration.model_dump_json(indent=1))
     artifact = draft_artifact(machine, material.vocabulary, calibration)
     return always(artifact_contender(artifact, material.data.train, seed=seed))
 
@@ -240,13 +209,10 @@ def _fit(
     """Fit, and write down every trial; those of an interrupted fit are replaced."""
     fitted = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
-    trials.parent.mkdir(parents=True, exist_ok=True)
     before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []
-    lines = [line for line in before if json.loads(line)["model"] != fitted.name]
-    lines += [json.dumps({"model": fitted.name, **asdict(trial)}) for trial in fitted.trials]
-    draft = trials.with_name(trials.name + ".part")
-    draft.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
-    draft.replace(trials)
+    lines = [line for line in before if json.loads(line)["model"] != baseline.name]
+    lines += [json.dumps({"model": baseline.name, **asdict(trial)}) for trial in fitted.trials]
+    write_whole(trials, "".join(f"{line}\n" for line in lines))
     return fitted
 
 

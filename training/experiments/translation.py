@@ -16,10 +16,9 @@ from torch import Tensor
 
 from app.scene import Vocabulary
 from training.batches import Batch
-from training.evaluation.contenders import Contender
-from training.evaluation.missing import ObjectScore
-from training.evaluation.placed import PlacedScore, Places
+from training.evaluation.missing import ObjectScore, PlacedScore, Places
 from training.evaluation.relations import RelationScore
+from training.evaluation.setting import Contender
 
 Score = TypeVar("Score")
 

@@ -35,12 +35,12 @@ from training.config import (
     load_config,
     with_settings,
 )
-from training.datasets import DatasetError
-from training.evaluation.contenders import Contender
-from training.evaluation.intervals import Metric, paired_difference
-from training.evaluation.missing import machine_score
-from training.evaluation.relations import machine_score as relation_score
+from training.evaluation.metrics import Metric, paired_difference
+from training.evaluation.missing import MachineScore
+from training.evaluation.relations import machine_score
 from training.evaluation.report import SourceReport, measure, pooled, settings_by_source
+from training.evaluation.setting import Contender
+from training.experiments.measure import resumable
 from training.pipeline import prepare
 from training.trainer import Trainer, TrainingData
 
@@ -101,7 +101,7 @@ def tune(
     <folder>/<configuration>/best.toml. Ctrl-C keeps finished trials; the same command goes on from
     there.
     """
-    try:
+    with resumable(console):
         original = load_config(configuration)
         distributions = load_space(_space(original, space), original)
         place = folder / original.name
@@ -113,12 +113,6 @@ def tune(
         search = Search(place, config, scenes.training_data(), distributions, by)
         study = search.open(scenes.digest, seed, prune=prune)
         search.run(study, trials + 1)
-    except (ConfigError, DatasetError) as error:
-        console.print(f"[red]error:[/red] {error}")
-        raise typer.Exit(1) from None
-    except KeyboardInterrupt:
-        console.print("stopped; the same command goes on from there")
-        raise typer.Exit(130) from None
     console.print(_table(study, original.name))
     if not _finished(study):
         console.print("[red]error:[/red] no trial finished")
@@ -319,7 +313,7 @@ class Search:
 
     def _judge(self, trainer: Trainer, place: Path) -> dict[str, Metric]:
         machine = trainer.machine
-        contender = Contender(objects=machine_score(machine), relations=relation_score(machine))
+        contender = Contender(objects=MachineScore(machine), relations=machine_score(machine))
         tasks = [task for task, _ in FIGURES.values()]
         for source, setting in settings_by_source(
             self.data.validation, self.data.structure, self.data.train, seen=None

@@ -9,23 +9,28 @@ from sklearn.neighbors import NearestNeighbors
 from sklearn.neural_network import BernoulliRBM
 
 from tests.training.baselines.furnished import LEFT, ON_TOP, STRUCTURE, A, V, scene, tensors
-from training.baselines.bernoulli_rbm import propose as propose_rbm
-from training.baselines.closure import ClosureScore
-from training.baselines.complex_embedding import complex_logits, fit_complex
-from training.baselines.ease import fit_ease
-from training.baselines.frequency_table import smoothed_log_odds
-from training.baselines.linear import LinearScore
-from training.baselines.masked_sets import removal_loss
-from training.baselines.naive_bayes import evidence
-from training.baselines.nearest import nearest_score
-from training.baselines.pairwise import fit_pairwise
-from training.baselines.placed_table import PlacedTable, smoothed_log_p
-from training.baselines.popularity import frequency
-from training.baselines.triple_counts import TripleTable, count_triples
-from training.evaluation.closure import transitive_closure
-from training.evaluation.missing import machine_score
-from training.evaluation.placed import Places
-from training.evaluation.relations import telling
+from training.baselines.networks import removal_loss
+from training.baselines.objects import (
+    LinearScore,
+    bernoulli_rbm,
+    evidence,
+    fit_ease,
+    fit_pairwise,
+    frequency,
+    nearest_score,
+)
+from training.baselines.relations import (
+    ClosureScore,
+    PlacedTable,
+    TripleTable,
+    complex_logits,
+    count_triples,
+    fit_complex,
+    smoothed_log_odds,
+    smoothed_log_p,
+)
+from training.evaluation.missing import Places
+from training.evaluation.relations import telling, transitive_closure
 
 
 @pytest.fixture(scope="module")
@@ -104,15 +109,11 @@ def test_a_strong_penalty_leaves_popularity(v):
     assert score.bias.sigmoid().numpy() == pytest.approx(v.mean(0).numpy(), abs=1e-3)
 
 
-def test_the_rbms_log_odds_are_scikit_learns_free_energies(v, monkeypatch):
+def test_the_rbms_log_odds_are_scikit_learns_free_energies(v):
     """F(v without i) - F(v with i), by scikit-learn's own function."""
-    kept = []
-    monkeypatch.setattr(
-        "training.baselines.bernoulli_rbm.machine_score", lambda machine: kept.append(machine)
-    )
     scenes = tensors([scene([k for k in range(6) if row[k]]) for row in v[:60]])
-    list(propose_rbm(scenes, STRUCTURE, 0))
-    machine = kept[-1]
+    *_, (_, score) = bernoulli_rbm(scenes, STRUCTURE, 0)
+    machine = score.machine
     rbm = BernoulliRBM(n_components=machine.spec.H1)
     rbm.components_ = machine.W.detach().T.numpy()
     rbm.intercept_hidden_ = machine.c1.detach().numpy()
@@ -121,7 +122,7 @@ def test_the_rbms_log_odds_are_scikit_learns_free_energies(v, monkeypatch):
         on, off = scenes.v[:5].clone(), scenes.v[:5].clone()
         on[:, i], off[:, i] = 1.0, 0.0
         expected = rbm._free_energy(off.numpy()) - rbm._free_energy(on.numpy())
-        values = machine_score(machine)(off)[:, i].detach().numpy()
+        values = score(off)[:, i].detach().numpy()
         assert values == pytest.approx(expected, abs=1e-3)
 
 

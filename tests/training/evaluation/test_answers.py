@@ -18,9 +18,9 @@ from training.evaluation.answers import (
     QUESTIONS,
     ask_outliers,
     collect,
-    kinds_of_intruders,
     uncalibrated,
 )
+from training.evaluation.intruders import kinds_of_intruders
 
 ARTIFACT = artifact_of(larger_machine("triway-local"))
 V = LARGER["triway-local"].V
@@ -32,10 +32,10 @@ def test_every_question_is_asked_and_some_answers_are_true(question):
     found = collect(ARTIFACT, DATA, QUESTIONS[question])
     assert found.scenes == 30
     assert 0 < found.truth.sum() < len(found.truth)
-    assert found.probability.min() >= 0
-    assert found.probability.max() <= 1
-    assert np.isfinite(found.ece().value)
-    assert found.brier_skill().value <= 1
+    assert found.score.min() >= 0
+    assert found.score.max() <= 1
+    assert np.isfinite(found.metric("ECE").value)
+    assert found.metric("Brier skill").value <= 1
 
 
 def test_relations_are_compared_with_what_was_listed():
@@ -48,7 +48,7 @@ def test_relations_are_compared_with_what_was_listed():
         bool(entry.instance_holds[names.index(a.relation), a.subject, a.object]) for a in answers
     ]
     ours = found.scene == 4
-    assert found.probability[ours].tolist() == [answer.probability for answer in answers]
+    assert found.score[ours].tolist() == [answer.probability for answer in answers]
     assert found.truth[ours].tolist() == listed
 
 
@@ -58,7 +58,7 @@ def test_relations_that_nobody_knows_of_are_not_judged():
     vague = [replace(entry, instance_observed=entry.instance_holds) for entry in vague]
     for question in ("relations", "relations, others given", "placements"):
         found = collect(ARTIFACT, tensors(vague, V), QUESTIONS[question])
-        assert (len(found.probability), found.skipped) == (0, 30)
+        assert (len(found.score), found.skipped) == (0, 30)
 
 
 def test_a_denied_relation_makes_its_kind_known():
@@ -102,7 +102,7 @@ def test_scenes_with_incomplete_object_lists_are_not_asked_about_objects(questio
     """An unlisted class may be there all the same."""
     some = tensors([replace(entry, complete=False) for entry in DATA.scenes], V)
     found = collect(ARTIFACT, some, QUESTIONS[question])
-    assert (len(found.probability), found.skipped) == (0, 30)
+    assert (len(found.score), found.skipped) == (0, 30)
 
 
 def test_half_of_the_scenes_have_an_intruder():

@@ -12,12 +12,13 @@ from tests.enumeration.small_machines import binary, enumerate_joint, same, smal
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation.density import (
     DensitySettings,
+    Ising,
+    State,
     independent_density,
     log_partition,
     machine_density,
     object_part,
 )
-from training.evaluation.ising import Ising, State
 
 LOCAL = ["rbm-local", "gbm-local", "triway-local", "triway-local-two-layers"]
 TRAIN = tensors([scene([0]), scene([0, 1]), scene([1]), scene([0, 1])], 2)

@@ -11,7 +11,7 @@ from app.scene import Scene
 from tests.training.evaluation.furnished_rooms import STRUCTURE, VOCABULARY, room_model, rooms
 from tests.training.evaluation.scenes import scene, tensors
 from training.evaluation import evidence
-from training.evaluation.contenders import Contender
+from training.evaluation.asking import LeakError
 from training.evaluation.evidence import (
     halves,
     intrusions,
@@ -22,8 +22,7 @@ from training.evaluation.evidence import (
     removals,
     told,
 )
-from training.evaluation.missing import LeakError
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Contender, Setting
 
 DATA = rooms(20, 3)
 PLAIN = STRUCTURE.numpy()

@@ -15,27 +15,29 @@ from training.evaluation.generation import (
     discrepancy,
     drawn_of,
     generation_metrics,
-    halves,
     hamming,
+    held_out_halves,
     independent_sampler,
+    machine_sampler,
     marginal_error,
     median_distance,
     pair_correlation,
     scene_sampler,
 )
-from training.evaluation.sampling import machine_sampler
+from training.evaluation.setting import Setting
 
 X = torch.tensor([[1.0, 0, 0], [1, 1, 0]])
 Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 1]])
 
 
-def test_distances_by_hand():
+def test_distances_and_copies_by_hand():
     assert hamming(X, Y).tolist() == [[0, 2, 3], [1, 3, 2]]
     # 2, 3 and 1 between the rows of Y.
     assert median_distance(Y) == 2.0
+    assert copies(X, Y).tolist() == [1.0, 0.0]
 
 
-def test_discrepancy_by_hand():
+def test_discrepancy_and_marginal_error_by_hand():
     k = lambda d: np.exp(-np.asarray(d) / 2.0)  # noqa: E731
     expected = k(1) + k([2, 3, 1]).mean() - 2 * k([[0, 2, 3], [1, 3, 2]]).mean()
     at = discrepancy(Y, X, 2.0)
@@ -43,6 +45,8 @@ def test_discrepancy_by_hand():
     # A scene drawn twice is no pair of its own.
     twice = k(1) + k(2) - 2 * (2 * k([0, 1]).mean() + k([2, 3]).mean()) / 3
     assert at(np.array([2.0, 1, 0])) == pytest.approx(twice)
+    marginal = marginal_error(Y.numpy().astype(float), X.numpy().astype(float))
+    assert marginal(np.ones(3)) == pytest.approx((2 / 3 + 1 / 6 + 2 / 3) / (4 / 3))
 
 
 def test_discrepancy_of_one_distribution_is_zero_on_average():
@@ -56,11 +60,6 @@ def test_discrepancy_of_one_distribution_is_zero_on_average():
     assert abs(np.mean(values)) < 5 * np.std(values) / np.sqrt(300)
     other = (torch.rand(20, 4, generator=rng) < 1 - p).float()
     assert discrepancy(x.float(), other, 2.0)(np.ones(20)) > 0.1
-
-
-def test_marginal_error_by_hand():
-    at = marginal_error(Y.numpy().astype(float), X.numpy().astype(float))
-    assert at(np.ones(3)) == pytest.approx((2 / 3 + 1 / 6 + 2 / 3) / (4 / 3))
 
 
 def test_pair_correlation_by_hand():
@@ -77,35 +76,29 @@ def test_pair_correlation_by_hand():
     assert same(np.ones(30)) == pytest.approx(1.0)
 
 
-def test_copies_are_equal_sets_of_classes():
-    assert copies(X, Y).tolist() == [1.0, 0.0]
+def test_contradictions_by_hand():
+    """Mirrored pairs are counted by pair; cycles of on-top are found whatever their length.
 
-
-def test_mirrored_relations_are_counted_by_pair():
-    """left(0,1), left(1,0), left(0,2), front(2,2): two related pairs, one of them both ways."""
-    holds = torch.zeros(1, 2, 3, 3)
+    left(0,1), left(1,0), left(0,2), front(2,2): two related pairs, one of them both ways. Then a
+    tower of three; the same with its foot on its top; nothing but left, in a circle.
+    """
+    holds = torch.zeros(4, 4, 3, 3)
     for a, i, j in [(0, 0, 1), (0, 1, 0), (0, 0, 2), (1, 2, 2)]:
-        holds[0, a, i, j] = 1
-    found = Contradictions.of(holds)
-    assert (found.related.tolist(), found.mirrored.tolist()) == ([2], [1])
-
-
-def test_cycles_of_on_top_are_found_whatever_their_length():
-    """A tower of three; the same with its foot on its top; nothing but left, in a circle."""
-    holds = torch.zeros(3, 4, 3, 3)
-    for k, a, i, j in [(0, 2, 0, 1), (0, 2, 1, 2), (1, 2, 0, 1), (1, 2, 1, 2), (1, 2, 2, 0)]:
-        holds[k, a, i, j] = 1
+        holds[3, a, i, j] = 1
+    for k, i, j in [(0, 0, 1), (0, 1, 2), (1, 0, 1), (1, 1, 2), (1, 2, 0)]:
+        holds[k, 2, i, j] = 1
     holds[2, 0] = torch.eye(3).roll(1, 1)
     holds[:, 2, 1, 1] = 1  # of itself: two books, one on the other
     found = Contradictions.of(holds)
-    assert found.stacked.tolist() == [True, True, False]
-    assert found.cyclic.tolist() == [False, True, False]
+    assert (int(found.related[3]), int(found.mirrored[3])) == (2, 1)
+    assert found.stacked.tolist() == [True, True, False, False]
+    assert found.cyclic.tolist() == [False, True, False, False]
     assert set(found.metrics()) == {"mirrored relations", "on-top cycles"}
 
 
 def test_halves_keep_groups_together():
     scenes = tensors([scene([0, 1], group=f"g{k // 2}") for k in range(40)])
-    first, second = halves(scenes)
+    first, second = held_out_halves(Setting(scenes, torch.zeros(5, dtype=torch.bool)))
     assert len(first) + len(second) == 40
     assert len(first) >= 5
     assert len(second) >= 5

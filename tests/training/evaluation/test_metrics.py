@@ -1,21 +1,33 @@
-"""Metrics by hand, pooled, and through JSON."""
+"""Metrics by hand, pooled, through JSON; their statistics; the bootstrap and its pairing."""
 
 from __future__ import annotations
 
 import json
+from itertools import permutations
 
 import numpy as np
 import pytest
+from sklearn.metrics import average_precision_score, roc_auc_score
 
+from training.evaluation.item_statistics import (
+    BINS,
+    STATISTICS,
+    auroc,
+    average_precision,
+    brier_skill,
+    calibration_error,
+    reliability,
+)
 from training.evaluation.metrics import (
+    Figure,
     Macro,
+    MeanOverSeeds,
     Ratio,
     Resampled,
     Scored,
-    metric_from_dict,
-    metric_to_dict,
-    pool,
+    paired_difference,
 )
+from training.evaluation.report import metric_from_dict, metric_to_dict, pool
 
 
 def ints(*values):
@@ -26,37 +38,34 @@ def floats(*values):
     return np.array(values, dtype=np.float64)
 
 
+def mean_of(values):
+    return Ratio.of_scenes(np.asarray(values, dtype=np.float64))
+
+
 RATIO = Ratio(floats(1, 0, 3), floats(2, 0, 4))
 MACRO = Macro(ints(0, 0, 1, 1), ints(7, 7, 7, 2), floats(1, 0, 0.5, 1), 3)
 SCORED = Scored("AUROC", ints(0, 0, 1), floats(3, 1, 2), np.array([True, False, False]), 2)
 RESAMPLED = Resampled.of(lambda weight: float(weight @ [1, 2]) / 2, 2, 9, 50)
+POOLABLE = {"ratio": RATIO, "macro": MACRO, "scored": SCORED}
 
 
-def test_ratios_by_hand():
+def test_metrics_by_hand():
     assert RATIO.value == pytest.approx(4 / 6)
     assert (RATIO.n, RATIO.scenes) == (6, 3)
     assert RATIO.mean_over_scenes().value == pytest.approx((1 / 2 + 3 / 4) / 2)
-
-
-def test_macro_counts_every_group_alike():
+    # Every group counts alike; without scene 0 class 7 keeps one item.
     assert MACRO.value == pytest.approx((1.5 / 3 + 1) / 2)
     assert (MACRO.n, MACRO.scenes) == (2, 3)
-    # Without scene 0 class 7 keeps one item.
     assert MACRO.at(floats(0, 1, 1)) == pytest.approx((0.5 + 1) / 2)
+    # Items count as often as their scene.
+    scene, score = ints(0, 0, 0, 0, 1), floats(3, 1, 3, 1, 2)
+    twice = Scored("AUROC", scene, score, np.array([1, 0, 1, 0, 0], bool), 2)
+    assert SCORED.at(floats(2, 1)) == pytest.approx(twice.value)
 
 
-def test_resampling_counts_items_as_often_as_their_scene():
-    weight = floats(2, 1)
-    twice = Scored(
-        "AUROC", ints(0, 0, 0, 0, 1), floats(3, 1, 3, 1, 2), np.array([1, 0, 1, 0, 0], bool), 2
-    )
-    assert SCORED.at(weight) == pytest.approx(twice.value)
-
-
-@pytest.mark.parametrize("metric", [RATIO, MACRO, SCORED], ids=["ratio", "macro", "scored"])
+@pytest.mark.parametrize("metric", POOLABLE.values(), ids=POOLABLE)
 def test_pooling_is_measuring_the_union(metric):
     both = pool([metric, metric])
-    assert both is not None
     assert both.scenes == 2 * metric.scenes
     assert both.value == pytest.approx(metric.value)
     first = np.concatenate([np.ones(metric.scenes), np.zeros(metric.scenes)])
@@ -69,35 +78,175 @@ def test_metrics_of_whole_sets_do_not_pool():
         pool([RATIO, MACRO])
 
 
-@pytest.mark.parametrize(
-    "metric", [RATIO, MACRO, SCORED, RESAMPLED], ids=["ratio", "macro", "scored", "resampled"]
-)
+@pytest.mark.parametrize("metric", [*POOLABLE.values(), RESAMPLED], ids=[*POOLABLE, "resampled"])
 def test_metrics_survive_json(metric):
     again = metric_from_dict(json.loads(json.dumps(metric_to_dict(metric), allow_nan=False)))
     assert again.figure() == metric.figure()
 
 
-def test_an_unknown_kind_is_an_error():
+def test_what_is_no_metric_is_an_error():
     with pytest.raises(ValueError, match="kind must be"):
         metric_from_dict({"kind": "guess"})
     with pytest.raises(ValueError, match="unknown statistic"):
         Scored("guess", ints(0), floats(0), np.array([True]), 1)
+    with pytest.raises(ValueError, match="no scene"):
+        Ratio(np.zeros(2), np.zeros(2))
+
+
+# ------------------------------------------------------------------------------------- statistics
+
+RNG = np.random.default_rng(0)
+SCORE = RNG.normal(size=60)
+P = 1 / (1 + np.exp(-SCORE))
+TRUTH = RNG.random(60) < 0.3
+ONE = np.ones(60)
+
+
+def test_rankings_are_scikit_learn_s_where_nothing_ties():
+    assert auroc(SCORE, TRUTH)(ONE) == pytest.approx(roc_auc_score(TRUTH, SCORE))
+    expected = average_precision_score(TRUTH, SCORE)
+    assert average_precision(SCORE, TRUTH)(ONE) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS.values(), ids=STATISTICS)
+def test_weights_are_copies(statistic):
+    weight = RNG.integers(0, 3, size=60)
+    copied = statistic(np.repeat(P, weight), np.repeat(TRUTH, weight))(np.ones(weight.sum()))
+    assert statistic(P, TRUTH)(weight.astype(float)) == pytest.approx(copied)
+
+
+def test_ties_score_their_expectation_under_random_order():
+    score = np.array([2.0, 1, 1, 1, 0])
+    truth = np.array([False, True, False, True, True])
+    expected = []
+    for order in permutations((1, 2, 3)):
+        broken = score.copy()
+        broken[list(order)] += np.array([0.2, 0.1, 0.0])
+        expected.append(average_precision_score(truth, broken))
+    assert average_precision(score, truth)(np.ones(5)) == pytest.approx(np.mean(expected))
+    assert auroc(np.zeros(5), truth)(np.ones(5)) == pytest.approx(0.5)
+
+
+def test_one_sided_truth_has_no_ranking():
+    assert np.isnan(auroc(SCORE, np.ones(60, bool))(ONE))
+    assert np.isnan(average_precision(SCORE, np.zeros(60, bool))(ONE))
+    assert np.isnan(brier_skill(SCORE, np.zeros(60, bool))(ONE))
+
+
+def test_calibration_error_by_hand():
+    """Ten bins of one item each: |p - y| of each."""
+    p = np.linspace(0.05, 0.95, BINS)
+    y = p > 0.5
+    assert calibration_error(p, y)(np.ones(BINS)) == pytest.approx(np.abs(p - y).mean())
+    # 20 items in two levels: .2 with 3 of 10 true, .9 with 8 of 10 true.
+    y = np.concatenate([np.arange(10) < 3, np.arange(10) < 8])
+    assert calibration_error(np.repeat([0.2, 0.9], 10), y)(np.ones(20)) == pytest.approx(0.1)
+    # A constant at the base rate is calibrated, in whatever order the items come.
+    y, flat, one = np.arange(30) < 6, np.full(30, 0.2), np.ones(30)
+    assert calibration_error(flat, y)(one) == pytest.approx(0.0, abs=1e-12)
+    assert brier_skill(flat, y)(one) == pytest.approx(0.0)
+    assert brier_skill(y.astype(float), y)(one) == pytest.approx(1.0)
+
+
+def test_reliability_is_what_the_error_is_made_of():
+    bins = reliability(P, TRUTH)
+    assert bins.mass == pytest.approx(np.full(BINS, 1 / BINS))
+    assert bins.mass @ bins.probability == pytest.approx(P.mean())
+    assert bins.mass @ bins.frequency == pytest.approx(TRUTH.mean())
+    gap = np.abs(bins.probability - bins.frequency) @ bins.mass
+    assert gap == pytest.approx(calibration_error(P, TRUTH)(ONE))
+
+
+# ------------------------------------------------------------------------------------- intervals
+
+
+def test_the_interval_covers_the_truth():
+    """Means of 200 samples of N(0, 1) x 100 scenes: 0 is within the 95 % interval 170 to 199 times.
+
+    A binomial of 200 and .95 leaves that range with probability below 1e-4.
+    """
+    rng = np.random.default_rng(0)
+    figures = [mean_of(rng.normal(size=100)).figure(resamples=300, seed=k) for k in range(200)]
+    assert 170 <= sum(figure.low <= 0 <= figure.high for figure in figures) <= 199
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_interval_holds_its_value_though_rare_groups_drop_out(seed):
+def test_an_interval_holds_a_value_that_moves_under_resampling(seed):
     """Most groups are in one scene and do badly: resamples without them would be too good."""
     rng = np.random.default_rng(seed)
     group = np.concatenate([np.zeros(100, np.int64), np.arange(1, 60)])
-    scene = rng.integers(100, size=len(group))
     value = np.where(group == 0, 0.9, rng.random(len(group)) * 0.1)
-    figure = Macro(scene, group, value, 100).figure()
-    assert figure.low < figure.value < figure.high
-
-
-def test_the_interval_of_a_calibration_error_holds_its_value():
-    rng = np.random.default_rng(0)
+    macro = Macro(rng.integers(100, size=len(group)), group, value, 100)
     probability = rng.random(300)
     truth = rng.random(300) < probability
-    figure = Scored("ECE", np.arange(300) % 50, probability, truth, 50).figure()
-    assert figure.low < figure.value < figure.high
+    for metric in (macro, Scored("ECE", np.arange(300) % 50, probability, truth, 50)):
+        figure = metric.figure()
+        assert figure.low < figure.value < figure.high
+
+
+def test_a_paired_difference_sees_what_two_intervals_hide():
+    """A gain of .1 in every scene, under a spread of 3 that both models share."""
+    shared = 3 * np.random.default_rng(0).normal(size=100)
+    a, b = mean_of(shared + 0.1), mean_of(shared)
+    assert a.figure().low < b.figure().high
+    difference = paired_difference(a, b)
+    assert (difference.value, difference.low) == pytest.approx((0.1, 0.1))
+    assert paired_difference(b, a).high < 0
+    assert paired_difference(a, a) == Figure(0.0, 0.0, 0.0, 100)
+
+
+def test_the_difference_of_two_equal_models_is_rarely_above_zero():
+    """60 pairs of unrelated scores with equal means: above zero in 2.5 % of them.
+
+    More than 7 of 60 happen with probability below 2e-4.
+    """
+    rng = np.random.default_rng(0)
+    pairs = [[mean_of(rng.normal(size=80)) for _ in "ab"] for _ in range(60)]
+    assert sum(paired_difference(a, b, resamples=300).low > 0 for a, b in pairs) <= 7
+
+
+def test_copies_of_a_scene_in_a_group_narrow_no_interval():
+    """Ten frames of each place tell what one frame of each does; groups of one are scenes."""
+    x, y = RNG.random(20), RNG.random(20)
+    places = np.array([f"{k:02}" for k in range(20)])
+    one = paired_difference(mean_of(x), mean_of(y), groups=places.tolist())
+    single = paired_difference(mean_of(x), mean_of(y))
+    assert (one.value, one.low, one.high) == pytest.approx((single.value, single.low, single.high))
+    a, b = mean_of(np.repeat(x, 10)), mean_of(np.repeat(y, 10))
+    ten = paired_difference(a, b, groups=np.repeat(places, 10).tolist())
+    assert (ten.low, ten.high) == pytest.approx((one.low, one.high))
+    naive = paired_difference(a, b)
+    assert naive.high - naive.low < 0.6 * (one.high - one.low)
+
+
+def test_intervals_over_groups_hold_the_truth_about_as_often_as_they_say():
+    """Groups of unequal size whose scenes are alike; the true difference is 0."""
+    rng, held, trials = np.random.default_rng(1), 0, 200
+    for _ in range(trials):
+        sizes = rng.integers(1, 6, 30)
+        groups = np.repeat(np.arange(30), sizes).astype(str).tolist()
+        effect = np.repeat(rng.normal(0, 1, 30), sizes)
+        a = mean_of(effect + rng.normal(0, 0.2, len(groups)))
+        none = mean_of(np.zeros(len(groups)))
+        found = paired_difference(a, none, groups=groups, resamples=200)
+        held += found.low <= 0 <= found.high
+    assert 0.87 * trials <= held <= 0.99 * trials
+
+
+@pytest.mark.parametrize(("scenes", "groups"), [(3, None), (3, ["a", "b"]), (2, ["a", "b", "c"])])
+def test_only_the_same_scenes_can_be_paired(scenes, groups):
+    with pytest.raises(ValueError, match=f"cannot pair 2 scenes with {scenes}"):
+        paired_difference(mean_of([1, 2]), mean_of(np.ones(scenes)), groups=groups)
+
+
+def test_a_mean_over_seeds_is_resampled_scene_by_scene():
+    mean = MeanOverSeeds([mean_of([0, 1, 1, 0]), mean_of([1, 1, 0, 0])])
+    together = mean_of([0.5, 1.0, 0.5, 0.0])
+    assert mean.value == together.value
+    np.testing.assert_allclose(mean.draws(), together.draws())
+    difference = paired_difference(mean, together)
+    assert (difference.low, difference.high) == pytest.approx((0.0, 0.0))
+    with pytest.raises(ValueError, match="different numbers of scenes"):
+        MeanOverSeeds([mean_of([1.0]), mean_of([1.0, 0.0])])
+    with pytest.raises(ValueError, match="at least one"):
+        MeanOverSeeds([])

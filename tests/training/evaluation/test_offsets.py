@@ -13,9 +13,9 @@ from tests.questions.artifacts import LARGER, larger_artifact
 from tests.training.evaluation.scenes import scene, tensors
 from tests.training.test_offsets import MEAN, STD, apart, draws
 from training.datasets import encode, generate_rooms, rooms_vocabulary
-from training.evaluation.contenders import Contender
 from training.evaluation.offsets import METRICS, offsets_task
-from training.evaluation.report import Setting, evaluate
+from training.evaluation.report import evaluate
+from training.evaluation.setting import Contender, Setting
 from training.offsets import fit_offsets
 
 V = LARGER["triway-local"].V

@@ -21,11 +21,9 @@ from tests.training.evaluation.scenes import (
 )
 from training.batches import seen_triples
 from training.evaluation import pairs
-from training.evaluation.asking import labels_alone, relation_probabilities
-from training.evaluation.contenders import Contender
-from training.evaluation.missing import LeakError
+from training.evaluation.asking import LeakError, labels_alone, relation_probabilities
 from training.evaluation.pairs import RARE, pairs_task, service_score, vertical_pairs
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Contender, Setting
 
 LEFT, ON, ABOVE = 0, 2, 3
 DATA = tensors(random_scenes(20), WIDE)
@@ -60,22 +58,29 @@ def test_only_vertical_relations_between_two_things_are_asked():
     assert np.flatnonzero(asked.listed[0]).tolist() == [LEFT, 4 + ON]
 
 
-def test_accuracy_and_log_loss_by_hand():
-    """on-top back has .6 of a total of 1: it is the likeliest, and its share is .6."""
-    data = tensors([scene([0, 1], [(ON, 1, 0)]), scene([0, 1], [(ON, 0, 1)])])
-    score = log_odds({(ON, True): 0.6, (ON, False): 0.3, (LEFT, False): 0.1})
-    metrics = pairs_task(Contender(relations=score), Setting(data, NO_STRUCTURE)).metrics
-    assert metrics["accuracy"].value == pytest.approx(1 / 2)
-    assert metrics["log-loss"].value == pytest.approx(-(np.log(0.6) + np.log(0.3)) / 2, rel=1e-4)
+EITHER = [scene([0, 1], [(ON, 1, 0)]), scene([0, 1], [(ON, 0, 1)])]
+SEVERAL = [scene([0, 1], [(ON, 1, 0), (LEFT, 0, 1)])]
 
 
-def test_any_listed_relation_is_right():
-    data = tensors([scene([0, 1], [(ON, 1, 0), (LEFT, 0, 1)])])
-    score = log_odds({(ON, True): 0.3, (LEFT, False): 0.6, (ABOVE, True): 0.1})
-    metrics = pairs_task(Contender(relations=score), Setting(data, NO_STRUCTURE)).metrics
-    assert metrics["accuracy"].value == 1.0
-    assert metrics["accuracy, vertical"].value == 1.0
-    assert metrics["log-loss"].value == pytest.approx(-np.log(0.9), rel=1e-4)
+@pytest.mark.parametrize(
+    ("scenes", "p", "accuracy", "log_loss"),
+    [
+        # on-top back has .6 of a total of 1: it is the likeliest, and its share is .6.
+        (
+            EITHER,
+            {(ON, True): 0.6, (ON, False): 0.3, (LEFT, False): 0.1},
+            1 / 2,
+            -(np.log(0.6) + np.log(0.3)) / 2,
+        ),
+        # Any listed relation is right.
+        (SEVERAL, {(ON, True): 0.3, (LEFT, False): 0.6, (ABOVE, True): 0.1}, 1.0, -np.log(0.9)),
+    ],
+)
+def test_accuracy_and_log_loss_by_hand(scenes, p, accuracy, log_loss):
+    setting = Setting(tensors(scenes), NO_STRUCTURE)
+    metrics = pairs_task(Contender(relations=log_odds(p)), setting).metrics
+    assert metrics["accuracy"].value == metrics["accuracy, vertical"].value == accuracy
+    assert metrics["log-loss"].value == pytest.approx(log_loss, rel=1e-4)
 
 
 def test_perfect_and_ignorant_scores():

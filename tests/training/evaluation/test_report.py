@@ -1,4 +1,4 @@
-"""Every task for one contender, stored, resumed, pooled and compared."""
+"""Every task for one contender, stored, resumed, pooled and published."""
 
 from __future__ import annotations
 
@@ -20,11 +20,15 @@ from tests.training.evaluation.scenes import (
     tensors,
 )
 from training.batches import seen_triples
+from training.cases import some_scenes
 from training.evaluation.answers import QUESTIONS
-from training.evaluation.asking import SENSITIVITIES
-from training.evaluation.cases import some_scenes
-from training.evaluation.contenders import Contender, artifact_contender
+from training.evaluation.contenders import (
+    artifact_contender,
+    floor_contender,
+    independent_contender,
+)
 from training.evaluation.density import DensitySettings
+from training.evaluation.generation import held_out_halves
 from training.evaluation.report import (
     SourceReport,
     digest,
@@ -34,12 +38,8 @@ from training.evaluation.report import (
     run,
     settings_by_source,
 )
-from training.evaluation.tasks import (
-    TASKS,
-    Setting,
-    floor_contender,
-    independent_contender,
-)
+from training.evaluation.setting import Contender, Setting
+from training.evaluation.tasks import EVERY_TASK, TASKS, WHOLE_SET
 
 V = LARGER["triway-local"].V
 NO_STRUCTURE = torch.zeros(V, dtype=torch.bool)
@@ -50,10 +50,13 @@ SETTING = Setting(DATA, NO_STRUCTURE, TRAIN, SEEN)
 EFFORT = DensitySettings(chains=8, temperatures=10, burn_in=5, draws=8)
 ARTIFACT = artifact_of(larger_machine("triway-local"))
 CONTENDER = artifact_contender(ARTIFACT, TRAIN, EFFORT)
+OF_OBJECTS = {name for name, task in TASKS.items() if task.of_objects}
 
 
-def flat_objects(v):
-    return torch.zeros_like(v)
+def report_of(contender, setting, tasks=tuple(TASKS)):
+    report = SourceReport("toy", digest(setting))
+    assert list(run(contender, setting, report, tasks=tasks)) == list(tasks)
+    return report
 
 
 def values_of(report):
@@ -65,15 +68,25 @@ def values_of(report):
     }
 
 
+def two_sources(scenes):
+    named = [replace(s, source="ab"[k % 2]) for k, s in enumerate(scenes.scenes)]
+    return tensors(sorted(named, key=lambda s: s.source), V)
+
+
 def test_every_task_has_an_outcome():
-    report = SourceReport("toy", digest(SETTING))
-    assert list(run(CONTENDER, SETTING, report)) == list(TASKS)
+    report = report_of(CONTENDER, SETTING)
     # Thirty training scenes say nothing of what is typical, and the setting names no facts.
     nothing = {task for task, outcome in report.outcomes.items() if outcome is None}
     assert nothing == {"T3 signature", "Everyday"}
     assert all(np.isfinite(list(values_of(report).values())))
     assert "R-precision, zero-shot" in report.outcomes["T1a relations"].metrics
     assert "alarms in untouched scenes" in report.outcomes["T3 outliers, uniform"].metrics
+
+
+def test_the_tasks_about_objects():
+    relational = {"T1a relations", "T1 pairs", "T1 with evidence", "T1b completion"}
+    others = relational | {"T3b placement", "Calibration", "Everyday"}
+    assert set(TASKS) - OF_OBJECTS == others
 
 
 def test_reports_are_stored_and_resumed(tmp_path):
@@ -91,13 +104,7 @@ def test_reports_are_stored_and_resumed(tmp_path):
     assert again.outcomes["T4 generate"].notes == whole.outcomes["T4 generate"].notes
     assert not list(path.parent.glob("*.part"))
     written = json.loads(path.read_text())["tasks"]["T2 missing"]["outcome"]["metrics"]["MRR"]
-    (row,) = (r for r in whole.rows() if (r.task, r.metric) == ("T2 missing", "MRR"))
-    assert written["figure"] == asdict(row.figure)
-
-
-def test_a_report_goes_on_with_the_same_questions_alone(tmp_path):
-    path = tmp_path / "toy.json"
-    measure(path, CONTENDER, SETTING, "toy", tasks=("T2 missing",))
+    assert written["figure"] == asdict(whole.outcomes["T2 missing"].metrics["MRR"].figure())
     for other in (replace(SETTING, seed=1), replace(SETTING, limit=3)):
         with pytest.raises(ValueError, match="other scenes or questions"):
             measure(path, CONTENDER, other, "toy")
@@ -106,139 +113,80 @@ def test_a_report_goes_on_with_the_same_questions_alone(tmp_path):
 
 
 @pytest.mark.parametrize("name", LARGER)
-def test_scenes_that_hold_no_question_have_no_outcome(name):
-    """A source without relations, and scenes of one class: nothing is asked, nothing fails."""
-    contender = artifact_contender(
-        artifact_of(larger_machine(name)), TRAIN, EFFORT, calibrated=False
-    )
+def test_every_machine_can_be_evaluated(name):
+    """Scenes without relations, of one class: nothing is asked, nothing fails."""
+    machine = artifact_of(larger_machine(name))
+    contender = artifact_contender(machine, TRAIN, EFFORT, calibrated=False)
+    some = ("T1a relations", "T1b completion", "T2 missing", "T3 outliers, uniform")
+    found = values_of(report_of(contender, SETTING, some))
+    assert {task for task, _ in found} == set(some)
+    assert all(np.isfinite(list(found.values())))
     asked = [task for task in TASKS if task.startswith(("T1", "T2", "T3"))]
     silent = Setting(tensors([scene([k]) for k in range(3)], V), NO_STRUCTURE, TRAIN, SEEN)
-    report = SourceReport("silent", digest(silent))
-    assert list(run(contender, silent, report, tasks=asked)) == asked
-    assert set(report.outcomes.values()) == {None}
+    assert set(report_of(contender, silent, asked).outcomes.values()) == {None}
 
 
-OBJECT_TASKS = {task for task in TASKS if task.startswith(("T2", "T3 ", "T4")) or task == "Density"}
+def test_who_takes_no_part_is_none():
+    assert set(report_of(Contender(), SETTING).outcomes.values()) == {None}
 
 
 def test_tasks_about_objects_see_scenes_with_complete_object_lists_alone():
     """Elsewhere an unlisted object may be there. Relations are asked of all annotated scenes."""
     cut = [replace(one, complete=False, source="captions") for one in random_scenes(9, V, seed=2)]
     mixed = Setting(tensors([*DATA.scenes, *cut], V), NO_STRUCTURE, TRAIN, SEEN)
-    reports = []
-    for setting in (SETTING, mixed):
-        reports.append(SourceReport("toy", digest(setting)))
-        list(run(CONTENDER, setting, reports[-1], tasks=sorted(OBJECT_TASKS | {"T1b completion"})))
-    whole, more = ({t: o.scenes for t, o in r.outcomes.items() if o} for r in reports)
-    assert whole == {task: more[task] - 9 * (task == "T1b completion") for task in whole}
-    of_objects = [
-        {key: value for key, value in values_of(report).items() if key[0] in OBJECT_TASKS}
-        for report in reports
+    asked = sorted(OF_OBJECTS | {"T1b completion"})
+    whole, more = (report_of(CONTENDER, setting, asked) for setting in (SETTING, mixed))
+    assert more.outcomes["T1b completion"].scenes == len(DATA) + 9
+    values = [
+        {key: value for key, value in values_of(report).items() if key[0] in OF_OBJECTS}
+        for report in (whole, more)
     ]
-    assert of_objects[1] == pytest.approx(of_objects[0])
-
-
-def test_a_source_of_incomplete_object_lists_is_asked_for_relations_alone():
-    cut = [replace(one, complete=False) for one in random_scenes(20, V, seed=2)]
-    setting = Setting(tensors(cut, V), NO_STRUCTURE, tensors(cut, V), SEEN)
-    report = SourceReport("captions", digest(setting))
-    asked = [task for task in TASKS if task != "Everyday"]
-    list(run(CONTENDER, setting, report, tasks=asked))
-    silent = {task for task, outcome in report.outcomes.items() if outcome is None}
-    assert silent == OBJECT_TASKS
-    names = report.outcomes["Calibration"].metrics
+    assert values[1] == pytest.approx(values[0])
+    # A source of such scenes is asked for relations alone.
+    captions = Setting(tensors(cut, V), NO_STRUCTURE, tensors(cut, V), SEEN)
+    report = report_of(CONTENDER, captions, [task for task in TASKS if task != "Everyday"])
+    assert {task for task, found in report.outcomes.items() if found is None} == OF_OBJECTS
+    names = set(report.outcomes["Calibration"].metrics)
     assert "ECE, relations" in names
-    assert not {f"ECE, {kind}" for kind in ("missing", "outliers", "missing at a place")} & set(
-        names
-    )
-
-
-def test_who_takes_no_part_is_none():
-    report = SourceReport("toy", digest(SETTING))
-    for _ in run(Contender(), SETTING, report):
-        pass
-    assert set(report.outcomes.values()) == {None}
-    assert report.rows() == []
-    bare = Setting(tensors([scene([0])], V), NO_STRUCTURE, TRAIN, SEEN)
-    report = SourceReport("toy", digest(bare))
-    for _ in run(replace(CONTENDER, density=None), bare, report):
-        pass
-    assert set(report.outcomes.values()) == {None}
+    assert not names & {f"ECE, {kind}" for kind in ("missing", "outliers", "missing at a place")}
 
 
 def test_pooled_sources_are_their_union():
-    scenes = [replace(s, source="ab"[k % 2]) for k, s in enumerate(DATA.scenes)]
-    union = tensors(sorted(scenes, key=lambda s: s.source), V)
-    train = tensors([replace(s, source="ab"[k % 2]) for k, s in enumerate(TRAIN.scenes)], V)
-    reports = []
-    for source, setting in settings_by_source(union, NO_STRUCTURE, train, SEEN):
-        report = SourceReport(source, digest(setting))
-        for _ in run(CONTENDER, setting, report, tasks=("T1a relations", "T3 outliers, uniform")):
-            pass
-        reports.append(report)
-    together = pooled(reports)
-    setting = Setting(union, NO_STRUCTURE, train, SEEN)
-    whole = SourceReport("all", digest(setting))
-    for _ in run(CONTENDER, setting, whole, tasks=("T1a relations", "T3 outliers, uniform")):
-        pass
+    union, train = two_sources(DATA), two_sources(TRAIN)
+    tasks = ("T1a relations", "T3 outliers, uniform")
+    settings = settings_by_source(union, NO_STRUCTURE, train, SEEN)
+    together = pooled([report_of(CONTENDER, setting, tasks) for _, setting in settings])
+    whole = report_of(CONTENDER, Setting(union, NO_STRUCTURE, train, SEEN), tasks)
     assert values_of(together) == pytest.approx(values_of(whole))
 
 
 def test_references_stand_on_either_side():
     """Independent classes gain nothing over themselves; the floor is the other half as it is."""
-    values = {}
-    references = {
-        "independent classes": independent_contender(SETTING),
-        "held-out scenes (floor)": floor_contender(SETTING),
-    }
-    for name, contender in references.items():
-        report = SourceReport("toy", digest(SETTING))
-        for _ in run(contender, SETTING, report, tasks=("T4 generate", "Density")):
-            pass
-        values[name] = {metric: value for (_, metric), value in values_of(report).items()}
-    gain = values["independent classes"]["gain over independent classes, upper log Z"]
+    tasks = ("T4 generate", "Density")
+    independent = values_of(report_of(independent_contender(SETTING), SETTING, tasks))
+    gain = independent["Density", "gain over independent classes, upper log Z"]
     assert gain == pytest.approx(0.0)
-    floor = values["held-out scenes (floor)"]
-    sizes = SETTING.halves()[1].v.sum(1).mean()
-    assert floor["classes per scene, free"] == pytest.approx(float(sizes))
+    floor = values_of(report_of(floor_contender(SETTING), SETTING, tasks))
+    sizes = held_out_halves(SETTING)[1].v.sum(1).mean()
+    assert floor["T4 generate", "classes per scene, free"] == pytest.approx(float(sizes))
 
 
-def test_publishing_measures_the_published_tasks_on_every_source():
+def test_publishing_measures_the_tasks_of_a_card_on_every_source():
     """Of the calibrated artifact, on each source; generation on all together."""
-    scenes = [replace(s, source="ab"[k % 2]) for k, s in enumerate(DATA.scenes)]
-    train = tensors([replace(s, source="ab"[k % 2]) for k, s in enumerate(TRAIN.scenes)], V)
-    rows = evaluate(ARTIFACT, tensors(scenes, V), NO_STRUCTURE, train)
+    rows = evaluate(ARTIFACT, two_sources(DATA), NO_STRUCTURE, two_sources(TRAIN))
     found = {(row.task, row.source, row.metric) for row in rows}
     assert len(found) == len(rows)
-    expected = {
-        "T1a relations": {"R-precision, distinct classes", "R-precision, instance counts"},
-        "T1 pairs": {"accuracy", "log-loss"},
-        "T1 with evidence": {"change of R-precision, relations"},
-        "T1b completion": {"R-precision"},
-        "T2 missing": {"MRR", "top-1", "top-10"},
-        "T2 partial": {"MRR, 50 %", "precision@5, 50 %", "change of MRR, 50 %"},
-        "T2 with evidence": {f"change of MRR, {k}" for k in ("relations", "room type")},
-        "T2-at missing at a place": {"MRR"},
-        "T3 outliers, uniform": {"hit@1", "AUROC", "alarms in untouched scenes"},
-        "T3 sensitivity": {
-            f"{figure}, {name}"
-            for name in SENSITIVITIES
-            for figure in ("alarms", "caught, uniform", "caught, by popularity")
-        },
-        "T3 with evidence": {f"change of hit@1, {k}" for k in ("relations", "room type")},
-        "T3b placement": {"hit@1"},
-        "Calibration": {f"{f}, {q}" for f in ("ECE", "Brier skill") for q in QUESTIONS},
+    # These scenes have no poses, no offsets, no typical classes and no facts.
+    absent = {"T3 signature", "Offsets", "Everyday"}
+    card = {
+        (task, source, metric)
+        for task, one in EVERY_TASK.items()
+        if task not in absent
+        for source in (("pooled",) if task in WHOLE_SET else "ab")
+        for metric in one.card
+        if not metric.endswith("poses")
     }
-    for source in "ab":
-        assert {
-            task: {metric for t, s, metric in found if (t, s) == (task, source)}
-            for task in expected
-        } == expected
-    assert {(t, m) for t, s, m in found if s == "pooled"} == {
-        ("T4 generate", "MMD², free"),
-        ("T4 generate", "pair correlation, free"),
-    }
-    assert {source for _, source, _ in found} == {"a", "b", "pooled"}
+    assert found == card
 
 
 @pytest.mark.slow
@@ -246,46 +194,38 @@ def test_what_is_published_is_the_calibrated_artifact_s():
     """Another default threshold, other alarms; and no more scenes than the limit allows."""
 
     def alarms(threshold, limit=100):
-        calibration = ARTIFACT.calibration.model_copy(
-            update={"outlier_thresholds": Thresholds(medium=threshold)}
-        )
-        rows = evaluate(
-            replace(ARTIFACT, calibration=calibration), DATA, NO_STRUCTURE, TRAIN, limit=limit
-        )
+        limits = {"outlier_thresholds": Thresholds(medium=threshold)}
+        artifact = replace(ARTIFACT, calibration=ARTIFACT.calibration.model_copy(update=limits))
+        rows = evaluate(artifact, DATA, NO_STRUCTURE, TRAIN, limit=limit)
         assert {row.source for row in rows} == {"toy"}
         (row,) = (row for row in rows if row.metric == "alarms in untouched scenes")
         return row.figure
 
-    assert alarms(0.0).value == 1.0
-    assert alarms(1.0).value == 0.0
+    assert (alarms(0.0).value, alarms(1.0).value) == (1.0, 0.0)
     assert (alarms(0.5).n, alarms(0.5, limit=7).n) == (40, 7)
 
 
 def test_completion_has_the_metrics_of_relations():
     """R@k and zero-shot R-precision, of the half that is asked for."""
-    knows = Contender(completion=knowing(DATA))
-    setting = replace(SETTING, seen=SEEN[:0])
-    metrics = TASKS["T1b completion"](knows, setting).metrics
+    completion = TASKS["T1b completion"]
+    knows, ignorant = Contender(completion=knowing(DATA)), Contender(completion=flat)
+    new = replace(SETTING, seen=SEEN[:0])
+    metrics = completion(knows, new).metrics
     assert metrics["R@100"].value == 1.0
     # Nothing was seen: every triple is new.
     assert metrics["R-precision, zero-shot"].n == metrics["R-precision"].n
-    some = TASKS["T1b completion"](knows, SETTING).metrics
+    some = completion(knows, SETTING).metrics
     assert 0 < some["R-precision, zero-shot"].n < some["R-precision"].n
-    ignorant = TASKS["T1b completion"](Contender(completion=flat), setting).metrics
-    recalls = [ignorant[f"R@{k}"].value for k in (20, 50, 100)]
+    recalls = [completion(ignorant, new).metrics[f"R@{k}"].value for k in (20, 50, 100)]
     assert recalls == sorted(recalls)
     assert 0 < recalls[0] < 1
-    unknown = TASKS["T1b completion"](knows, replace(SETTING, seen=None)).metrics
+    unknown = completion(knows, replace(SETTING, seen=None)).metrics
     assert "R-precision, zero-shot" not in unknown
 
 
 def test_a_skill_that_is_undefined_is_left_out(tmp_path, monkeypatch):
     """No answer was true: the calibration error stands, and the report can be written."""
-
-    def never(artifact, scene, rng):
-        return [(0.25, False), (0.5, False)]
-
-    monkeypatch.setitem(QUESTIONS, "missing", never)
+    monkeypatch.setitem(QUESTIONS, "missing", lambda *_: [(0.25, False), (0.5, False)])
     report = measure(tmp_path / "toy.json", CONTENDER, SETTING, "toy", tasks=("Calibration",))
     metrics = report.outcomes["Calibration"].metrics
     assert metrics["ECE, missing"].value == pytest.approx(0.375)
@@ -298,5 +238,4 @@ def test_some_scenes_are_the_same_for_everybody():
     some = some_scenes(DATA, 7)
     assert [s.scene_id for s in some.scenes] == [s.scene_id for s in some_scenes(DATA, 7).scenes]
     assert len(some) == 7
-    assert some_scenes(DATA, None) is DATA
-    assert some_scenes(DATA, 100) is DATA
+    assert some_scenes(DATA, None) is some_scenes(DATA, 100) is DATA

@@ -11,16 +11,15 @@ import torch
 from tests.questions.artifacts import LARGER
 from tests.training.evaluation.scenes import larger_machine, random_scenes, scene, tensors
 from training.batches import relation_units
-from training.evaluation.contenders import Contender
 from training.evaluation.seed_protocol import (
-    SEED_TASKS,
     draw_relations,
     reconstruction_after_addition,
     relations_switched_on,
     removed_switched_on,
     switch_on_probability,
 )
-from training.evaluation.tasks import Setting
+from training.evaluation.setting import Contender, Setting
+from training.evaluation.tasks import SEED_TASKS
 from training.machines.bernoulli import bernoulli
 from training.machines.mean_field import Evidence, mean_field
 

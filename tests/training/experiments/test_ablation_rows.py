@@ -112,8 +112,3 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
 def test_bad_rows_say_what_is_wrong(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message):
         rows(tmp_path, text)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"no ablation .*nowhere.toml"):
-        load_rows(tmp_path / "nowhere.toml", FULL)

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
 from training.cli import app
 from training.config import ConfigError
-from training.evaluation.contenders import Contender
-from training.evaluation.intervals import Figure, paired_difference
-from training.evaluation.metrics import Ratio
-from training.evaluation.tasks import TASKS, Setting
+from training.evaluation.metrics import Figure, Ratio
+from training.evaluation.report import SourceReport
+from training.evaluation.setting import Contender, Outcome, Setting
+from training.evaluation.tasks import TASKS
 from training.experiments.benchmark import (
     QUICK_BASELINES,
     YARDSTICKS,
@@ -26,7 +26,7 @@ from training.experiments.benchmark import (
 )
 from training.experiments.measure import BenchmarkError, Plan, measure_rows
 from training.experiments.plots import read_curve, recall_points
-from training.experiments.results import Cell, Difference, MeanOverSeeds, Results, summarise
+from training.experiments.results import Cell, Difference, Results, summarise
 from training.experiments.rows import Material, Row, baseline_rows
 from training.runs import load_run
 from training.trainer import Trainer
@@ -90,9 +90,9 @@ def results(finished):
 
 def test_every_row_is_measured_and_compared(finished, results):
     assert results["ours"] == "rooms-triway"
-    rows = {cell["row"] for cell in results["cells"]}
-    assert rows == MACHINES | set(QUICK_BASELINES) | REFERENCES
     cells = {(c["row"], c["source"], c["task"], c["metric"]): c["figure"] for c in results["cells"]}
+    assert {row for row, *_ in cells} == MACHINES | set(QUICK_BASELINES) | REFERENCES
+    assert {key[0] for key in cells if key[2] == "T4 generate"} == MACHINES | REFERENCES
     for difference in results["differences"]:
         key = (difference["source"], difference["task"], difference["metric"])
         gap = cells["rooms-triway", *key]["value"] - cells[difference["row"], *key]["value"]
@@ -100,21 +100,17 @@ def test_every_row_is_measured_and_compared(finished, results):
     compared = {(d["row"], d["task"]) for d in results["differences"]}
     assert {("EASE", "T2 missing"), ("rooms-rbm", "T1b completion")} <= compared
     assert "### T2 missing: MRR" in (finished[1] / "results.md").read_text()
-
-
-def test_machines_are_measured_as_they_are_published(results):
-    """Calibrated, with the default alarm, told the room type where the table says so."""
-    found = {(c["row"], c["task"], c["metric"]) for c in results["cells"]}
+    # One source is also the pool.
+    for row in ("EASE", "rooms-triway"):
+        alone, both = (cells[row, x, "T2 missing", "MRR"]["value"] for x in ("rooms", "pooled"))
+        assert alone == pytest.approx(both)
+    # Machines are measured as they are published: calibrated, with the default alarm.
     for row in MACHINES:
-        assert (row, "T3 outliers, uniform", "alarms in untouched scenes") in found
-        assert (row, "T2 missing, room type given", "MRR, room type withheld") in found
+        names = {(task, metric) for name, _, task, metric in cells if name == row}
+        assert ("T3 outliers, uniform", "alarms in untouched scenes") in names
+        assert ("T2 missing, room type given", "MRR, room type withheld") in names
         for question in ("relations", "missing", "outliers", "misplaced"):
-            assert (row, "Calibration", f"Brier skill, {question}") in found
-
-
-def test_references_stand_in_the_tables_of_generation(results):
-    rows = {c["row"] for c in results["cells"] if c["task"] == "T4 generate"}
-    assert rows == MACHINES | REFERENCES
+            assert ("Calibration", f"Brier skill, {question}") in names
 
 
 def test_weights_are_counted(finished, results):
@@ -189,58 +185,29 @@ def test_rows_above_the_yardstick_are_named():
     assert "with the whole interval: no row." in none
 
 
-def test_only_tasks_with_a_yardstick_are_asked_on_shuffled_scenes(tmp_path):
-    code, output = run(write(tmp_path), "--quick", "--shuffled", "--task", "T4", *HERE)
-    assert code == 1
-    assert f"only {', '.join(YARDSTICKS)} are asked" in output
-
-
 def test_plots_lie_beside_the_results(finished):
     names = {path.stem for path in finished[1].glob("*.png") if path.stat().st_size > 5000}
     assert names == {"learning-curves", "recall"} | {
         f"reliability-{machine}" for machine in MACHINES
     }
-
-
-def test_a_curve_is_read_back(finished):
     epochs, values = read_curve(finished[1] / "rooms-triway/seed-0/run/curve.csv", "mrr_validation")
     assert epochs == [1, 2]
     assert all(0 < value <= 1 for value in values)
 
 
-def test_one_source_is_also_the_pool(results):
-    cells = results["cells"]
-    mrr = {
-        (c["row"], c["source"]): c["figure"]["value"]
-        for c in cells
-        if (c["task"], c["metric"]) == ("T2 missing", "MRR")
-    }
-    for row in ("EASE", "rooms-triway"):
-        assert mrr[row, "rooms"] == pytest.approx(mrr[row, "pooled"])
-
-
-def test_the_same_command_computes_nothing_again(finished, monkeypatch):
-    arguments, folder = finished
-    before = (folder / "results.json").read_bytes()
-
-    def trained(*_):
-        raise AssertionError("a finished row was trained again")
-
-    monkeypatch.setattr(Trainer, "run", trained)
-    code, output = run(*arguments)
-    assert code == 0, output
-    assert (folder / "results.json").read_bytes() == before
-
-
-def test_a_lost_report_is_made_again_from_the_finished_run(finished, monkeypatch):
+def test_finished_rows_are_never_trained_again(finished, monkeypatch):
+    """A lost report is made again from the finished run."""
     arguments, folder = finished
     report = folder / "rooms-triway/seed-0/rooms.json"
-    before = json.loads(report.read_text())["tasks"]["T2 missing"]["outcome"]
+    before = [json.loads((folder / "results.json").read_text()), json.loads(report.read_text())]
     report.unlink()
     monkeypatch.setattr(Trainer, "run", None)
     code, output = run(*arguments)
     assert code == 0, output
-    assert json.loads(report.read_text())["tasks"]["T2 missing"]["outcome"] == before
+    after = [json.loads((folder / "results.json").read_text()), json.loads(report.read_text())]
+    assert after[0] == before[0]
+    outcomes = [found["tasks"]["T2 missing"]["outcome"] for found in (before[1], after[1])]
+    assert outcomes[0] == outcomes[1]
 
 
 def test_every_trial_is_kept(finished):
@@ -251,20 +218,12 @@ def test_every_trial_is_kept(finished):
     assert all(np.isfinite(t["validation"]) and t["seconds"] >= 0 for t in trials)
 
 
-def test_reports_of_another_configuration_are_not_gone_on_with(finished, tmp_path):
-    _, folder = finished
-    other = write(tmp_path, epochs=1)
-    arguments = (other, "--folder", str(folder.parent), "--quick", "--baseline", "none", *HERE)
-    code, output = run(*arguments)
-    assert code == 1
-    assert "another configuration of rooms-triway" in output
-
-
 @pytest.mark.parametrize(
     ("others", "message"),
     [
         (("--baseline", "nobody"), "unknown baselines ['nobody']"),
         (("--task", "T9"), "unknown task 'T9'"),
+        (("--shuffled", "--task", "T4"), f"only {', '.join(YARDSTICKS)} are asked"),
     ],
 )
 def test_bad_requests_are_named(tmp_path, others, message):
@@ -305,29 +264,14 @@ def test_workers_find_what_one_process_finds(finished, tmp_path):
         assert ours["outcome"] == theirs["outcome"]
 
 
-def test_a_failing_worker_is_told(tmp_path):
-    broken = tmp_path / "rooms/rooms-triway/seed-0/run/checkpoint.pt"
-    broken.parent.mkdir(parents=True)
-    broken.write_bytes(b"nothing")
-    code, output = run(
-        write(tmp_path), "--folder", str(tmp_path), "--quick", "--baseline", "none", "--workers",
-        "2", "--task", "T2 missing",
-    )  # fmt: skip
-    assert (code, "checkpoint.pt cannot be read" in output) == (1, True)
-
-
-def test_machines_of_one_domain_share_their_scenes(tmp_path):
-    code, output = run(write(tmp_path), write(tmp_path, variant="rbm", rooms=50), "--quick")
-    assert code == 1
-    assert "different data sections" in output
-
-
-def test_configurations_of_one_data_section_are_a_domain():
+def test_configurations_of_one_data_section_are_a_domain(tmp_path):
     found = read_domains(["indoor-rbm", "open-triway", "indoor-triway"])
     assert [domain.name for domain in found] == ["indoor", "open"]
     assert [config.name for config in found[0].configs] == ["indoor-rbm", "indoor-triway"]
     with pytest.raises(ConfigError, match="two configurations are called indoor-rbm"):
         read_domains(["indoor-rbm", "indoor-rbm"])
+    with pytest.raises(ConfigError, match="different data sections"):
+        read_domains([write(tmp_path), write(tmp_path, variant="rbm", rooms=50)])
 
 
 def test_the_default_domains_begin_with_their_triway_machine():
@@ -369,27 +313,6 @@ def test_recall_curves_follow_the_figures():
     assert found == {"a": [(1, 0.2), (10, 0.5)], "b": [(1, 0.4)]}
 
 
-def ratio(values):
-    return Ratio(np.array(values, dtype=np.float64), np.ones(len(values)))
-
-
-def test_a_mean_over_seeds_is_resampled_scene_by_scene():
-    a, b = ratio([0.0, 1.0, 1.0, 0.0]), ratio([1.0, 1.0, 0.0, 0.0])
-    mean = MeanOverSeeds([a, b])
-    together = ratio([0.5, 1.0, 0.5, 0.0])
-    assert mean.value == together.value
-    np.testing.assert_allclose(mean.draws(), together.draws())
-    difference = paired_difference(mean, together)
-    assert (difference.low, difference.high) == pytest.approx((0.0, 0.0))
-
-
-def test_a_mean_over_seeds_needs_the_same_scenes():
-    with pytest.raises(ValueError, match="different numbers of scenes"):
-        MeanOverSeeds([ratio([1.0]), ratio([1.0, 0.0])])
-    with pytest.raises(ValueError, match="at least one"):
-        MeanOverSeeds([])
-
-
 def test_a_summary_needs_our_row():
     with pytest.raises(ValueError, match="no report of ours"):
         summarise({}, "ours")
@@ -421,24 +344,26 @@ def _plan(folder, material="these scenes"):
     return Plan(folder, Material(None, None, material), settings, ["T2 missing"])
 
 
-def test_a_changed_row_is_refused(tmp_path):
-    first, second = (Row("row", 0, name, lambda *_: lambda _: Contender()) for name in "12")
-    measure_rows(_plan(tmp_path), [first], print)
+def test_a_folder_of_another_row_or_other_scenes_is_refused(tmp_path):
+    def row(identity):
+        return Row("row", 0, identity, lambda *_: lambda _: Contender())
+
+    measure_rows(_plan(tmp_path), [row("1")], print)
     with pytest.raises(BenchmarkError, match="another configuration of row"):
-        measure_rows(_plan(tmp_path), [second], print)
-
-
-def test_a_row_that_learnt_from_other_scenes_is_refused(tmp_path):
-    entry = Row("row", 0, "row", lambda *_: lambda _: Contender())
-    measure_rows(_plan(tmp_path), [entry], print)
+        measure_rows(_plan(tmp_path), [row("2")], print)
     with pytest.raises(BenchmarkError, match="learnt from other scenes"):
-        measure_rows(_plan(tmp_path, "other scenes"), [entry], print)
-
-
-def test_a_folder_that_does_not_say_what_it_learnt_from_is_refused(tmp_path):
-    entry = Row("row", 0, "row", lambda *_: lambda _: Contender())
-    place = tmp_path / "row/seed-0"
-    place.mkdir(parents=True)
-    (place / "row.json").write_text(json.dumps({"identity": "row"}))
+        measure_rows(_plan(tmp_path, "other scenes"), [row("1")], print)
+    # Nor one that does not say what it learnt from.
+    (tmp_path / "row/seed-0/row.json").write_text(json.dumps({"identity": "1"}))
     with pytest.raises(BenchmarkError, match="learnt from other scenes"):
-        measure_rows(_plan(tmp_path), [entry], print)
+        measure_rows(_plan(tmp_path), [row("1")], print)
+
+
+def test_rows_that_answered_in_other_sources_are_not_paired():
+    """A metric that one row has on two sources, and another row on one of them."""
+    both, one = Ratio.of_scenes(np.ones(4)), Ratio.of_scenes(np.ones(2))
+    reports = {
+        (name, 0): {"pooled": SourceReport("pooled", "", {"T2": Outcome({"MRR": metric}, 4, 0)})}
+        for name, metric in (("ours", both), ("other", one))
+    }
+    assert summarise(reports, "ours").differences == ()

@@ -9,7 +9,7 @@ import pytest
 
 from app.registry import Store
 from tests.http.stores import corrupt, make_store
-from training.evaluation.intervals import Figure
+from training.evaluation.metrics import Figure
 from training.experiments import gate
 from training.experiments.compare import RELATIONAL, Comparison, unmeasured
 from training.experiments.gate import WorseError, seat

@@ -6,11 +6,11 @@ import pytest
 
 from training.config import Config, ConfigError
 from training.datasets import generate_rooms, split, stable_part
-from training.experiments.heldout import held_out
-from training.experiments.sides import Side, baseline_side
+from training.experiments.sides import BASELINE_SIDE, Side, held_out
 from training.pipeline import digest_of
 
 SCENES = {"rooms": generate_rooms(500, 0)}
+BASELINES = Side(BASELINE_SIDE, None, {}, None)
 LEARNT = {"rooms": digest_of(SCENES["rooms"])}
 
 
@@ -99,9 +99,9 @@ def test_a_model_of_other_sources_has_seen_nothing(tmp_path) -> None:
     )
     assert found.certain
     assert any("other sources (kitchens)" in note for note in found.notes)
-    assert held_out(side("a"), baseline_side(), SCENES, tmp_path).certain
+    assert held_out(side("a"), BASELINES, SCENES, tmp_path).certain
 
 
 def test_who_does_not_say_what_was_held_out_cannot_come_first(tmp_path) -> None:
     with pytest.raises(ConfigError, match="does not say how its scenes were split"):
-        held_out(baseline_side(), side("b"), SCENES, tmp_path)
+        held_out(BASELINES, side("b"), SCENES, tmp_path)

@@ -73,21 +73,6 @@ def rows_of(results):
 ONE_TASK = ("--task", "T2 missing", "--baseline", "popularity")
 
 
-@pytest.mark.slow
-def test_a_baseline_of_a_corrected_file_is_not_gone_on_with(tmp_path):
-    write_scenes(tmp_path, "flats")
-    code, output = run(*arguments(tmp_path, *ONE_TASK))
-    assert code == 0, output
-    code, output = run(*arguments(tmp_path, *ONE_TASK))
-    assert code == 0, output
-    write_scenes(tmp_path, "flats", seed=1)
-    code, output = run(*arguments(tmp_path, *ONE_TASK))
-    assert code == 1
-    assert "learnt from other scenes than these" in output
-    code, output = run(*arguments(tmp_path, *ONE_TASK, "--fresh"))
-    assert code == 0, output
-
-
 def material(folder, **settings):
     data = DataConfig(**{"sources": ("flats",), "vocabulary": "source"} | settings)
     return split_and_encode(data, read_sources(data, folder))

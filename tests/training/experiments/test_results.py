@@ -9,8 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from training.cli import app
-from training.evaluation.intervals import Figure
-from training.evaluation.metrics import Ratio
+from training.evaluation.metrics import Figure, Ratio
 from training.evaluation.report import SourceReport
 from training.evaluation.setting import Outcome
 from training.experiments.results import Asked, Cell, Difference, Results, remarks, summarise

@@ -8,7 +8,7 @@ import torch
 from app.scene import ObjectClass, Vocabulary
 from training.batches import Batch
 from training.evaluation.contenders import artifact_contender
-from training.evaluation.placed import Places
+from training.evaluation.missing import Places
 from training.experiments.translation import BEYOND, Translation, same_classes
 from training.machines import MachineSpec, build
 from training.publish import draft_artifact

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.training.evaluation.scenes import NO_STRUCTURE, scene, tensors
-from training.evaluation.contenders import Contender
-from training.evaluation.setting import Setting
+from training.evaluation.setting import Contender, Setting
 from training.experiments.measure import Plan, measure_rows, place_of
 from training.experiments.rows import Material, Row
 
