@@ -59,8 +59,9 @@ def to_log_odds(mean: Floats, spread: Floats) -> Floats:
     u = e^-|mean| and q = e^spread they are u/(1 + u), uq/(1 + uq) and u/(q + u), and nothing can
     overflow. Wider ones by the trapezoidal rule, for any σ up to 10 and more.
     """
-    found = mean.reshape(-1).astype(np.float32)
-    kernels.log_odds(found, spread.reshape(-1), NO_UNIT)
+    found = mean.ravel().astype(np.float32)
+    # Contiguous: for another layout the loop would be compiled again.
+    kernels.log_odds(found, spread.ravel(), NO_UNIT)
     return found.reshape(mean.shape)
 
 
