@@ -101,9 +101,9 @@ def generate(
         stream = random_stream(seed, len(scenes))
         for attempt in range(ATTEMPTS):
             drawn = conditioned.draw(steps, stream)
-            found = _scene(artifact, conditioned, drawn, shown[drawn.classes], given)
-            if plausible(found.objects) or stop() or attempt == ATTEMPTS - 1:
-                scenes.append(found)
+            seen = shown[drawn.classes]
+            if plausible(drawn.classes[seen].tolist()) or stop() or attempt == ATTEMPTS - 1:
+                scenes.append(_scene(artifact, conditioned, drawn, seen, given))
                 break
     return tuple(scenes)
 
@@ -257,22 +257,18 @@ class Plausible:
         if smallest:
             self._least = smallest[-1 if scene.room_type is None else scene.room_type]
 
-    def __call__(self, labels: Sequence[str]) -> bool:
+    def __call__(self, classes: list[int]) -> bool:
         """Whether a drawn scene of these classes is one."""
-        if len(labels) < self._least:
+        if len(classes) < self._least or not self._suits_room(classes):
             return False
-        index = self._artifact.vocabulary.index
-        objects = tuple([SceneObject(label, label, index(label)) for label in labels])
-        classes = [thing.class_index for thing in objects if thing.class_index is not None]
-        if not self._suits_room(classes):
-            return False
-        judged = Scene(objects, room_type=self._room)
+        labels = self._artifact.vocabulary.labels
+        objects = [SceneObject(labels[index], labels[index], index) for index in classes]
+        judged = Scene(tuple(objects), room_type=self._room)
         # A drawn scene is whole, however few its classes are.
         whole = self._artifact.calibration.outlier_thresholds.medium
         found = outliers(self._artifact, judged, threshold=whole, details=False).outliers
         return not any(
-            entry.is_outlier and objects[entry.object].class_index not in self._given
-            for entry in found
+            entry.is_outlier and classes[entry.object] not in self._given for entry in found
         )
 
     def _suits_room(self, classes: list[int]) -> bool:
