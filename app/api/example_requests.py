@@ -1,7 +1,7 @@
 """Worked example requests for the documentation: every case of every route that takes a body.
 
 They are asked of the service as they stand, by whoever presses a button in /docs and by the tests;
-the labels are known to every shipped model. An example names the problem that it meets, if any.
+the default model knows the labels. An example names the problem that it meets, if any.
 """
 
 from __future__ import annotations
