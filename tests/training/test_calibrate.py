@@ -28,6 +28,7 @@ from training.calibrate_objects import (
     least_of_the_best,
     listing,
     popularity,
+    smallest_scenes,
 )
 from training.cases import altered_case
 from training.config import ObjectsConfig
@@ -105,6 +106,17 @@ def test_scenes_count_by_weight_and_incomplete_ones_not_at_all():
     assert first.count(0) == 20
     assert first.count(2) == 0
     assert 60 <= first.count(4) <= 140
+
+
+def test_the_smallest_scenes_are_those_of_their_room_type():
+    """Of a type of 20 scenes its own size, of fewer that of all; structure does not count."""
+    large, small = scene([0, 1, 2, 3, 4], room=0), scene([1, 2, 3], room=1)
+    data = tensors([large] * 20 + [small] * 19, WIDE)
+    structure = torch.zeros(data.v.shape[1], dtype=torch.bool)
+    assert smallest_scenes(data, structure, 3) == (5, 3, 3, 3)
+    structure[0] = True
+    assert smallest_scenes(data, structure, 2) == (4, 3, 3)
+    assert smallest_scenes(tensors([large] * 20 + [small], WIDE), structure, 2) == (4, 4, 4)
 
 
 def test_popularity_is_the_log_odds_of_a_class_in_a_complete_scene():
