@@ -33,9 +33,8 @@ def main() -> int:
     return serve(settings, began)
 
 
-# Containers made until the collector looks at the youngest. An answer is some two hundred, all of
-# them freed by their counts of references: to look every 700, as is usual, takes 4 to 8 % of a
-# request's time.
+# Threshold of the garbage collector's youngest generation. An answer has some two hundred
+# containers, all freed by reference counts. The default of 700 costs 4 to 8 % of a request's time.
 _YOUNG = 10_000
 
 

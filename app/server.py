@@ -33,8 +33,8 @@ _logger = logging.getLogger("app.server")
 class Server(uvicorn.Server):
     """Ends in three steps on SIGTERM.
 
-    First new requests are refused, readiness is off, and streams are closed. After
-    ``drain_seconds``, in which a load balancer may notice, the listening socket is closed. Then
+    First new requests are refused, readiness is off, and streams are closed. The listening socket
+    closes after ``drain_seconds``. In this time a load balancer sees that readiness is off. Then
     requests in progress are finished. A second signal, or Ctrl-C, skips the first step.
 
     Args:

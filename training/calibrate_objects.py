@@ -397,7 +397,8 @@ def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds
 def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
     """The alpha of the best mean of hit@1 and share caught, over kinds of intruders.
 
-    Uniform intruders lose at most .04 of hit@1 and .06 of the share caught.
+    An alpha is allowed if uniform intruders lose at most .04 of hit@1 and .06 of the share caught,
+    against alpha 0.
     """
     found = {
         alpha: {name: _found(scores.with_prior(alpha * prior)) for name, scores in kinds.items()}

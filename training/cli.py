@@ -138,8 +138,8 @@ def publish(
 
     With --promote it is compared first with what the alias serves, on test scenes that neither has
     learnt from. Where a primary metric is worse by more than the margin (the whole 95 % interval of
-    the paired difference), nothing is published, and the exit code is 3. So it is where nothing
-    shows how it does at relations, and what the alias serves was measured at them.
+    the paired difference), nothing is published, and the exit code is 3. The exit code is also 3 if
+    the new version has no measurements of relations and the served version has them.
     """
     try:
         run = load_run(folder)

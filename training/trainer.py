@@ -383,7 +383,7 @@ class Trainer:
         if not self.epochs:
             return
         write_csv(self.folder / "curve.csv", self.epochs)
-        # Drawing takes longer than an epoch on few scenes does.
+        # A plot takes longer than an epoch on few scenes.
         if time.perf_counter() - self._drawn > _DRAWN_EVERY:
             self._draw()
 

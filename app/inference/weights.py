@@ -109,7 +109,7 @@ class Weights:
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:
-    """Presence (N, V) of scenes as bits, (N, words)."""
+    """Unpack scenes as bits, (N, words), into the presence of classes, (N, V)."""
     octets = packed.astype("<i4").view(np.uint8).reshape(len(packed), -1)
     bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
     return bits.astype(np.float32)

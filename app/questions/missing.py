@@ -128,7 +128,7 @@ def _at_place(
     listed: int,
     top_k: int,
 ) -> NDArray[np.floating[Any]]:
-    """Logits of p(there) · p(stands so | there) of the best `top_k` candidates at least, (N,).
+    """Logits of p(there) · p(stands so | there), (N,), for at least the best `top_k` candidates.
 
     Candidates are asked in blocks, the likeliest to be there first. A product is never above its
     first factor: once the next candidate is less likely to be there than `top_k` others are at the

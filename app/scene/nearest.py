@@ -116,9 +116,8 @@ def _in_common(words: Sequence[str], known: Sequence[str], *, is_only: bool) -> 
     """How much of a name with the same head is shared.
 
     A name that says more than a known one is a kind of it; one that says less may be another kind.
-    Where several entries have names with this head, the head alone does not tell which is meant: of
-    held-out aliases 86 % belong to the only such entry, and 59 % to the one that the head alone
-    names.
+    A head word is ambiguous if several entries share it. If one entry has it, 86 % of held-out
+    aliases belong to that entry. If several have it, 59 % belong to the entry of that name.
 
     Args:
         is_only: no other entry has a name with this head.

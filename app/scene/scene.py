@@ -62,8 +62,8 @@ class Scene:
         relations_complete: relations missing from ``relations`` do not hold.
         room_type: index of the room type in the model's vocabulary; None if unknown.
         poses: relations derived from poses (see `app.scene.observe`), which also say what was seen
-            *not* to hold. They take the place of ``relations`` as evidence, and ``relations`` are
-            then taken to be what they hold, which needs no check.
+            *not* to hold. They replace ``relations`` as evidence. ``relations`` must list those
+            that hold, which is not checked.
 
     Raises:
         ValueError: two things with one id, a triple that points nowhere, joins a thing to itself or

@@ -325,7 +325,7 @@ class WorkQueue:
         came = monotonic()
 
         def measured(_: Callable[[], bool] | None = None) -> Done[T]:
-            # Measured here: the request of work that took too long may have ended.
+            # Measured here: after a timeout the request may have ended already.
             began, busy = monotonic(), thread_time()
             result = call()
             done = Done(result, began - came, monotonic() - began, thread_time() - busy)

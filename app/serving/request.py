@@ -27,7 +27,7 @@ SUCCESS: Final = "success"
 
 @dataclass(slots=True)
 class Record:
-    """What becomes known about a request; read once, when its response has been sent.
+    """Values of a request for log and metrics, read when its response has been sent.
 
     Attributes:
         outcome: `SUCCESS`, or the name of the problem it was answered with.

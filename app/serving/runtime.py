@@ -163,7 +163,7 @@ class Runtime:
         self.models.resolve(DEFAULT)
 
     def drain(self) -> None:
-        """Begin nothing new, and be not ready, from now on."""
+        """Refuse new requests and turn readiness off."""
         self.backlog.draining = True
 
     async def start(self) -> None:

@@ -93,7 +93,7 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
 def annotated_classes(
     scenes: Sequence[EncodedScene], vocabulary: Vocabulary
 ) -> dict[str, NDArray[np.bool_]]:
-    """Per source, (V,) the classes whose absence from a scene means something.
+    """Per source, (V,) the annotated classes: without the label the object is absent.
 
     These are the classes that the source ever mentions, or all of them in a source of open
     vocabulary, less those it leaves out. Initial biases are frequencies over the sources that

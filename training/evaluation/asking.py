@@ -1,8 +1,8 @@
 """Questions put to a score or to `app.questions`, as a robot puts them; the answers as columns.
 
 A sample of the cases is asked once more in another order: an answer that follows the order of the
-questions knows more than its scene, and the evaluation stops. (A model that recognises a scene by
-the objects that are left has seen it before: against that stand the splits by group.)
+questions knows more than its scene, and the evaluation stops. This check does not detect memorised
+scenes. Splits by group keep near-duplicates of test scenes out of training.
 """
 
 from __future__ import annotations

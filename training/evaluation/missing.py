@@ -228,7 +228,7 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
     if not len(partial.v):
         raise ValueError("no scene has two classes, one to show and one to hide")
     values = ask_rows(score, partial.v)
-    # The least a candidate can have: what was given no probability at all stays a candidate.
+    # A candidate of probability 0 stays a candidate: -inf marks classes that are none.
     values = values.clamp(min=torch.finfo(values.dtype).min)
     values = values.masked_fill((partial.v > 0) | structure, -torch.inf)
     row, target = partial.hidden.nonzero(as_tuple=True)

@@ -1,8 +1,8 @@
 """Reconstruction error of objects and of relations, separately: the seed paper's training curve.
 
 One deterministic up–down pass: the context's mean given the scene (relations observed where
-annotated), then p(v | h1) and p(r | v, h1). The error is the mean absolute difference per class,
-and per observed relation unit that may be on.
+annotated), then p(v | h1) and p(r | v, h1). The error of objects is the mean absolute difference
+over classes. That of relations is the same over observed units between present objects.
 """
 
 from __future__ import annotations

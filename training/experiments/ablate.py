@@ -166,7 +166,7 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
 def _costs(
     folder: Path, configs: Sequence[Config], seeds: int
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Trained weights by row, those held at zero left out, and mean seconds of training."""
+    """Number of trained weights by row, without those fixed at zero, and mean seconds."""
     weights, seconds = {}, {}
     for config in configs:
         places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]

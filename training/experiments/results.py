@@ -74,7 +74,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Asked:
-    """The size of one task for one row and seed.
+    """Number of scored and skipped scenes of one task, for one row and seed.
 
     Attributes:
         row, seed, task, source: its place in the tables.

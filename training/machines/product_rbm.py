@@ -3,8 +3,8 @@
     E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
     U_t = P[a] + sum_k S[i,k] M[a,k] O[j,k]
 
-for t = (a,i,j) among the triples seen in training. Relations are not gated, as in the RBM; pairs
-that are alike share what they say of the context, as in the Triway. A rival for comparisons.
+for t = (a,i,j) among the triples seen in training. Relations are ungated, as in the RBM.
+Their context weights share the factors S, O, M and P, as in the Triway. A rival for comparisons.
 """
 
 from __future__ import annotations

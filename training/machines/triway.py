@@ -31,8 +31,8 @@ never r_e itself:
 Forms: `seed` is the energy above (with a compensating offset κ_a per active unit, 0 in the paper);
 `local` adds softplus(ℓ_e) for every active unit.
 
-Source of the implications: Mnih, Larochelle and Hinton, "Conditional restricted Boltzmann machines
-for structured output prediction" (2011), for observed units as conditions.
+The implications follow Mnih, Larochelle and Hinton, "Conditional restricted Boltzmann machines for
+structured output prediction" (2011), who condition on observed units.
 """
 
 from __future__ import annotations

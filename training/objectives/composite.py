@@ -177,7 +177,7 @@ class CompositeLikelihood(Objective):
         masked: Masked,
         generator: torch.Generator,
     ) -> Tensor:
-        """Log-odds of all classes given the rest, its relations unobserved, (B, V)."""
+        """Log-odds of each class given the other classes, relations unobserved, (B, V)."""
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
             drop = torch.rand(v.shape, generator=generator) < self.config.structure_dropout

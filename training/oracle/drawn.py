@@ -99,8 +99,8 @@ class DrawnPosterior:
 
             p(r_e = 1 | rest) = E[ sigmoid(ℓ_e(h1) + x_e) ],   h1 from p(h1 | rest)
 
-        with x_e what the observed relations imply for e. The draws are made given all that is
-        observed. An observed unit is taken out of the evidence by reweighting them:
+        with x_e what the observed relations imply for e. Samples of h1 are conditioned on the
+        observed objects and relations. Reweighting takes an observed unit out of the evidence:
         w ← w / p(r_e | v, h1). A relation without a unit has log-odds `NO_UNIT`.
         """
         between = self._between
