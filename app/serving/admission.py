@@ -122,7 +122,8 @@ class Backlog:
         now = monotonic()
         if self._begun and self._ticking:
             took = (now - self._began_at) / self._begun
-            self._seconds += _NEWEST_PACE * (took - self._seconds)
+            share = _NEWEST_PACE if self._seconds else 1.0
+            self._seconds += share * (took - self._seconds)
         self._began_at = now
         fit = int(TICK / self._seconds) if PACE * self._seconds > TICK else PACE
         self._places = max(0, max(1, fit) - self.pending)
