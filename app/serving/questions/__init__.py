@@ -1,4 +1,4 @@
-"""The four questions: a request in, a scene to the model, an answer as JSON has it out.
+"""The four questions: each reads a request, asks the model about the scene, and returns the answer.
 
 Each raises:
     RequestError, UnknownModelError, ModelUnavailableError: see `Request.read`.
