@@ -1,8 +1,8 @@
 """Admission control: which requests begin when, and where the work of each model runs.
 
 `Backlog` bounds the requests that wait to be read. In a tick of the event loop it starts so many as
-lately took `TICK` together, at most `PACE` less those whose work is still pending, and refuses at
-most `REFUSALS`. Without it hundreds of simultaneous requests would hold up the event loop, and
+lately took `TICK` together, never more than `PACE` less those whose work is still pending, and
+refuses at most `REFUSALS`. Without it hundreds of simultaneous requests would hold up the event loop, and
 health checks with it. A request is refused when the backlog is full, when it would spend much of
 its time waiting, and when its deadline has passed.
 
@@ -125,8 +125,8 @@ class Backlog:
             share = _NEWEST_PACE if self._seconds else 1.0
             self._seconds += share * (took - self._seconds)
         self._began_at = now
-        fit = int(TICK / self._seconds) if PACE * self._seconds > TICK else PACE
-        self._places = max(0, max(1, fit) - self.pending)
+        fit = max(1, int(TICK / self._seconds)) if PACE * self._seconds > TICK else PACE
+        self._places = max(0, min(fit, PACE - self.pending))
         begun = self._begun = _wake(self._waiting, self._places) if self._waiting else 0
         self._places -= begun
         if begun or self._moved_at is not None or self._waiting:

@@ -415,6 +415,23 @@ async def test_slow_requests_begin_fewer_in_a_tick() -> None:
     assert max(steps[len(steps) // 2 :]) <= TICK / 1e-3 + 1
 
 
+async def test_slow_requests_begin_beside_work_of_another_model() -> None:
+    """Eight requests fill a tick here, and as many questions are pending already."""
+    backlog = Backlog(1000)
+    backlog.pending = int(TICK / 1e-3)
+
+    async def request() -> str:
+        outcome = await enter(backlog, [])
+        end = thread_time() + 1e-3
+        while thread_time() < end:
+            pass
+        return outcome
+
+    for _ in range(3):
+        requests = (request() for _ in range(20))
+        assert await asyncio.wait_for(asyncio.gather(*requests), 5) == ["begun"] * 20
+
+
 async def test_no_more_requests_begin_than_the_models_keep_up_with() -> None:
     backlog = Backlog(1000)
     begun: list[str] = []
