@@ -16,22 +16,11 @@ from app.api.body import JSONRoute
 from app.api.openapi import operation_id, queued
 from app.api.problems import from_exception, report_defect, unfit
 from app.api.questions import begin
-from app.serving import questions
-from app.serving import request as serving
-from app.serving.answers import Answer, written
+from app.serving.answers import written
 from app.serving.models import DEFAULT
+from app.serving.questions import QUESTIONS, Question
 from app.serving.request import SUCCESS
-from scene_client.schemas import (
-    BatchAnswer,
-    BatchRequest,
-    MissingAnswer,
-    MissingRequest,
-    OutliersAnswer,
-    OutliersRequest,
-    RelationsAnswer,
-    RelationsRequest,
-    SceneRequest,
-)
+from scene_client.schemas import MAX_BATCH, BatchAnswer, BatchRequest, SceneRequest
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
 
@@ -56,13 +45,12 @@ router = APIRouter(
 async def _answer_each(
     http: Request,
     batch: BatchRequest[RequestT],
-    kind: type[RequestT],
-    question: Callable[[serving.Request, RequestT], Awaitable[Answer]],
+    question: Question[RequestT],
 ) -> bytes:
     request = begin(http)
 
     def count(outcome: str) -> None:
-        request.metrics.entry_answered(question.__name__, outcome)
+        request.metrics.entry_answered(question.name, outcome)
 
     results: list[bytes] = []
     left = request.limits.answer_bytes
@@ -71,7 +59,9 @@ async def _answer_each(
             try:
                 held.check()
                 one = held.with_answer_bytes(left)
-                answer = written(await question(one, _validated(scene, place, kind)))
+                answer = written(
+                    await question.answer(one, _validated(scene, place, question.request))
+                )
                 results.append(b'{"status":200,"result":%b}' % answer)
                 count(SUCCESS)
             except Exception as error:  # noqa: BLE001 — a defect too spoils one entry only
@@ -111,31 +101,26 @@ def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
         raise unfit(error, scene, at=("scenes", place)) from None
 
 
-@router.post(
-    "/relations/batch",
-    summary="Relations of many scenes",
-    response_model=BatchAnswer[RelationsAnswer],
-)
-async def relations_batch(asked: BatchRequest[RelationsRequest], http: Request) -> bytes:
-    """As `POST /relations`, for up to 256 scenes."""
-    return await _answer_each(http, asked, RelationsRequest, questions.relations)
+def _answering(question: Question[Any]) -> Callable[..., Awaitable[bytes]]:
+    """The function of a route."""
+
+    async def answer(asked: Any, http: Request) -> bytes:
+        return await _answer_each(http, asked, question)
+
+    # The framework reads the schema of the body here.
+    form = BatchRequest[question.request]  # type: ignore[name-defined]
+    answer.__annotations__ |= {"asked": form, "http": Request}
+    return answer
 
 
-@router.post(
-    "/missing/batch",
-    summary="Missing objects of many scenes",
-    response_model=BatchAnswer[MissingAnswer],
-)
-async def missing_batch(asked: BatchRequest[MissingRequest], http: Request) -> bytes:
-    """As `POST /missing`, for up to 256 scenes."""
-    return await _answer_each(http, asked, MissingRequest, questions.missing)
-
-
-@router.post(
-    "/outliers/batch",
-    summary="Outliers of many scenes",
-    response_model=BatchAnswer[OutliersAnswer],
-)
-async def outliers_batch(asked: BatchRequest[OutliersRequest], http: Request) -> bytes:
-    """As `POST /outliers`, for up to 256 scenes."""
-    return await _answer_each(http, asked, OutliersRequest, questions.outliers)
+for _question in QUESTIONS:
+    if _question.has_batch:
+        router.add_api_route(
+            f"/{_question.name}/batch",
+            _answering(_question),
+            methods=["POST"],
+            name=f"{_question.name}_batch",
+            summary=f"POST /{_question.name} for many scenes",
+            description=f"As `POST /{_question.name}`, for up to {MAX_BATCH} scenes.",
+            response_model=BatchAnswer[_question.response],  # type: ignore[name-defined]
+        )

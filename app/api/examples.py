@@ -1,11 +1,15 @@
-"""Worked examples for the documentation: an answer of every operation. The figures illustrate.
+"""Worked examples for the documentation: requests and an answer of each operation, by its id.
 
-Requests are in `example_requests`.
+The documentation page sends the requests as they stand, and so do the tests. The figures of the
+answers illustrate. The examples of a question stand in its module of `app.serving.questions`.
 """
 
 from __future__ import annotations
 
 from typing import Any, Final
+
+from app.serving.questions import QUESTIONS
+from app.serving.questions.question import BATCH, Example
 
 _ID: Final = "0b0f5b1e-6b1f-4a52-9d5c-3f7a2f1f6c11"
 _MODEL: Final = {
@@ -28,103 +32,6 @@ _UNKNOWN: Final = {
             "pointer": "#/scenes/1/objects/1",
             "message": "the model does not know this label",
             "suggestions": ["nightstand"],
-        }
-    ],
-}
-_RELATIONS: Final = _ENVELOPE | {
-    "relations": [
-        {
-            "subject": "lamp_1",
-            "relation": "on-top",
-            "object": "nightstand_1",
-            "probability": 0.83,
-            "observed": True,
-        },
-        {
-            "subject": "nightstand_1",
-            "relation": "left",
-            "object": "bed",
-            "probability": 0.41,
-            "observed": False,
-        },
-    ],
-    "disagreements": [
-        {
-            "subject": "lamp_1",
-            "object": "bed",
-            "observed": ["on-top"],
-            "expected": "left",
-            "probability": 0.36,
-            "observed_probability": 0.02,
-        }
-    ],
-}
-_MISSING: Final = _ENVELOPE | {
-    "coverage": 0.5,
-    "missing": [
-        {
-            "label": "pillow",
-            "probability": 0.46,
-            "log_odds": 1.9,
-            "placements": [
-                {
-                    "relation": "on-top",
-                    "object": "bed",
-                    "probability": 0.91,
-                    "offset": {
-                        "mean": {"x": 0.005, "y": 0.012, "z": 0.421},
-                        "std": {"x": 0.466, "y": 0.491, "z": 0.242},
-                        "scenes": 1089,
-                    },
-                }
-            ],
-            "because": [
-                {"object": "bed", "log_odds_change": 1.7},
-                {"object": "lamp_1", "log_odds_change": -0.2},
-            ],
-        }
-    ],
-}
-_OUTLIERS: Final = _ENVELOPE | {
-    "threshold": 0.7,
-    "outliers": [
-        {
-            "object": "toilet",
-            "label": "toilet",
-            "probability": 0.94,
-            "log_odds": -5.2,
-            "is_outlier": True,
-            "because": [{"object": "bed", "log_odds_change": -2.7}],
-            "usually_with": ["toilet paper", "sink", "faucet"],
-        },
-        {
-            "object": "bed",
-            "label": "bed",
-            "probability": 0.03,
-            "log_odds": 2.4,
-            "is_outlier": False,
-            "because": [{"object": "lamp_1", "log_odds_change": 0.9}],
-            "usually_with": [],
-        },
-    ],
-    "misplaced": [
-        {
-            "subject": "lamp_1",
-            "relation": "on-top",
-            "object": "nightstand_1",
-            "probability": 0.05,
-            "is_misplaced": False,
-        }
-    ],
-}
-_GENERATED: Final = _ENVELOPE | {
-    "seed": 7,
-    "scenes": [
-        {
-            "objects": ["bed", "nightstand", "lamp"],
-            "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
-            "log_score": -6.1,
-            "context": {"h1": [3, 17]},
         }
     ],
 }
@@ -155,14 +62,29 @@ def _batch(result: dict[str, Any]) -> dict[str, Any]:
     return {"request_id": _ID, "results": entries}
 
 
+REQUESTS: Final[dict[str, dict[str, Example]]] = {
+    **{question.name: dict(question.examples) for question in QUESTIONS},
+    **{f"{question.name}_batch": BATCH for question in QUESTIONS if question.has_batch},
+    "move_alias": {
+        "promote": Example("to a version", {"model": "home@1.1.0"}),
+        "guarded": Example(
+            "only if it leads where it led when I looked",
+            {"model": "home@1.1.0", "expected": "home@1.0.0"},
+        ),
+        "create": Example(
+            "a new one, which must not exist", {"model": "home@1.0.0", "expected": None}
+        ),
+        "model-not-found": Example(
+            "to a model that is not there", {"model": "nobody@9.9.9"}, "model-not-found"
+        ),
+    },
+}
+_OF_QUESTIONS: Final = {
+    question.name: {**_ENVELOPE, **question.example_answer} for question in QUESTIONS
+}
 ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
-    "relations": _RELATIONS,
-    "missing": _MISSING,
-    "outliers": _OUTLIERS,
-    "generate": _GENERATED,
-    "relations_batch": _batch(_RELATIONS),
-    "missing_batch": _batch(_MISSING),
-    "outliers_batch": _batch(_OUTLIERS),
+    **_OF_QUESTIONS,
+    **{f"{name}_batch": _batch(answer) for name, answer in _OF_QUESTIONS.items()},
     "list_models": {
         "generation": "3f6d0f4be1a25c77",
         "models": [_SUMMARY],

@@ -9,9 +9,9 @@ from fastapi.routing import APIRoute
 
 from app.api import catalogue, examples
 from app.api.catalogue import ProblemType
-from app.api.example_requests import REQUESTS
 from app.api.gateway import API_KEY, HEALTH, OPEN_ROUTES, TIMEOUT_HEADER
 from app.api.problems import MEDIA_TYPE, ProblemError
+from app.serving.questions.question import Example
 from scene_client.schemas import MAX_SEED, FieldError, Problem
 
 Responses = dict[int | str, dict[str, Any]]
@@ -86,6 +86,18 @@ def queued(*kinds: ProblemType) -> Responses:
     )
 
 
+def described(example: Example) -> dict[str, Any]:
+    """An example request as an Example Object."""
+    if example.problem is None:
+        return {"summary": example.summary, "value": example.value}
+    problem = catalogue.PROBLEM_TYPES[example.problem]
+    return {
+        "summary": f"{example.summary}: {problem.status}",
+        "description": f"Refused: {problem.title} (`{problem.uri}`).",
+        "value": example.value,
+    }
+
+
 def operation_id(route: APIRoute) -> str:
     """The name of the route's function: generated clients call the operation by it."""
     return route.name
@@ -122,8 +134,8 @@ class DocumentedAPI(FastAPI):
                     ok["example"] = examples.ANSWERS[operation["operationId"]]
                     if "requestBody" in operation:
                         (body,) = operation["requestBody"]["content"].values()
-                        cases = REQUESTS[operation["operationId"]].items()
-                        body["examples"] = {name: case.describe() for name, case in cases}
+                        cases = examples.REQUESTS[operation["operationId"]].items()
+                        body["examples"] = {name: described(case) for name, case in cases}
                     if "504" in operation["responses"]:
                         operation.setdefault("parameters", []).append(timeout)
                     content = operation["responses"].get("422", {}).get("content", {})

@@ -1,8 +1,9 @@
-"""The four questions about one scene."""
+"""Routes of the questions about one scene: one `POST` for each entry of `QUESTIONS`."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
 
 from fastapi import APIRouter
 from starlette.requests import Request
@@ -10,19 +11,9 @@ from starlette.requests import Request
 from app.api import catalogue
 from app.api.body import JSONRoute
 from app.api.openapi import operation_id, queued
-from app.serving import questions
 from app.serving import request as serving
 from app.serving.answers import written
-from scene_client.schemas import (
-    GenerateAnswer,
-    GenerateRequest,
-    MissingAnswer,
-    MissingRequest,
-    OutliersAnswer,
-    OutliersRequest,
-    RelationsAnswer,
-    RelationsRequest,
-)
+from app.serving.questions import QUESTIONS, Question
 
 PROBLEMS: Final = queued(
     catalogue.NOT_JSON,
@@ -63,48 +54,24 @@ def begin(http: Request) -> serving.Request:
     return found
 
 
-@router.post(
-    "/relations",
-    summary="How do these objects stand to each other?",
-    response_model=RelationsAnswer,
-)
-async def relations(asked: RelationsRequest, http: Request) -> bytes:
-    """The likeliest relations between the objects of a scene, best first."""
-    return written(await questions.relations(begin(http), asked))
+def _answering(question: Question[Any]) -> Callable[..., Awaitable[bytes]]:
+    """The function of a route."""
+
+    async def answer(asked: Any, http: Request) -> bytes:
+        return written(await question.answer(begin(http), asked))
+
+    # The framework reads the schema of the body here.
+    answer.__annotations__ |= {"asked": question.request, "http": Request}
+    return answer
 
 
-@router.post(
-    "/missing",
-    summary="What else should be here, and where?",
-    response_model=MissingAnswer,
-)
-async def missing(asked: MissingRequest, http: Request) -> bytes:
-    """The likeliest absent objects, and where each would stand.
-
-    A class that is present is never proposed again: how many chairs a table wants is outside the
-    models.
-    """
-    return written(await questions.missing(begin(http), asked))
-
-
-@router.post(
-    "/outliers",
-    summary="What does not belong here, or stands in the wrong place?",
-    response_model=OutliersAnswer,
-)
-async def outliers(asked: OutliersRequest, http: Request) -> bytes:
-    """Every object, least fitting first, and every given relation, least likely first.
-
-    Instances of one class are scored alike; only `misplaced` tells them apart.
-    """
-    return written(await questions.outliers(begin(http), asked))
-
-
-@router.post(
-    "/generate",
-    summary="What would a scene like this look like?",
-    response_model=GenerateAnswer,
-)
-async def generate(asked: GenerateRequest, http: Request) -> bytes:
-    """Scenes drawn from the model that contain the evidence; the same seed draws the same ones."""
-    return written(await questions.generate(begin(http), asked))
+for _question in QUESTIONS:
+    router.add_api_route(
+        f"/{_question.name}",
+        _answering(_question),
+        methods=["POST"],
+        name=_question.name,
+        summary=_question.summary,
+        description=_question.description,
+        response_model=_question.response,
+    )

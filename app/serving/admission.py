@@ -1,10 +1,10 @@
 """Admission control: which requests begin when, and where the work of each model runs.
 
-`Backlog` bounds the requests that wait to be read. In a tick of the event loop it starts so many as
-lately took `TICK` together, never more than `PACE` less those whose work is still pending, and
-refuses at most `REFUSALS`. Without it hundreds of simultaneous requests would hold up the event loop, and
-health checks with it. A request is refused when the backlog is full, when it would spend much of
-its time waiting, and when its deadline has passed.
+`Backlog` bounds the requests that wait to be read. In one tick of the event loop it starts as many
+requests as took `TICK` together in earlier ticks, and at most `PACE` less the pending ones. It
+refuses at most `REFUSALS` a tick. Without these bounds hundreds of simultaneous requests would hold
+up the event loop, and health checks with it. A request is refused when the backlog is full, when it
+would spend much of its time waiting, and when its deadline has passed.
 
 `WorkQueue` bounds the work of one model in rows. Each question is computed by itself, so an answer
 never depends on other requests. A cheap one is computed at once, on the event loop: a hop to a

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -20,7 +20,6 @@ from app.registry import AliasTarget, Artifact, ArtifactError, ModelSet, StoreEr
 from app.scene.vocabulary import Vocabulary
 from app.serving.admission import WorkQueue
 from app.serving.errors import ModelUnavailableError, NotReadyError, UnknownModelError
-from app.serving.warm_up import warm_up
 from scene_client.schemas import Failure, ModelReference
 
 DEFAULT = "default"
@@ -169,36 +168,3 @@ class ServedModels:
         name, version = artifact.manifest.name, artifact.manifest.version
         cause = self.warm_up_failures[name, version]
         return Failure(subject=alias, reason=cause.reason, detail=f"{name}@{version}")
-
-
-def prepare(
-    store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels | None = None
-) -> ServedModels:
-    """Let every verified model answer one question of each kind.
-
-    A model that ``previous`` serves from the same artifact has answered already, and keeps its
-    queue.
-    """
-    served: dict[Key, ServedModel] = {}
-    failures: dict[Key, Failure] = {}
-    for key, artifact in store.entries.items():
-        if not isinstance(artifact, Artifact):
-            continue
-        known = previous.served.get(key) if previous is not None else None
-        if known is not None and known.artifact is artifact:
-            served[key] = known
-            continue
-        try:
-            warm_up(artifact)
-        except Exception:
-            # Whatever a broken model raises, it must not take the others down with it.
-            subject = f"{key[0]}@{key[1]}"
-            _logger.exception("%s did not answer its warm-up", subject)
-            failures[key] = Failure(
-                subject=subject,
-                reason="warm_up_failed",
-                detail="it verified, but could not answer a question",
-            )
-        else:
-            served[key] = ServedModel(artifact, new_queue())
-    return ServedModels(store, MappingProxyType(served), MappingProxyType(failures))

@@ -31,9 +31,10 @@ from app.serving.errors import (
 )
 from app.serving.metrics import Change as Counted
 from app.serving.metrics import Metrics
-from app.serving.models import DEFAULT, Key, ServedModels, prepare
+from app.serving.models import DEFAULT, Key, ServedModels
 from app.serving.reading import Limits
 from app.serving.request import Record, Request
+from app.serving.warm_up import prepare
 from app.settings import Settings
 from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
 

@@ -12,36 +12,21 @@ from dataclasses import replace
 from time import monotonic
 from typing import Any, Final
 
-from app.serving import answers, questions
+from app.serving import answers
 from app.serving.answers import Answer
 from app.serving.errors import Location, Reason, RequestError, ServingError
 from app.serving.metrics import Metrics
+from app.serving.questions import QUESTIONS
 from app.serving.reading import Faults, read_scene
 from app.serving.request import Request
-from scene_client.schemas import (
-    MissingOptions,
-    MissingRequest,
-    OutliersOptions,
-    OutliersRequest,
-    RelationsRequest,
-    SceneRequest,
-)
+from scene_client.schemas import MissingOptions, OutliersOptions, SceneRequest
 from scene_client.stream_messages import Ask, MergedScene, SceneMessage, Update, Whole, object_id
 
 # Fields of a message beside the scene.
 _NOT_REQUESTED: Final = frozenset({"ask", "timeout_ms"})
 _DEFAULT_ASK: Final = Ask(missing=MissingOptions(), outliers=OutliersOptions())
-_FORMS: Final[dict[str, type[SceneRequest]]] = {
-    "missing": MissingRequest,
-    "outliers": OutliersRequest,
-    "relations": RelationsRequest,
-}
-# The lists of each question's answer; they are empty for an empty scene.
-_LISTS: Final = {
-    "missing": ("missing",),
-    "outliers": ("outliers", "misplaced"),
-    "relations": ("relations", "disagreements"),
-}
+_BY_NAME: Final = {question.name: question for question in QUESTIONS}
+_ASKED: Final = [_BY_NAME[name] for name in Ask.model_fields]
 
 
 class StreamScene:
@@ -141,28 +126,29 @@ async def _answers(
 ) -> tuple[dict[str, Answer], dict[str, ServingError]]:
     """The answers by question, as the routes give them, and the errors of the others."""
     ask = scene.fields.get("ask") or _DEFAULT_ASK
-    asked = [name for name in _FORMS if getattr(ask, name) is not None]
+    asked = [question for question in _ASKED if getattr(ask, question.name) is not None]
+    names = [question.name for question in asked]
     bare = _request(scene)
     try:
         model, reading = request.read(bare, may_be_empty=True)
     except RequestError as error:  # another model than when the messages were taken
-        return {}, dict.fromkeys(asked, _in_message(error, scene, {}, frozenset()))
+        return {}, dict.fromkeys(names, _in_message(error, scene, {}, frozenset()))
     except ServingError as error:
-        return {}, dict.fromkeys(asked, error)
+        return {}, dict.fromkeys(names, error)
     # One reading and one deadline for all questions.
     request = replace(request, known=(model, reading), low_priority=True)
     found: dict[str, Answer] = {}
     errors: dict[str, ServingError] = {}
-    for name in asked:
+    for name, question in zip(names, asked, strict=True):
         if not reading.scene.objects:
             found[name] = answers.envelope(bare, request.id, model.reference, reading)
-            found[name] |= {own: [] for own in _LISTS[name]}
+            found[name] |= question.empty_answer
             continue
         options = getattr(ask, name)
         given = {option: getattr(options, option) for option in options.model_fields_set}
         try:
-            question = _request(scene, _FORMS[name], **given)
-            found[name] = await getattr(questions, name)(request, question)
+            form = _request(scene, question.request, **given)
+            found[name] = await question.answer(request, form)
         except RequestError as error:
             faults = [
                 replace(fault, location=("ask", name, *fault.location)) for fault in error.faults

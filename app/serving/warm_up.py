@@ -1,55 +1,77 @@
-"""One real question of each kind to a model before anybody depends on it."""
+"""Load models: each verified model answers every question before the first request."""
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from types import MappingProxyType
 
-from app import questions
 from app.questions.ranking import significant
-from app.registry import Artifact
+from app.registry import Artifact, ModelSet
 from app.scene.observe import observe
 from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
+from app.serving.admission import WorkQueue
+from app.serving.models import Key, ServedModel, ServedModels
+from app.serving.questions import QUESTIONS
+from scene_client.schemas import Failure
 
-STEPS = 1
-"""Gibbs sweeps of the drawing: more take their time and warm nothing further."""
+_logger = logging.getLogger("app.serving")
+
+
+def prepare(
+    store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels | None = None
+) -> ServedModels:
+    """Let every verified model answer each question.
+
+    A model that ``previous`` serves from the same artifact has answered already, and keeps its
+    queue.
+    """
+    served: dict[Key, ServedModel] = {}
+    failures: dict[Key, Failure] = {}
+    for key, artifact in store.entries.items():
+        if not isinstance(artifact, Artifact):
+            continue
+        known = previous.served.get(key) if previous is not None else None
+        if known is not None and known.artifact is artifact:
+            served[key] = known
+            continue
+        try:
+            warm_up(artifact)
+        except Exception:
+            # Whatever a broken model raises, it must not take the others down with it.
+            subject = f"{key[0]}@{key[1]}"
+            _logger.exception("%s did not answer its warm-up", subject)
+            failures[key] = Failure(
+                subject=subject,
+                reason="warm_up_failed",
+                detail="it verified, but could not answer a question",
+            )
+        else:
+            served[key] = ServedModel(artifact, new_queue())
+    return ServedModels(store, MappingProxyType(served), MappingProxyType(failures))
 
 
 def warm_up(artifact: Artifact) -> None:
-    """Ask everything once, with and without given relations and with poses: the first call of a
-    compiled loop compiles it.
+    """Ask each question with given relations, without relations, and with poses.
 
     Raises:
         ValueError: an answer is not finite.
-        Exception: whatever the model raises.
+        Exception: an exception of the model.
     """
-    scene = _scene(artifact.vocabulary)
-    bare = replace(scene, relations=None)
-    seen = observe(bare, typical_sizes=artifact.vocabulary.sizes)
-    scenes = scene, bare, seen
-    stand = [questions.relations(artifact, one) for one in scenes]
-    missing = [entry for one in scenes for entry in questions.missing(artifact, one)]
-    if len(scene.objects) > 1:
-        questions.missing(artifact, bare, at=("on-top", 0))
-        questions.missing(artifact, scene, at=("under", 0))
-    # With threshold 0 every object is an outlier: reasons and companions are asked for, too.
-    _, outliers, misplaced = questions.outliers(artifact, scene, threshold=0.0)
-    for one in scenes[1:]:
-        outliers += questions.outliers(artifact, one).outliers
-    generated = questions.generate(artifact, scene, count=2, seed=0, steps=STEPS)
-    numbers = [entry.probability for both in stand for found in both for entry in found]
-    numbers += [number for entry in missing for number in (entry.probability, entry.log_odds)]
-    numbers += [cause.log_odds_change for entry in missing for cause in entry.because]
-    numbers += [number for entry in outliers for number in (entry.probability, entry.log_odds)]
-    numbers += [entry.probability for entry in misplaced]
-    numbers += [entry.log_score for entry in generated]
+    related = _scene(artifact.vocabulary)
+    bare = replace(related, relations=None)
+    posed = observe(bare, typical_sizes=artifact.vocabulary.sizes)
+    scenes = related, bare, posed
+    numbers = [number for question in QUESTIONS for number in question.warm_up(artifact, scenes)]
     if not all(map(math.isfinite, significant(numbers))):
         raise ValueError("the model gives answers that are not finite")
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """Three kinds of things, or as many as there are, in a row; one is said to be on another."""
+    """A row of three objects, or fewer in a smaller vocabulary; one stands on another."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
         SceneObject(str(place), vocabulary.labels[index], index, position=(1.0, 0.5 * place, 0.5))

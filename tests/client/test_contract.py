@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from app.api.example_requests import REQUESTS
+from app.api.examples import REQUESTS
+from app.serving import questions
 from scene_client import (
     Client,
     DeadlineError,
@@ -47,6 +48,10 @@ QUESTIONS: list[tuple[str, dict[str, Any]]] = [
     ("outliers", {"objects": ["bed"], "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}),
     ("generate", {"objects": ["bed"], "count": 3, "seed": 7, "temperature": 0.5}),
     ("generate", {"objects": [], "room_type": "office", "seed": 1, "steps": 5, "model": "deep"}),
+    *[
+        (question.name, next(iter(question.examples.values())).value)
+        for question in questions.QUESTIONS
+    ],
 ]
 
 

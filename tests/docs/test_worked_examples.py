@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from app.api.example_requests import REQUESTS
+from app.api.examples import REQUESTS
 from tests.docs.blocks import blocks
 from tests.docs.conftest import Workplace
 
@@ -25,7 +25,7 @@ def test_examples_are_answered_by_the_shipped_models(workplace: Workplace, opera
         if case.problem is None:
             assert response.status_code == 200, (name, response.text)
         else:
-            assert response.json()["type"] == case.problem.uri, (name, response.text)
+            assert response.json()["type"] == f"/problems/{case.problem}", (name, response.text)
 
 
 def test_the_picture_shows_what_the_default_model_answers(

@@ -10,16 +10,14 @@ import schemathesis
 from pydantic import BaseModel, ValidationError
 
 from app.main import create_app
+from app.serving.questions import QUESTIONS
 from app.settings import Settings
 from scene_client import schemas
 from tests.conftest import REPOSITORY
 from tests.services import ADMIN_KEY, LiveService
 
 _FORMS: dict[str, type[BaseModel]] = {
-    "/relations": schemas.RelationsRequest,
-    "/missing": schemas.MissingRequest,
-    "/outliers": schemas.OutliersRequest,
-    "/generate": schemas.GenerateRequest,
+    **{f"/{question.name}": question.request for question in QUESTIONS},
     "/models/aliases/{alias}": schemas.AliasRequest,
 }
 _UNKNOWN_HEADER = "x-schemathesis-unknown-property"

@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 import pytest
 
+from app.serving.questions import QUESTIONS
 from tests.services import Replace, defect
 
 pytestmark = pytest.mark.anyio
@@ -21,10 +22,10 @@ ENTRIES: list[Any] = [
     {"objects": []},
     {"objects": ["bed", "chair"], "model": "plain"},
 ]
-QUESTIONS = ["relations", "missing", "outliers"]
+NAMES = [question.name for question in QUESTIONS if question.has_batch]
 
 
-@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize("question", NAMES)
 async def test_every_entry_gets_the_result_or_problem_of_a_single_request(
     client: httpx.AsyncClient, question: str
 ) -> None:

@@ -13,7 +13,9 @@ from urllib.parse import urljoin, urlsplit
 import httpx
 import pytest
 
-from app.api.example_requests import REQUESTS
+from app.api.catalogue import PROBLEM_TYPES
+from app.api.examples import REQUESTS
+from app.api.openapi import described
 from scene_client import schemas
 from scene_client.schemas import Problem
 from tests.http.test_problems import problem
@@ -198,7 +200,7 @@ async def test_every_body_has_worked_examples(document: dict[str, Any]) -> None:
         found = operation["requestBody"]["content"]["application/json"]["examples"]
         assert cases.get(operation["operationId"], set()) <= found.keys()
         assert found == {
-            name: case.describe() for name, case in REQUESTS[operation["operationId"]].items()
+            name: described(case) for name, case in REQUESTS[operation["operationId"]].items()
         }
 
 
@@ -232,9 +234,9 @@ async def test_an_example_is_answered_or_refused_as_it_says(
         validated = model.model_validate_json(response.content, extra="forbid")
         assert validated.model_dump_json(exclude_none=True) == response.text
         return
-    found = problem(response, case.problem.status, case.problem.slug)
-    documented = responses[str(case.problem.status)]
-    shown = documented["content"]["application/problem+json"]["examples"][case.problem.slug]
+    found = problem(response, PROBLEM_TYPES[case.problem].status, case.problem)
+    documented = responses[str(response.status_code)]
+    shown = documented["content"]["application/problem+json"]["examples"][case.problem]
     if name in {"unknown-labels", "contradictory-evidence"}:
         # The problem in the document is the one that this example meets.
         assert shown["value"]["errors"] == found["errors"]
@@ -252,7 +254,7 @@ async def test_an_example_of_moving_an_alias_does_as_it_says(
         assert response.status_code == 200
         assert response.json()["model"] == case.value["model"]
     else:
-        problem(response, case.problem.status, case.problem.slug)
+        problem(response, PROBLEM_TYPES[case.problem].status, case.problem)
 
 
 async def test_example_answers_have_the_fields_of_real_ones(document: dict[str, Any]) -> None:

@@ -47,15 +47,11 @@ def test_bodies_are_read_without_a_proxy_too(service: LiveService) -> None:
 
 
 def test_every_field_of_every_request_is_attacked() -> None:
+    from app.serving.questions import QUESTIONS
     from scene_client import schemas
 
-    forms = {
-        "/relations": schemas.RelationsRequest,
-        "/missing": schemas.MissingRequest,
-        "/outliers": schemas.OutliersRequest,
-        "/generate": schemas.GenerateRequest,
-        corpus.ALIAS: schemas.AliasRequest,
-    }
+    forms = {f"/{question.name}": question.request for question in QUESTIONS}
+    forms[corpus.ALIAS] = schemas.AliasRequest
     for path, form in forms.items():
         assert set(corpus.VALID[path]) == set(form.model_fields)
     detection = corpus.SCENE["objects"][1]

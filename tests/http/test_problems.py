@@ -17,16 +17,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from app.api.catalogue import PROBLEM_TYPES
+from app.serving.questions import QUESTIONS
 from scene_client.schemas import (
     Detection,
-    GenerateRequest,
-    MissingRequest,
-    OutliersRequest,
     Position,
     Problem,
     Quaternion,
     Relation,
-    RelationsRequest,
     Stamp,
     Viewpoint,
 )
@@ -34,7 +31,7 @@ from tests.services import Replace, defect, serve
 
 pytestmark = pytest.mark.anyio
 
-QUESTIONS = ["relations", "missing", "outliers", "generate"]
+NAMES = [question.name for question in QUESTIONS]
 MARKER = "Zq7-marker"
 BED = {"label": "bed"}
 POINT = {"x": 1.0, "y": 1.0, "z": 1.0}
@@ -206,7 +203,7 @@ async def test_a_body_is_an_object_with_objects(
     assert [error["pointer"] for error in document["errors"]] == [pointer]
 
 
-@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize("question", NAMES)
 async def test_no_body_has_more_faults_than_it_is_long(
     client: httpx.AsyncClient, question: str
 ) -> None:
@@ -224,7 +221,7 @@ async def test_no_body_has_more_faults_than_it_is_long(
     assert "32 members" in document["detail"]
 
 
-@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize("question", NAMES)
 async def test_contradictions_are_refused(client: httpx.AsyncClient, question: str) -> None:
     for second in (("bed", "right", "lamp"), ("lamp", "left", "bed"), ("bed", "front", "bed")):
         triples = [("bed", "left", "lamp"), second]
@@ -237,7 +234,7 @@ async def test_contradictions_are_refused(client: httpx.AsyncClient, question: s
         assert [error["pointer"] for error in document["errors"]] == ["#/relations/1"]
 
 
-@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize("question", NAMES)
 async def test_unknown_labels_are_named_with_suggestions(
     client: httpx.AsyncClient, question: str
 ) -> None:
@@ -426,7 +423,7 @@ async def test_other_request_ids_are_replaced(
 # ----------------------------------------------------------------------------------- defects
 
 
-@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize("question", NAMES)
 async def test_a_defect_is_a_problem_without_details(
     client: httpx.AsyncClient,
     replace: Replace,
@@ -489,7 +486,7 @@ SCALARS = st.one_of(
     st.text(max_size=8),
     st.sampled_from(["bed", "chair", "lamp", "left", "on-top", "map", "ignore", "plain"]),
 )
-REQUESTS = (RelationsRequest, MissingRequest, OutliersRequest, GenerateRequest)
+REQUESTS = tuple(question.request for question in QUESTIONS)
 PARTS = (Detection, Position, Quaternion, Relation, Stamp, Viewpoint)
 FIELDS = st.sampled_from(sorted({name for kind in REQUESTS + PARTS for name in kind.model_fields}))
 ANYTHING = st.recursive(
@@ -504,7 +501,7 @@ ANYTHING = st.recursive(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
 @given(
-    question=st.sampled_from(QUESTIONS),
+    question=st.sampled_from(NAMES),
     body=st.one_of(
         ANYTHING,
         st.dictionaries(FIELDS, ANYTHING, max_size=4).map(

@@ -13,23 +13,13 @@ from app import questions
 from app.registry import Store
 from app.scene import Scene, SceneObject
 from app.scene.relations import CANONICAL, opposite
-from scene_client.schemas import (
-    GenerateAnswer,
-    MissingAnswer,
-    OutliersAnswer,
-    RelationsAnswer,
-)
+from app.serving.questions import QUESTIONS
 from tests.http.stores import VOCABULARY, publish
 from tests.services import Replace, serve
 
 pytestmark = pytest.mark.anyio
 
-ANSWERS: dict[str, Any] = {
-    "relations": RelationsAnswer,
-    "missing": MissingAnswer,
-    "outliers": OutliersAnswer,
-    "generate": GenerateAnswer,
-}
+ANSWERS = {question.name: question.response for question in QUESTIONS}
 SCENE: dict[str, Any] = {
     "objects": ["bed", "chair", "chair", {"id": "l", "label": "lamp", "confidence": 0.5}],
     "relations": [{"subject": "l", "relation": "on-top", "object": "bed"}],

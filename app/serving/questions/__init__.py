@@ -1,14 +1,19 @@
-"""The four questions: each reads a request, asks the model about the scene, and returns the answer.
+"""The questions that the service answers: each module reads a request, asks the model, and answers.
 
-Each raises:
-    RequestError, UnknownModelError, ModelUnavailableError: see `Request.read`.
-    RequestError: the answer would be too large.
-    QueueFullError, DeadlinePassedError, DisconnectedError: see `Request.ask`.
+A new question is a module here and an entry in `QUESTIONS`.
 """
 
-from app.serving.questions.generate import generate
-from app.serving.questions.missing import missing
-from app.serving.questions.outliers import outliers
-from app.serving.questions.relations import relations
+from __future__ import annotations
 
-__all__ = ["generate", "missing", "outliers", "relations"]
+from typing import Any, Final
+
+from app.serving.questions.generate import GENERATE
+from app.serving.questions.missing import MISSING
+from app.serving.questions.outliers import OUTLIERS
+from app.serving.questions.question import Question
+from app.serving.questions.relations import RELATIONS
+
+QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, GENERATE)
+"""In the order of the documentation."""
+
+__all__ = ["QUESTIONS", "Question"]

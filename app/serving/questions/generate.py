@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Sequence
+from typing import Final
 
 from app import questions
+from app.registry import Artifact
+from app.scene.scene import Scene
 from app.serving.answers import (
     OBJECT_BYTES,
     RELATION_BYTES,
@@ -16,18 +19,26 @@ from app.serving.answers import (
 )
 from app.serving.errors import Reason
 from app.serving.models import ServedModel
+from app.serving.questions.question import (
+    BEDROOM,
+    POSES,
+    REFUSED,
+    Example,
+    Question,
+)
 from app.serving.reading import Faults
 from app.serving.request import Request
-from scene_client.schemas import GenerateRequest
+from scene_client.schemas import GenerateAnswer, GenerateRequest
 
 DRAWN_SEED_BITS = 53
 """Every JSON reader can hand such a seed back: a double holds it exactly."""
 
+_WARM_UP_STEPS: Final = 1  # more Gibbs sweeps warm nothing further
 _UNIT_BYTES = 12  # the number of a hidden unit
 
 
 async def generate(request: Request, asked: GenerateRequest) -> Answer:
-    """See `scene_client.schemas.GenerateAnswer`."""
+    """Scenes drawn from the model that contain the evidence; the same seed draws the same ones."""
     model, reading = request.read(asked, may_be_empty=True)
     _check_context(asked, model)
     seed = secrets.randbits(DRAWN_SEED_BITS) if asked.seed is None else asked.seed
@@ -84,3 +95,48 @@ def _size(drawn: Sequence[questions.GeneratedScene]) -> Callable[[int], int]:
     units = sum([len(layer) for scene in drawn for layer in scene.context.values()])
     fixed = len(drawn) * OBJECT_BYTES + relations * RELATION_BYTES + units * _UNIT_BYTES
     return lambda name: fixed + (objects + 2 * relations) * name
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
+    drawn = questions.generate(artifact, scenes[0], count=2, seed=0, steps=_WARM_UP_STEPS)
+    return [scene.log_score for scene in drawn]
+
+
+_EXAMPLES: Final = {
+    "room": Example("a bedroom", {"room_type": "bedroom", "count": 2, "seed": 7}),
+    "evidence": Example(
+        "scenes that hold these objects and this relation",
+        {**BEDROOM, "count": 2, "seed": 7},
+    ),
+    "poses": Example("scenes around what the robot sees", {**POSES, "seed": 7}),
+    "context": Example(
+        "hidden units held on, as GET /models/{name}/contexts shows them",
+        {"context": {"h1": [0, 3]}, "seed": 7},
+    ),
+    "varied": Example(
+        "longer and hotter chains: more varied scenes",
+        {"objects": ["desk"], "steps": 100, "temperature": 1.5, "count": 4, "seed": 7},
+    ),
+    **REFUSED,
+}
+_EXAMPLE_ANSWER: Final = {
+    "seed": 7,
+    "scenes": [
+        {
+            "objects": ["bed", "nightstand", "lamp"],
+            "relations": [{"subject": "lamp", "relation": "on-top", "object": "nightstand"}],
+            "log_score": -6.1,
+            "context": {"h1": [3, 17]},
+        }
+    ],
+}
+
+GENERATE: Final = Question(
+    generate,
+    _warm_up,
+    GenerateRequest,
+    GenerateAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+    has_batch=False,
+)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Final
 
 from app import questions
 from app.questions.missing import VIEWER
 from app.questions.ranking import significant
+from app.registry import Artifact
 from app.scene.frames import Axes, viewer_axes
 from app.scene.relations import opposite
+from app.scene.scene import Scene
 from app.serving.answers import (
     CAUSE_BYTES,
     OBJECT_BYTES,
@@ -21,15 +24,26 @@ from app.serving.answers import (
 )
 from app.serving.errors import Reason
 from app.serving.models import ServedModel
+from app.serving.questions.question import (
+    LABELS,
+    REFUSED,
+    SCENES,
+    Example,
+    Question,
+)
 from app.serving.reading import Faults, Reading
 from app.serving.request import Request
-from scene_client.schemas import Anchor, MissingRequest
+from scene_client.schemas import Anchor, MissingAnswer, MissingRequest
 
 _OFFSET_BYTES = 250
 
 
 async def missing(request: Request, asked: MissingRequest) -> Answer:
-    """See `scene_client.schemas.MissingAnswer`."""
+    """The likeliest absent objects, and where each would stand.
+
+    A class that is present is never proposed again: how many chairs a table wants is outside the
+    models.
+    """
     model, reading = request.read(asked)
     faults = Faults()
     # The default is for vocabularies of any size; a client's own number is never cut silently.
@@ -131,3 +145,71 @@ def _placement(place: questions.Placement, ids: Sequence[str], numbered: Iterato
         std = {"x": next(numbered), "y": next(numbered), "z": next(numbered)}
         entry["offset"] = {"mean": mean, "std": std, "scenes": offset.scenes}
     return entry
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
+    related, bare, _ = scenes
+    found = [entry for scene in scenes for entry in questions.missing(artifact, scene)]
+    if len(bare.objects) > 1:
+        questions.missing(artifact, bare, at=("on-top", 0))
+        questions.missing(artifact, related, at=("under", 0))
+    numbers = [number for entry in found for number in (entry.probability, entry.log_odds)]
+    return numbers + [cause.log_odds_change for entry in found for cause in entry.because]
+
+
+_EXAMPLES: Final = {
+    **SCENES,
+    "at": Example(
+        "what is missing from the desk?",
+        {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
+    ),
+    "coverage": Example(
+        "the whole scene is listed: what is not listed is absent",
+        {**LABELS, "coverage": 1.0},
+    ),
+    "candidates": Example(
+        "which of these is missing?",
+        {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3},
+    ),
+    **REFUSED,
+    "invalid-request": Example(
+        "a place that is not in the scene",
+        {**LABELS, "at": {"relation": "on-top", "object": "desk"}},
+        "invalid-request",
+    ),
+}
+_EXAMPLE_ANSWER: Final = {
+    "coverage": 0.5,
+    "missing": [
+        {
+            "label": "pillow",
+            "probability": 0.46,
+            "log_odds": 1.9,
+            "placements": [
+                {
+                    "relation": "on-top",
+                    "object": "bed",
+                    "probability": 0.91,
+                    "offset": {
+                        "mean": {"x": 0.005, "y": 0.012, "z": 0.421},
+                        "std": {"x": 0.466, "y": 0.491, "z": 0.242},
+                        "scenes": 1089,
+                    },
+                }
+            ],
+            "because": [
+                {"object": "bed", "log_odds_change": 1.7},
+                {"object": "lamp_1", "log_odds_change": -0.2},
+            ],
+        }
+    ],
+}
+
+MISSING: Final = Question(
+    missing,
+    _warm_up,
+    MissingRequest,
+    MissingAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 from app import questions
 from app.questions.ranking import significant
+from app.registry import Artifact
 from app.scene.relations import CANONICAL, opposite
+from app.scene.scene import Scene
 from app.serving.answers import (
     CAUSE_BYTES,
     OBJECT_BYTES,
@@ -17,13 +20,23 @@ from app.serving.answers import (
     require_size,
     rounded,
 )
+from app.serving.questions.question import (
+    REFUSED,
+    SCENES,
+    WITH_TOILET,
+    Example,
+    Question,
+)
 from app.serving.reading import Reading
 from app.serving.request import Request
-from scene_client.schemas import OutliersRequest
+from scene_client.schemas import OutliersAnswer, OutliersRequest
 
 
 async def outliers(request: Request, asked: OutliersRequest) -> Answer:
-    """See `scene_client.schemas.OutliersAnswer`."""
+    """Every object, least fitting first, and every given relation, least likely first.
+
+    Instances of one class are scored alike; only `misplaced` tells them apart.
+    """
     model, reading = request.read(asked)
     found = await request.ask(
         model,
@@ -80,3 +93,78 @@ def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Ans
     if (CANONICAL.index(relation), subject, object_) in reading.flipped:
         subject, relation, object_ = object_, opposite(relation), subject
     return {"subject": ids[subject], "relation": relation, "object": ids[object_]}
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
+    # With threshold 0 every object is an outlier: reasons and companions are computed, too.
+    _, found, misplaced = questions.outliers(artifact, scenes[0], threshold=0.0)
+    for scene in scenes[1:]:
+        found += questions.outliers(artifact, scene).outliers
+    numbers = [number for entry in found for number in (entry.probability, entry.log_odds)]
+    return numbers + [entry.probability for entry in misplaced]
+
+
+_EXAMPLES: Final = {
+    "intruder": Example("a toilet in a bedroom", WITH_TOILET),
+    **SCENES,
+    "misplaced": Example(
+        "relations that may be wrong",
+        {
+            "objects": ["bed", "pillow", "nightstand"],
+            "relations": [
+                {"subject": "pillow", "relation": "on-top", "object": "bed"},
+                {"subject": "bed", "relation": "on-top", "object": "nightstand"},
+            ],
+        },
+    ),
+    "sensitivity": Example(
+        "alarms more readily",
+        {**WITH_TOILET, "sensitivity": "high"},
+    ),
+    "threshold": Example(
+        "a threshold of one's own",
+        {**WITH_TOILET, "threshold": 0.5},
+    ),
+    **REFUSED,
+}
+_EXAMPLE_ANSWER: Final = {
+    "threshold": 0.7,
+    "outliers": [
+        {
+            "object": "toilet",
+            "label": "toilet",
+            "probability": 0.94,
+            "log_odds": -5.2,
+            "is_outlier": True,
+            "because": [{"object": "bed", "log_odds_change": -2.7}],
+            "usually_with": ["toilet paper", "sink", "faucet"],
+        },
+        {
+            "object": "bed",
+            "label": "bed",
+            "probability": 0.03,
+            "log_odds": 2.4,
+            "is_outlier": False,
+            "because": [{"object": "lamp_1", "log_odds_change": 0.9}],
+            "usually_with": [],
+        },
+    ],
+    "misplaced": [
+        {
+            "subject": "lamp_1",
+            "relation": "on-top",
+            "object": "nightstand_1",
+            "probability": 0.05,
+            "is_misplaced": False,
+        }
+    ],
+}
+
+OUTLIERS: Final = Question(
+    outliers,
+    _warm_up,
+    OutliersRequest,
+    OutliersAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+)

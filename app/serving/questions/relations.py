@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Final
 
 from app import questions
 from app.questions.ranking import significant
+from app.registry import Artifact
 from app.scene.relations import canonicalise, opposite
+from app.scene.scene import Scene
 from app.serving.answers import RELATION_BYTES, Answer, envelope, require_size, rounded
 from app.serving.errors import Location, Reason
+from app.serving.questions.question import (
+    BEDROOM,
+    LABELS,
+    REFUSED,
+    SCENES,
+    Example,
+    Question,
+)
 from app.serving.reading import Faults, Reading
 from app.serving.request import Request
-from scene_client.schemas import RelationsRequest
+from scene_client.schemas import RelationsAnswer, RelationsRequest
 
 
 async def relations(request: Request, asked: RelationsRequest) -> Answer:
-    """See `scene_client.schemas.RelationsAnswer`."""
+    """The likeliest relations between the objects of a scene, best first."""
     model, reading = request.read(asked)
     found, disagreements = await request.ask(
         model,
@@ -91,3 +102,72 @@ def _disagreement(entry: questions.Disagreement, reading: Reading) -> Answer:
         "probability": rounded(probability),
         "observed_probability": rounded(observed_probability),
     }
+
+
+def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
+    answers = [questions.relations(artifact, scene) for scene in scenes]
+    return [entry.probability for both in answers for found in both for entry in found]
+
+
+_EXAMPLES: Final = {
+    **SCENES,
+    "instances": Example(
+        "two of a class, told apart by their ids",
+        {"objects": ["chair", "chair", "desk"], "top_k": 10},
+    ),
+    "pairs": Example(
+        "one ordered pair, all eight relations",
+        {
+            **BEDROOM,
+            "pairs": [{"subject": "lamp_1", "object": "bed"}],
+            "include_opposites": True,
+        },
+    ),
+    "likely": Example(
+        "what is likelier than not, all unlisted relations known not to hold",
+        {**BEDROOM, "relations_complete": True, "min_probability": 0.5},
+    ),
+    **REFUSED,
+    "invalid-request": Example(
+        "a pair that is not in the scene",
+        {**LABELS, "pairs": [{"subject": "lamp", "object": "desk"}]},
+        "invalid-request",
+    ),
+}
+_EXAMPLE_ANSWER: Final = {
+    "relations": [
+        {
+            "subject": "lamp_1",
+            "relation": "on-top",
+            "object": "nightstand_1",
+            "probability": 0.83,
+            "observed": True,
+        },
+        {
+            "subject": "nightstand_1",
+            "relation": "left",
+            "object": "bed",
+            "probability": 0.41,
+            "observed": False,
+        },
+    ],
+    "disagreements": [
+        {
+            "subject": "lamp_1",
+            "object": "bed",
+            "observed": ["on-top"],
+            "expected": "left",
+            "probability": 0.36,
+            "observed_probability": 0.02,
+        }
+    ],
+}
+
+RELATIONS: Final = Question(
+    relations,
+    _warm_up,
+    RelationsRequest,
+    RelationsAnswer,
+    _EXAMPLES,
+    _EXAMPLE_ANSWER,
+)

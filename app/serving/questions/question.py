@@ -1,0 +1,175 @@
+"""What the service knows of each question: its function, its schemas, its worked examples."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from inspect import getdoc
+from typing import Any, Final, Generic, TypeVar
+
+from app.registry import Artifact
+from app.scene.scene import Scene
+from app.serving.answers import Answer
+from app.serving.request import Request
+from scene_client import schemas
+
+RequestT = TypeVar("RequestT", bound=schemas.SceneRequest)
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """A worked example for the documentation.
+
+    Attributes:
+        summary: its line in the list of examples.
+        value: the request body.
+        problem: slug of the problem that refuses the request; None where it is answered.
+    """
+
+    summary: str
+    value: dict[str, Any]
+    problem: str | None = None
+
+
+@dataclass(frozen=True)
+class Question(Generic[RequestT]):
+    """One question about a scene. Routes, documentation, warm-up and metrics use this record.
+
+    Attributes:
+        answer: answers a request; its name is the name of the question, and its docstring
+            describes the route. Raises what `Request.read` and `Request.ask` raise, and
+            `RequestError` where the answer would be too large.
+        warm_up: asks a model about scenes and returns the numbers of the answers. The first call of
+            a compiled loop compiles it, so every loop must be called here.
+        request, response: schemas of the HTTP contract.
+        examples: by name; the default model knows their labels.
+        example_answer: an answer with illustrative figures, without its envelope.
+        has_batch: whether the question can be asked about many scenes at once.
+    """
+
+    answer: Callable[[Request, RequestT], Awaitable[Answer]]
+    warm_up: Callable[[Artifact, tuple[Scene, ...]], list[float]]
+    request: type[RequestT]
+    response: type[schemas.Answer]
+    examples: Mapping[str, Example]
+    example_answer: Mapping[str, Any]
+    has_batch: bool = True
+
+    @property
+    def name(self) -> str:
+        """The name of the question, as in its address."""
+        return self.answer.__name__
+
+    @property
+    def summary(self) -> str:
+        """The question in words."""
+        return getdoc(self.request) or ""
+
+    @property
+    def description(self) -> str:
+        """The answer in words."""
+        return getdoc(self.answer) or ""
+
+    @property
+    def empty_answer(self) -> Answer:
+        """The lists of an answer, without entries."""
+        return {name: [] for name, part in self.example_answer.items() if isinstance(part, list)}
+
+
+LABELS: Final[dict[str, Any]] = {"objects": ["bed", "nightstand", "lamp"]}
+WITH_TOILET: Final[dict[str, Any]] = {"objects": [*LABELS["objects"], "toilet"]}
+BEDROOM: Final[dict[str, Any]] = {
+    "objects": [
+        "bed",
+        {"id": "nightstand_1", "label": "nightstand"},
+        {"id": "lamp_1", "label": "lamp", "confidence": 0.92},
+    ],
+    "relations": [{"subject": "lamp_1", "relation": "on-top", "object": "nightstand_1"}],
+    "room_type": "bedroom",
+}
+POSES: Final[dict[str, Any]] = {
+    "objects": [
+        {
+            "id": "desk_1",
+            "label": "desk",
+            "position": {"x": 2.0, "y": 0.0, "z": 0.4},
+            "size": {"x": 0.7, "y": 1.4, "z": 0.8},
+        },
+        {
+            "id": "lamp_1",
+            "label": "lamp",
+            "position": {"x": 2.0, "y": 0.5, "z": 1.0},
+            "size": {"x": 0.2, "y": 0.2, "z": 0.4},
+        },
+        {
+            "id": "chair_1",
+            "label": "chair",
+            "position": {"x": 1.2, "y": 0.0, "z": 0.45},
+            "size": {"x": 0.5, "y": 0.5, "z": 0.9},
+            "orientation": {"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0},
+        },
+    ],
+    "frame_id": "base_link",
+    "stamp": {"sec": 12, "nanosec": 500000000},
+}
+_CAMERA: Final[dict[str, Any]] = {
+    "objects": [
+        {"label": "desk", "position": {"x": 0.0, "y": 0.6, "z": 2.0}},
+        {"label": "keyboard", "position": {"x": 0.1, "y": 0.3, "z": 1.9}},
+    ],
+    "frame_id": "camera_color_optical_frame",
+}
+_MAP: Final[dict[str, Any]] = {
+    **POSES,
+    "frame_id": "map",
+    "viewpoint": {"x": 0.0, "y": 0.0, "yaw": 0.0},
+}
+SCENES: Final[dict[str, Example]] = {
+    "labels": Example("labels alone", LABELS),
+    "relations": Example("ids, a confidence, a given relation, the room type", BEDROOM),
+    "poses": Example("poses, from which relations are derived", POSES),
+    "camera": Example("poses in a camera's optical frame, without sizes", _CAMERA),
+    "map": Example("poses in a map, seen from a viewpoint", _MAP),
+    "ignore": Example(
+        "without the labels that the model does not know",
+        {"objects": ["bed", "nightstand", "flux capacitor"], "unknown_labels": "ignore"},
+    ),
+    "nearest": Example(
+        "unknown labels mapped to the nearest class",
+        {"objects": ["bed", "nigthstand", "big lamp"], "unknown_labels": "nearest"},
+    ),
+}
+"""Examples that every question about listed objects answers."""
+
+REFUSED: Final[dict[str, Example]] = {
+    "unknown-labels": Example(
+        "a label that the model does not know",
+        {"objects": ["bed", "nigthstand"]},
+        "unknown-labels",
+    ),
+    "contradictory-evidence": Example(
+        "a scene that contradicts itself",
+        {
+            "objects": ["bed", "lamp"],
+            "relations": [
+                {"subject": "lamp", "relation": "left", "object": "bed"},
+                {"subject": "lamp", "relation": "right", "object": "bed"},
+            ],
+        },
+        "contradictory-evidence",
+    ),
+    "model-not-found": Example(
+        "a model that is not there", {**LABELS, "model": "nobody@9.9.9"}, "model-not-found"
+    ),
+}
+"""Examples that every question refuses."""
+
+BATCH: Final[dict[str, Example]] = {
+    "scenes": Example("two scenes", {"scenes": [LABELS, BEDROOM]}),
+    "bad-entry": Example(
+        "a bad scene spoils its own entry alone",
+        {"scenes": [LABELS | {"room_type": "bedroom"}, {"objects": ["desk", "nigthstand"]}]},
+    ),
+    "empty": Example("no scene at all", {"scenes": []}, "invalid-request"),
+}
+"""Examples of every batch."""
