@@ -10,42 +10,30 @@ from typing import Final, Self, Unpack, overload
 import anyio
 import httpx
 
-from scene_client.calls import (
-    GENERATE,
-    MISSING,
-    OUTLIERS,
-    RELATIONS,
-    AliasFields,
-    Body,
-    Call,
-    GenerateFields,
-    MissingFields,
-    Objects,
-    OutliersFields,
-    RelationsFields,
-    T,
-    ask,
-    ask_each,
-    promote,
-    segment,
-)
+from scene_client.calls import Call, Objects, T, ask, ask_each, promote, segment
 from scene_client.connection import RETRIES, Options, async_deadline, async_transport
 from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
 from scene_client.schemas import (
     AliasAnswer,
+    AliasFields,
     BatchAnswer,
+    Body,
     ContextsAnswer,
     GenerateAnswer,
+    GenerateFields,
     GenerateRequest,
     Health,
     MissingAnswer,
+    MissingFields,
     MissingRequest,
     ModelList,
     ModelSummary,
     OutliersAnswer,
+    OutliersFields,
     OutliersRequest,
     RefreshAnswer,
     RelationsAnswer,
+    RelationsFields,
     RelationsRequest,
     VersionDetails,
     VocabularyAnswer,
@@ -108,7 +96,10 @@ class AsyncClient:
         **fields: Unpack[RelationsFields],
     ) -> RelationsAnswer:
         """How do these objects stand to each other?"""
-        return await self._call(ask(RELATIONS, objects, fields, self.options.model), timeout)
+        call = ask(
+            "/relations", RelationsRequest, RelationsAnswer, objects, fields, self.options.model
+        )
+        return await self._call(call, timeout)
 
     async def missing(
         self,
@@ -118,7 +109,9 @@ class AsyncClient:
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
         """What else should be here, and where?"""
-        return await self._call(ask(MISSING, objects, fields, self.options.model), timeout)
+        form, answer = MissingRequest, MissingAnswer
+        call = ask("/missing", form, answer, objects, fields, self.options.model)
+        return await self._call(call, timeout)
 
     async def outliers(
         self,
@@ -128,7 +121,10 @@ class AsyncClient:
         **fields: Unpack[OutliersFields],
     ) -> OutliersAnswer:
         """What does not belong here, or stands in the wrong place?"""
-        return await self._call(ask(OUTLIERS, objects, fields, self.options.model), timeout)
+        call = ask(
+            "/outliers", OutliersRequest, OutliersAnswer, objects, fields, self.options.model
+        )
+        return await self._call(call, timeout)
 
     async def generate(
         self,
@@ -138,7 +134,10 @@ class AsyncClient:
         **fields: Unpack[GenerateFields],
     ) -> GenerateAnswer:
         """What would a scene like this look like?"""
-        return await self._call(ask(GENERATE, objects, fields, self.options.model), timeout)
+        call = ask(
+            "/generate", GenerateRequest, GenerateAnswer, objects, fields, self.options.model
+        )
+        return await self._call(call, timeout)
 
     # -------------------------------------------------------------------------------- batches
 
@@ -149,7 +148,9 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
         """As `relations`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return await self._call(ask_each(RELATIONS, scenes, self.options.model), timeout)
+        form, answer = RelationsRequest, BatchAnswer[RelationsAnswer]
+        call = ask_each("/relations", form, answer, scenes, self.options.model)
+        return await self._call(call, timeout)
 
     async def missing_batch(
         self,
@@ -158,7 +159,9 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
         """As `missing`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return await self._call(ask_each(MISSING, scenes, self.options.model), timeout)
+        form, answer = MissingRequest, BatchAnswer[MissingAnswer]
+        call = ask_each("/missing", form, answer, scenes, self.options.model)
+        return await self._call(call, timeout)
 
     async def outliers_batch(
         self,
@@ -167,7 +170,9 @@ class AsyncClient:
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
         """As `outliers`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return await self._call(ask_each(OUTLIERS, scenes, self.options.model), timeout)
+        form, answer = OutliersRequest, BatchAnswer[OutliersAnswer]
+        call = ask_each("/outliers", form, answer, scenes, self.options.model)
+        return await self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from random import random
-from typing import Any, Final, Generic, TypeAlias, TypedDict, TypeVar
+from typing import Any, Final, Generic, TypeAlias, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -24,27 +24,11 @@ from scene_client.schemas import (
     MAX_BATCH,
     AliasAnswer,
     AliasRequest,
-    Anchor,
     Answer,
-    BatchAnswer,
+    Body,
     Detection,
     FieldError,
-    GenerateAnswer,
-    GenerateRequest,
-    MissingAnswer,
-    MissingRequest,
-    OutliersAnswer,
-    OutliersRequest,
-    Pair,
-    Relation,
-    RelationName,
-    RelationsAnswer,
-    RelationsRequest,
     SceneRequest,
-    Sensitivity,
-    Stamp,
-    UnknownLabels,
-    Viewpoint,
 )
 from scene_client.validation import field_errors
 
@@ -52,67 +36,8 @@ FIRST_PAUSE: Final = 0.05
 LONGEST_PAUSE: Final = 2.0
 """Seconds between attempts where the service names none; they double from the first on."""
 
-# ------------------------------------------------------------------------- arguments of a question
-
-Body: TypeAlias = Mapping[str, Any]
-"""Any part of a request, as in the HTTP contract."""
-
 Objects: TypeAlias = Iterable[str | Detection | Body]
 """Labels, detections, or detections as in the HTTP contract."""
-
-
-class SceneFields(TypedDict, total=False):
-    """The fields of `SceneRequest`; relations and pairs may be plain tuples of names."""
-
-    relations: Iterable[Relation | Body | tuple[str, RelationName, str]]
-    relations_complete: bool
-    room_type: str
-    frame_id: str
-    stamp: Stamp | Body
-    viewpoint: Viewpoint | Body
-    model: str
-    seed: int
-    unknown_labels: UnknownLabels
-
-
-class RelationsFields(SceneFields, total=False):
-    """The fields of `RelationsRequest`."""
-
-    top_k: int
-    min_probability: float
-    pairs: Iterable[Pair | Body | tuple[str, str]]
-    include_opposites: bool
-
-
-class MissingFields(SceneFields, total=False):
-    """The fields of `MissingRequest`; ``at`` may be ``("on-top", "desk")``."""
-
-    coverage: float
-    top_k: int
-    candidates: Iterable[str]
-    at: Anchor | Body | tuple[RelationName, str]
-
-
-class OutliersFields(SceneFields, total=False):
-    """The fields of `OutliersRequest`."""
-
-    sensitivity: Sensitivity
-    threshold: float
-
-
-class GenerateFields(SceneFields, total=False):
-    """The fields of `GenerateRequest`."""
-
-    count: int
-    steps: int
-    temperature: float
-    context: Mapping[str, Sequence[int]]
-
-
-class AliasFields(TypedDict, total=False):
-    """The fields of `AliasRequest` beside the model."""
-
-    expected: str | None
 
 
 # ------------------------------------------------------------------------------------ one call
@@ -187,33 +112,13 @@ def segment(name: str) -> str:
     return quote(name, safe="")
 
 
-# --------------------------------------------------------------------------------- four questions
-
-
-@dataclass(frozen=True, slots=True)
-class Question(Generic[RequestT, AnswerT]):
-    """One of the four questions: its address, and the classes of its request and answer."""
-
-    path: str
-    request: type[RequestT]
-    answer: type[AnswerT]
-    batch: type[BatchAnswer[AnswerT]]
-
-
-RELATIONS: Final = Question(
-    "/relations", RelationsRequest, RelationsAnswer, BatchAnswer[RelationsAnswer]
-)
-MISSING: Final = Question("/missing", MissingRequest, MissingAnswer, BatchAnswer[MissingAnswer])
-OUTLIERS: Final = Question(
-    "/outliers", OutliersRequest, OutliersAnswer, BatchAnswer[OutliersAnswer]
-)
-GENERATE: Final = Question(
-    "/generate", GenerateRequest, GenerateAnswer, BatchAnswer[GenerateAnswer]
-)
+# -------------------------------------------------------------------------------------- questions
 
 
 def ask(
-    question: Question[RequestT, AnswerT],
+    path: str,
+    form: type[RequestT],
+    answer: type[AnswerT],
     scene: Any,
     fields: Mapping[str, Any],
     model: str | None = None,
@@ -221,6 +126,8 @@ def ask(
     """One question about one scene.
 
     Args:
+        path: the address of the question.
+        form, answer: its schemas.
         scene: objects, a whole request, or its body as in the HTTP contract.
         fields: further fields, where ``scene`` is objects.
         model: asked where the request names none.
@@ -228,27 +135,30 @@ def ask(
     Raises:
         InvalidRequestError: the service would refuse it.
     """
-    request = _request(question.request, scene, fields, model)
-    return Call("POST", question.path, question.answer, _json(request))
+    return Call("POST", path, answer, _json(_request(form, scene, fields, model)))
 
 
 def ask_each(
-    question: Question[RequestT, AnswerT], scenes: Iterable[Any], model: str | None = None
-) -> Call[BatchAnswer[AnswerT]]:
-    """One question about many scenes, each as in `ask`.
+    path: str,
+    form: type[SceneRequest],
+    answer: type[T],
+    scenes: Iterable[Any],
+    model: str | None = None,
+) -> Call[T]:
+    """One question about many scenes, each as in `ask`; the answer is that of the batch.
 
     Raises:
         InvalidRequestError: the service would refuse one of them.
     """
     requests = [
-        _json(_request(question.request, scene, {}, model, ("scenes", place)))
+        _json(_request(form, scene, {}, model, ("scenes", place)))
         for place, scene in enumerate(scenes)
     ]
     if not 1 <= len(requests) <= MAX_BATCH:
         message = f"must hold from 1 to {MAX_BATCH} scenes"
         raise InvalidRequestError([FieldError(pointer="#/scenes", message=message)])
     body = f'{{"scenes":[{",".join(requests)}]}}'
-    return Call("POST", f"{question.path}/batch", question.batch, body)
+    return Call("POST", f"{path}/batch", answer, body)
 
 
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:

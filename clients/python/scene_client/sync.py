@@ -11,42 +11,30 @@ from typing import Final, Self, Unpack, overload
 
 import httpx
 
-from scene_client.calls import (
-    GENERATE,
-    MISSING,
-    OUTLIERS,
-    RELATIONS,
-    AliasFields,
-    Body,
-    Call,
-    GenerateFields,
-    MissingFields,
-    Objects,
-    OutliersFields,
-    RelationsFields,
-    T,
-    ask,
-    ask_each,
-    promote,
-    segment,
-)
+from scene_client.calls import Call, Objects, T, ask, ask_each, promote, segment
 from scene_client.connection import RETRIES, DeadlineTransport, Options, deadline
 from scene_client.errors import AnswerError, DeadlineError, ProblemError, UnreachableError
 from scene_client.schemas import (
     AliasAnswer,
+    AliasFields,
     BatchAnswer,
+    Body,
     ContextsAnswer,
     GenerateAnswer,
+    GenerateFields,
     GenerateRequest,
     Health,
     MissingAnswer,
+    MissingFields,
     MissingRequest,
     ModelList,
     ModelSummary,
     OutliersAnswer,
+    OutliersFields,
     OutliersRequest,
     RefreshAnswer,
     RelationsAnswer,
+    RelationsFields,
     RelationsRequest,
     VersionDetails,
     VocabularyAnswer,
@@ -109,7 +97,10 @@ class Client:
         **fields: Unpack[RelationsFields],
     ) -> RelationsAnswer:
         """How do these objects stand to each other?"""
-        return self._call(ask(RELATIONS, objects, fields, self.options.model), timeout)
+        call = ask(
+            "/relations", RelationsRequest, RelationsAnswer, objects, fields, self.options.model
+        )
+        return self._call(call, timeout)
 
     def missing(
         self,
@@ -119,7 +110,9 @@ class Client:
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
         """What else should be here, and where?"""
-        return self._call(ask(MISSING, objects, fields, self.options.model), timeout)
+        form, answer = MissingRequest, MissingAnswer
+        call = ask("/missing", form, answer, objects, fields, self.options.model)
+        return self._call(call, timeout)
 
     def outliers(
         self,
@@ -129,7 +122,10 @@ class Client:
         **fields: Unpack[OutliersFields],
     ) -> OutliersAnswer:
         """What does not belong here, or stands in the wrong place?"""
-        return self._call(ask(OUTLIERS, objects, fields, self.options.model), timeout)
+        call = ask(
+            "/outliers", OutliersRequest, OutliersAnswer, objects, fields, self.options.model
+        )
+        return self._call(call, timeout)
 
     def generate(
         self,
@@ -139,7 +135,10 @@ class Client:
         **fields: Unpack[GenerateFields],
     ) -> GenerateAnswer:
         """What would a scene like this look like?"""
-        return self._call(ask(GENERATE, objects, fields, self.options.model), timeout)
+        call = ask(
+            "/generate", GenerateRequest, GenerateAnswer, objects, fields, self.options.model
+        )
+        return self._call(call, timeout)
 
     # -------------------------------------------------------------------------------- batches
 
@@ -150,7 +149,9 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
         """As `relations`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return self._call(ask_each(RELATIONS, scenes, self.options.model), timeout)
+        form, answer = RelationsRequest, BatchAnswer[RelationsAnswer]
+        call = ask_each("/relations", form, answer, scenes, self.options.model)
+        return self._call(call, timeout)
 
     def missing_batch(
         self,
@@ -159,7 +160,9 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
         """As `missing`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return self._call(ask_each(MISSING, scenes, self.options.model), timeout)
+        form, answer = MissingRequest, BatchAnswer[MissingAnswer]
+        call = ask_each("/missing", form, answer, scenes, self.options.model)
+        return self._call(call, timeout)
 
     def outliers_batch(
         self,
@@ -168,7 +171,9 @@ class Client:
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
         """As `outliers`, for up to 256 scenes; what the model refuses spoils one entry only."""
-        return self._call(ask_each(OUTLIERS, scenes, self.options.model), timeout)
+        form, answer = OutliersRequest, BatchAnswer[OutliersAnswer]
+        call = ask_each("/outliers", form, answer, scenes, self.options.model)
+        return self._call(call, timeout)
 
     # --------------------------------------------------------------------------------- models
 

@@ -8,7 +8,8 @@ infinity, every text and list bounded. What needs a model's vocabulary or the wh
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Generic, Literal, Self, TypeAlias, TypedDict, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -28,7 +29,6 @@ MAX_RELATIONS = 65536
 """No setting allows more, and a million wrong ones would take seconds to name."""
 
 UnknownLabels = Literal["error", "ignore", "nearest"]
-Sensitivity = Literal["low", "medium", "high"]
 RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "above", "below"]
 
 
@@ -46,6 +46,10 @@ UnitNumber = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Label = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_plain_text)]
 Name = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(_plain_text)]
 ModelSpec = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_plain_text)]
+
+
+Body: TypeAlias = Mapping[str, Any]
+"""Any part of a request, as in the HTTP contract."""
 
 
 class Request(BaseModel):
@@ -156,20 +160,6 @@ class Relation(Request):
     object: Name
 
 
-class Pair(Request):
-    """Two objects, each by its id or an unambiguous label."""
-
-    subject: Name
-    object: Name
-
-
-class Anchor(Request):
-    """A place: in ``relation`` to ``object`` ("on-top" of the "desk")."""
-
-    relation: RelationName
-    object: Name
-
-
 class SceneRequest(Request):
     """What the robot sees, and which model to ask."""
 
@@ -215,100 +205,18 @@ class SceneRequest(Request):
     ] = "error"
 
 
-class RelationsOptions(Request):
-    """What `/relations` is asked beside the scene."""
+class SceneFields(TypedDict, total=False):
+    """The fields of `SceneRequest`; relations and pairs may be plain tuples of names."""
 
-    top_k: Annotated[int, Field(ge=1, le=4096, description="how many relations at most")] = 20
-    min_probability: Annotated[Probability, Field(description="leave out what is less likely")] = (
-        0.0
-    )
-    pairs: Annotated[
-        list[Pair] | None,
-        Field(
-            min_length=1, max_length=4096, fail_fast=True, description="only these ordered pairs"
-        ),
-    ] = None
-    include_opposites: Annotated[
-        bool, Field(description="also report right, behind, under and below")
-    ] = False
-
-
-class RelationsRequest(RelationsOptions, SceneRequest):
-    """How do these objects stand to each other?"""
-
-    objects: SomeObjects
-
-
-class MissingOptions(Request):
-    """What `/missing` is asked beside the scene."""
-
-    coverage: Annotated[
-        Probability | None,
-        Field(
-            description="probability that an object which is there is listed: 1 where the whole "
-            "scene is seen, so that an unlisted class counts as absent; 0 where unlisted classes "
-            "say nothing; left out: the model's own",
-        ),
-    ] = None
-    top_k: Annotated[
-        int, Field(ge=1, description="how many objects at most; not above the vocabulary")
-    ] = 10
-    candidates: Annotated[
-        list[Label] | None,
-        Field(min_length=1, max_length=4096, description="only these labels"),
-    ] = None
-    at: Annotated[Anchor | None, Field(description="what is missing at this place?")] = None
-
-
-class MissingRequest(MissingOptions, SceneRequest):
-    """What else should be here, and where?"""
-
-    objects: SomeObjects
-
-
-class OutliersOptions(Request):
-    """What `/outliers` is asked beside the scene."""
-
-    sensitivity: Annotated[
-        Sensitivity,
-        Field(
-            description="how readily an alarm is raised: in about 2, 10 or 20 % of untouched "
-            "scenes of the hardest large source, and of lists of few classes"
-        ),
-    ] = "medium"
-    threshold: Annotated[
-        Probability | None,
-        Field(
-            description="an object is an outlier from this probability on; left out: the model's "
-            "threshold for `sensitivity`",
-        ),
-    ] = None
-
-
-class OutliersRequest(OutliersOptions, SceneRequest):
-    """What does not belong here, or stands in the wrong place?"""
-
-    objects: SomeObjects
-
-
-class GenerateRequest(SceneRequest):
-    """What would a scene like this look like?"""
-
-    objects: Annotated[
-        list[SceneObject], Field(max_length=256, description="evidence; may be empty")
-    ] = []
-    count: Annotated[int, Field(ge=1, le=64, description="how many scenes")] = 1
-    steps: Annotated[
-        int | None, Field(ge=1, le=2000, description="Gibbs sweeps; left out: the model's own")
-    ] = None
-    temperature: Annotated[
-        float,
-        Field(ge=0.05, le=20, allow_inf_nan=False, description="above 1: more varied scenes"),
-    ] = 1.0
-    context: Annotated[
-        dict[Name, Annotated[list[UnitNumber], Field(max_length=4096)]] | None,
-        Field(max_length=8, description="layer name to the numbers of its units that are on"),
-    ] = None
+    relations: Iterable[Relation | Body | tuple[str, RelationName, str]]
+    relations_complete: bool
+    room_type: str
+    frame_id: str
+    stamp: Stamp | Body
+    viewpoint: Viewpoint | Body
+    model: str
+    seed: int
+    unknown_labels: UnknownLabels
 
 
 class AliasRequest(Request):
@@ -322,6 +230,12 @@ class AliasRequest(Request):
             "exist; left out: wherever it leads"
         ),
     ] = None
+
+
+class AliasFields(TypedDict, total=False):
+    """The fields of `AliasRequest` beside the model."""
+
+    expected: str | None
 
 
 RequestT = TypeVar("RequestT", bound=SceneRequest)
