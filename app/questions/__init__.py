@@ -11,24 +11,19 @@ scene gets the same answer. Objects are named by their position in the scene.
 
 from __future__ import annotations
 
-from app.questions.answers import (
-    Because,
-    ContextUnit,
-    Disagreement,
-    GeneratedScene,
+from app.questions.contexts import ContextUnit, contexts
+from app.questions.generate import GeneratedScene, generate
+from app.questions.missing import MissingAnswer, Offset, Placement, missing
+from app.questions.outliers import (
     MisplacedAnswer,
-    MissingAnswer,
-    Offset,
     OutlierAnswer,
     OutliersFound,
-    Placement,
-    RelationAnswer,
+    Sensitivity,
+    misplaced,
+    outliers,
 )
-from app.questions.contexts import contexts
-from app.questions.generate import generate
-from app.questions.missing import missing
-from app.questions.outliers import Sensitivity, misplaced, outliers
-from app.questions.relations import relations
+from app.questions.ranking import Because
+from app.questions.relations import Disagreement, RelationAnswer, relations
 
 __all__ = [
     "Because",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.questions.answers import ContextUnit
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL
 
@@ -20,6 +20,26 @@ ROOM_TYPES = 3
 _NAMED = 3
 Floats = NDArray[np.float32]
 Named = TypeVar("Named")
+
+
+@dataclass(frozen=True, slots=True)
+class ContextUnit:
+    """A hidden unit by the classes that it favours.
+
+    Attributes:
+        unit: its number in the layer.
+        name: for people to read.
+        objects: (label, weight) of the objects it favours most.
+        relations: ((subject, relation, object), weight) of the relations it favours most, beyond
+            the mean over the layer.
+        room_types: (room type, weight) of the room types that favour it most.
+    """
+
+    unit: int
+    name: str
+    objects: tuple[tuple[str, float], ...]
+    relations: tuple[tuple[tuple[str, str, str], float], ...]
+    room_types: tuple[tuple[str, float], ...]
 
 
 def contexts(artifact: Artifact) -> dict[str, tuple[ContextUnit, ...]]:

@@ -13,6 +13,7 @@ What a request gives is never a reason. The last of `ATTEMPTS` draws is always t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -22,7 +23,6 @@ from app.compiling import compiled
 from app.inference import MachineSpec, Weights
 from app.inference.chains import ConditionedChains, Conditions, Drawn, random_stream
 from app.inference.elementary import softplus
-from app.questions.answers import GeneratedScene
 from app.questions.outliers import outliers
 from app.questions.posterior import given_relations, present
 from app.registry.artifact import Artifact
@@ -40,6 +40,23 @@ ATTEMPTS: Final = 8
 # The direction of each relation: left, front or, for all others, up. A thing on another is higher,
 # as one above it.
 _DIRECTION: Final = np.array([{LEFT: 1, FRONT: 2}.get(a, 0) for a in range(len(CANONICAL))])
+
+
+@dataclass(frozen=True, slots=True)
+class GeneratedScene:
+    """A drawn scene.
+
+    Attributes:
+        objects: canonical labels of its classes, in the order of the vocabulary.
+        relations: canonical (subject, relation, object) over labels.
+        log_score: see `ConditionedChains.log_score`; comparable between scenes of one model.
+        context: layer name to its active units.
+    """
+
+    objects: tuple[str, ...]
+    relations: tuple[tuple[str, str, str], ...]
+    log_score: float
+    context: dict[str, tuple[int, ...]]
 
 
 def generate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from app.compiling import compiled
 from app.inference.elementary import sigmoid
 from app.inference.relations import NO_UNIT
-from app.questions.answers import (
-    EXPLAINED,
-    Because,
-    MissingAnswer,
-    Offset,
-    Placement,
-)
 from app.questions.calibration import placed_logits, placement_log_p
 from app.questions.posterior import Posterior, posterior
-from app.questions.ranking import best, entries, likeliest_places, strongest_reasons
+from app.questions.ranking import (
+    EXPLAINED,
+    Because,
+    best,
+    entries,
+    likeliest_places,
+    strongest_reasons,
+)
 from app.registry.artifact import Artifact
 from app.registry.offsets import NOTHING, Offsets, look_up
 from app.scene.frames import Axes, viewer_axes
@@ -39,6 +39,47 @@ PLACES: Final = 3
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
 _UNTURNED: Final = np.eye(3)
 _PER_METRE: Final = 1000.0  # answers are rounded to millimetres
+
+
+class Offset(NamedTuple):
+    """From the centre of an anchor to that of a missing thing, in metres.
+
+    Attributes:
+        mean, std: along x, y and z.
+        scenes: training scenes that showed the two classes so.
+    """
+
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    scenes: int
+
+
+class Placement(NamedTuple):
+    """A missing thing would stand in `relation` to `object`, at `offset` from it where known."""
+
+    relation: str
+    object: int
+    probability: float
+    offset: Offset | None = None
+
+
+class MissingAnswer(NamedTuple):
+    """An absent class.
+
+    Attributes:
+        label: canonical.
+        probability: that it is the one that was taken away, given that exactly one was (with a
+            place: given that it stood there).
+        log_odds: of its presence against its absence.
+        placements: where it would stand, likeliest first.
+        because: the objects that change its log-odds most, strongest first.
+    """
+
+    label: str
+    probability: float
+    log_odds: float
+    placements: tuple[Placement, ...]
+    because: tuple[Because, ...]
 
 
 def missing(

@@ -17,22 +17,15 @@ increase and probability beside i, and an increase below half of the largest one
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference.elementary import sigmoid
-from app.questions.answers import (
-    EXPLAINED,
-    Because,
-    MisplacedAnswer,
-    OutlierAnswer,
-    OutliersFound,
-)
 from app.questions.calibration import false_log_odds, intruder_line
 from app.questions.posterior import Posterior, posterior
-from app.questions.ranking import best, entries, strongest_reasons
+from app.questions.ranking import EXPLAINED, Because, best, entries, strongest_reasons
 from app.registry.artifact import Artifact
 from app.registry.description import Calibration, Thresholds
 from app.scene.relations import CANONICAL
@@ -48,6 +41,56 @@ COMPANIONS: Final = 3
 """How many classes an answer names."""
 
 _LEAST_SHARE: Final = 0.5  # of the largest increase
+
+
+class OutlierAnswer(NamedTuple):
+    """How badly an object fits.
+
+    Attributes:
+        object, label: which one; the label is canonical.
+        probability: that it is an intruder, where half of the scenes are clean.
+        log_odds: of its class being present given the rest of the scene.
+        is_outlier: the probability reaches the threshold.
+        because: the objects that make it unlikely, strongest first; of one that fits, those that
+            make it likely.
+        usually_with: absent classes that would make it likely, at most three; of outliers only.
+    """
+
+    object: int
+    label: str
+    probability: float
+    log_odds: float
+    is_outlier: bool
+    because: tuple[Because, ...]
+    usually_with: tuple[str, ...] = ()
+
+
+class MisplacedAnswer(NamedTuple):
+    """A relation of the scene and the probability that it is false.
+
+    Attributes:
+        is_misplaced: the probability reaches the threshold.
+    """
+
+    subject: int
+    relation: str
+    object: int
+    probability: float
+    is_misplaced: bool = False
+
+
+class OutliersFound(NamedTuple):
+    """What does not belong, and what stands in the wrong place.
+
+    Attributes:
+        threshold: probability from which an object is an outlier.
+        outliers: every object, least fitting first.
+        misplaced: every stated relation, least likely first.
+    """
+
+    threshold: float
+    outliers: tuple[OutlierAnswer, ...]
+    misplaced: tuple[MisplacedAnswer, ...]
 
 
 def outliers(

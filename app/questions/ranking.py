@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.compiling import compiled
 from app.inference.relations import NO_UNIT
-from app.questions.answers import REASONS, Because
 from app.questions.calibration import exclusive, relation_probability
 
 DIGITS: Final = 6
@@ -25,6 +24,20 @@ _POWERS: Final = np.array([10.0**power for power in range(23)])
 
 
 TupleT = TypeVar("TupleT", bound=tuple[Any, ...])
+
+
+REASONS: Final = 3
+"""How many objects an answer names as reasons."""
+
+EXPLAINED: Final = 32
+"""Reasons are given for so many entries of an answer at most, its first."""
+
+
+class Because(NamedTuple):
+    """What the presence of one object adds to the log-odds of another; negative speaks against."""
+
+    object: int
+    log_odds_change: float
 
 
 def entries(kind: type[TupleT], *columns: Iterable[Any]) -> list[TupleT]:

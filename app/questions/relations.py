@@ -15,11 +15,11 @@ other way round, whichever of the two is likelier.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.questions.answers import Disagreement, RelationAnswer
 from app.questions.posterior import Posterior, Present, posterior, relations_given
 from app.questions.ranking import disagreeing, entries, likeliest_relations, observed_pairs
 from app.registry.artifact import Artifact
@@ -31,6 +31,40 @@ EXPECTED = 0.5
 
 Of two relations that are both unlikely, the likelier one says little.
 """
+
+
+class RelationAnswer(NamedTuple):
+    """`subject` stands in `relation` to `object`.
+
+    Attributes:
+        probability: that the relation holds, given that both are in the scene.
+        observed: the scene states it, or its poses show it.
+    """
+
+    subject: int
+    relation: str
+    object: int
+    probability: float
+    observed: bool = False
+
+
+class Disagreement(NamedTuple):
+    """Two objects that stand otherwise than the rest of the scene makes one expect.
+
+    Attributes:
+        subject, object: which two.
+        observed: relations of the one to the other that were stated or observed.
+        expected: the likeliest relation, judged without all that is known of the pair.
+        probability: of it, as that of a `RelationAnswer`.
+        observed_probability: of the likeliest observed one.
+    """
+
+    subject: int
+    object: int
+    observed: tuple[str, ...]
+    expected: str
+    probability: float
+    observed_probability: float
 
 
 def relations(
