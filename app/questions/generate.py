@@ -23,8 +23,8 @@ from app.compiling import compiled
 from app.inference import MachineSpec, Weights
 from app.inference.chains import ConditionedChains, Conditions, Drawn, random_stream
 from app.inference.elementary import softplus
-from app.questions.outliers import outliers
-from app.questions.posterior import given_relations, present
+from app.questions.outliers import intruder_probability
+from app.questions.posterior import given_relations, posterior, present
 from app.registry.artifact import Artifact
 from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP
 from app.scene.scene import Scene, SceneObject
@@ -214,8 +214,9 @@ def staying(
         np.ascontiguousarray(every[:, 0]),
         *(places.reshape(-1, 2), order[possible[order]], len(fixed), len(classes)),
     )
-    shape = len(CANONICAL), len(structure), len(structure)
-    stay |= np.isin(np.ravel_multi_index(units.T, shape), np.ravel_multi_index(fixed.T, shape))
+    if given:
+        shape = len(CANONICAL), len(structure), len(structure)
+        stay |= np.isin(np.ravel_multi_index(units.T, shape), np.ravel_multi_index(fixed.T, shape))
     return stay
 
 
@@ -278,15 +279,16 @@ class Plausible:
         """Whether a drawn scene of these classes is one."""
         if len(classes) < self._least or not self._suits_room(classes):
             return False
+        if not classes:
+            return True
         labels = self._artifact.vocabulary.labels
         objects = [SceneObject(labels[index], labels[index], index) for index in classes]
         judged = Scene(tuple(objects), room_type=self._room)
         # A drawn scene is whole, however few its classes are.
         whole = self._artifact.calibration.outlier_thresholds.medium
-        found = outliers(self._artifact, judged, threshold=whole, details=False).outliers
-        return not any(
-            entry.is_outlier and classes[entry.object] not in self._given for entry in found
-        )
+        given = posterior(self._artifact, judged)
+        is_intruder = intruder_probability(self._artifact, given) >= whole
+        return self._given.issuperset(given.present.classes[is_intruder].tolist())
 
     def _suits_room(self, classes: list[int]) -> bool:
         limits = self._artifact.calibration.room_fit

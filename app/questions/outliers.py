@@ -130,12 +130,10 @@ def outliers(
         listed = int((~artifact.vocabulary.structure[classes]).sum())
         threshold = _threshold(_presets(calibration, listed), sensitivity)
     log_odds = given.log_odds_given_rest()
-    intercept, slope = intruder_line(calibration, len(log_odds))
-    logits = intercept + slope * _adjusted(artifact, classes, log_odds).astype(np.float64)
-    logits[artifact.vocabulary.structure[classes]] = -np.inf
+    logits = _intruder_logits(artifact, classes, log_odds)
     # By logit: probabilities near 0 or 1 may all round to one number.
     order = np.argsort(-logits[given.present.row], kind="stable")
-    p = np.where(np.isinf(logits), 0.0, sigmoid(logits))
+    p = _probability(logits)
     row = given.present.row[order]
     rows, labels, is_outlier = row.tolist(), artifact.vocabulary.labels, p >= threshold
     explained = list(dict.fromkeys(rows[: _affordable(given)])) if details else []
@@ -163,6 +161,26 @@ def misplaced(
     if not scene.objects:
         return ()
     return _misplaced(artifact, posterior(artifact, scene), scene, sensitivity)
+
+
+def intruder_probability(artifact: Artifact, given: Posterior) -> NDArray[np.float64]:
+    """The probability that a class of the scene is an intruder, (n,); see `outliers`."""
+    log_odds = given.log_odds_given_rest()
+    return _probability(_intruder_logits(artifact, given.present.classes, log_odds))
+
+
+def _intruder_logits(
+    artifact: Artifact, classes: NDArray[np.int64], log_odds: NDArray[np.floating[Any]]
+) -> NDArray[np.float64]:
+    """Logits of the probability that each class is an intruder, (n,); -inf for structure."""
+    intercept, slope = intruder_line(artifact.calibration, len(log_odds))
+    logits = intercept + slope * _adjusted(artifact, classes, log_odds).astype(np.float64)
+    logits[artifact.vocabulary.structure[classes]] = -np.inf
+    return logits
+
+
+def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(np.isinf(logits), 0.0, sigmoid(logits))
 
 
 def _presets(calibration: Calibration, listed: int) -> Thresholds:
