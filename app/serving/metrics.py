@@ -1,7 +1,7 @@
 """Metrics for Prometheus: counted where it happens, written out when `/metrics` is asked.
 
 Every label has few values, whatever clients send: routes by their templates, models only while
-they are served. A replica is one process and tells its own; see docs/decisions/queues.md.
+they are served. A replica is one process and tells its own; see docs/decisions/artifacts.md.
 """
 
 from __future__ import annotations
