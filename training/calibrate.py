@@ -3,9 +3,8 @@
 All fits use validation scenes. The entries are:
 
     missing, outlier   see `training.calibrate_objects`
-    relation   the relation holds between this pair of instances; one fit for scenes without
-    observed
-               relations, another for scenes where half of the pairs are observed
+    relation   the relation holds between this pair of instances; fitted once for scenes without
+               observed relations, and once for scenes where half of the pairs are observed
     placement  the same for a pair whose subject or object was removed from the scene
     misplaced  the relation is false; one triple was altered in half of the scenes
 
@@ -59,9 +58,9 @@ _OF_THE_REST = 0.02
 _ROUNDS = 3
 # Columns of an example; column 0 is the scene.
 _RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 5, 6
-# The weight of a source's examples is their number to the power of -_POWER. The share of 3DSSG
-# pairs whose likeliest of eight relations is right: .62 at power 0, .73 at .25, .82 at .5. A
-# frequency table reaches .75.
+# The weight of an example is the number of listed examples of its source, to the power -_POWER.
+# Share of 3DSSG pairs whose likeliest of eight relations is right: .62 at power 0, .73 at .25,
+# .82 at .5. A frequency table reaches .75.
 _POWER = 0.5
 # The curve of all relations: the number of its bends, its least slope, and the penalty on each
 # change of slope (in log-likelihood).

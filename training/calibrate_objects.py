@@ -224,7 +224,7 @@ def fit_coverage(
 
 
 def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
-    """Choose coverage and weight by MRR; nearly complete lists may lose `_COMPLETE_LOSS` at most."""
+    """Choose coverage and weight by MRR; nearly complete lists lose `_COMPLETE_LOSS` at most."""
     nearly = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
     least = [_mrr(some, 0.5, 0.0) - _COMPLETE_LOSS for some in nearly]
     allowed = [(0.5, 0.0)] + [
@@ -288,8 +288,7 @@ def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
 
 
 def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
-    """Return the mean of 1 / rank of hidden classes among non-hidden ones; sources count equally.
-    """
+    """Return the mean of 1 / rank of hidden classes among other classes; sources count equally."""
     found: dict[int, list[Floats]] = {}
     for case in cases:
         z = _mixed(case, coverage, weight)
