@@ -163,7 +163,7 @@ def relation_log_odds(
     *,
     count: int = 64,
 ) -> tuple[Tensor, Tensor]:
-    """Return log-odds, with standard errors, of units of `edges` that the evidence does not contain.
+    """Return log-odds, with standard errors, of units of `edges` that the evidence does not have.
 
     p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms. x_e is the shift
     implied by the observed relations. The log-odds are -inf where the gate is off.
