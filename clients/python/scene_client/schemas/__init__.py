@@ -1,4 +1,4 @@
-"""The HTTP contract: plain pydantic, shared by the service and its clients."""
+"""The HTTP contract as pydantic models, which the service and its clients share."""
 
 from __future__ import annotations
 

@@ -20,21 +20,21 @@ class Reply(BaseModel):
 
 
 class FieldError(Reply):
-    """One thing that is wrong with a request."""
+    """One error in a request."""
 
     pointer: Annotated[
         str,
         Field(description="JSON pointer into the body, as a URI fragment (RFC 6901, section 6)"),
     ]
     message: str
-    suggestions: Annotated[list[str], Field(description="nearest known names, best first")] = []
+    suggestions: Annotated[list[str], Field(description="similar known names, best first")] = []
 
 
 class Failure(Reply):
-    """Something in the store that cannot be used, and why."""
+    """An entry of the model store that cannot be used, and the reason."""
 
     subject: Annotated[str, Field(description="`name@version`, an alias, or `store`")]
-    reason: Annotated[str, Field(description="a stable code")]
+    reason: Annotated[str, Field(description="a stable code of the reason")]
     detail: str
 
 
@@ -45,13 +45,16 @@ class Problem(Reply):
     title: str
     status: int
     detail: str
-    instance: Annotated[str, Field(description="the problem's page, the request id as fragment")]
+    instance: Annotated[
+        str, Field(description="path of the problem's page with the request id as fragment")
+    ]
     request_id: str
     errors: Annotated[
-        list[FieldError] | None, Field(description="what is wrong, and where; at most 100 entries")
+        list[FieldError] | None, Field(description="errors with their places, at most 100")
     ] = None
     failures: Annotated[
-        list[Failure] | None, Field(description="what a refresh refused, and why")
+        list[Failure] | None,
+        Field(description="entries of the store that a refresh refused, with reasons"),
     ] = None
 
 
@@ -59,7 +62,7 @@ class Problem(Reply):
 
 
 class ModelReference(Reply):
-    """Which model answered."""
+    """The model that answered."""
 
     name: str
     version: str
@@ -69,60 +72,67 @@ class ModelReference(Reply):
 
 @dataclass(slots=True)
 class ObservedRelation:
-    """A relation between two objects (by id) that their positions show."""
+    """A relation between two objects (by id), derived from their positions."""
 
-    # No model: a scene of a dozen objects shows some fifty, and a model takes ten times as long.
+    # A dataclass: a scene of a dozen objects has some fifty of these, and a pydantic model takes
+    # ten times as long.
     subject: str
     relation: RelationName
     object: str
 
 
 class Mapped(Reply):
-    """A label that the model does not know, and the class that stands for it."""
+    """A label that the model does not know, and the class that replaces it."""
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
 
-    label: Annotated[str, Field(description="as given: of an object, a candidate, or the room")]
-    class_: Annotated[str, Field(alias="class", description="the canonical label")]
+    label: Annotated[
+        str, Field(description="the label in the request: of an object, a candidate or the room")
+    ]
+    class_: Annotated[str, Field(alias="class", description="canonical label of the class")]
     similarity: Annotated[
-        float, Field(ge=0, le=1, description="of the names, by spelling and common words")
+        float,
+        Field(ge=0, le=1, description="similarity of the names, by spelling and common words"),
     ]
 
 
 class SceneWarning(Reply):
-    """Something in the scene that is probably a mistake. The scene is answered all the same."""
+    """A probable mistake in the scene. The scene is answered nevertheless."""
 
     code: Annotated[
         Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"],
         Field(
-            description="a position beyond 100 m (are these millimetres?); a side below 1 mm or "
-            "above 20 m; one depth for all objects in an optical frame; vertical relations that "
-            "are unobserved because sizes are unknown"
+            description="implausible-position: beyond 100 m, perhaps in millimetres. "
+            "implausible-size: a side below 1 mm or above 20 m. flat-scene: equal depth of all "
+            "objects in an optical frame. unknown-sizes: vertical relations are unobserved "
+            "because sizes are unknown"
         ),
     ]
     message: str
-    objects: Annotated[list[str], Field(description="ids of the objects concerned")]
+    objects: Annotated[list[str], Field(description="ids of the objects of the warning")]
 
 
 class Answer(Reply):
-    """What every answer carries."""
+    """Fields that every answer has."""
 
     model: ModelReference
-    request_id: Annotated[str, Field(description="of the X-Request-Id header, or drawn")]
-    frame_id: Annotated[str | None, Field(description="as given")] = None
-    stamp: Annotated[Stamp | None, Field(description="as given")] = None
+    request_id: Annotated[
+        str, Field(description="value of the X-Request-Id header, or a random id")
+    ]
+    frame_id: Annotated[str | None, Field(description="as in the request")] = None
+    stamp: Annotated[Stamp | None, Field(description="as in the request")] = None
     ignored: Annotated[
         list[str],
         Field(
-            description="with `unknown_labels: ignore`: ids of the objects, and the candidates and "
-            "room type, that this model does not know and the answer left out"
+            description="with `unknown_labels: ignore`: ids of objects, candidates and the room "
+            "type that the model does not know; the answer leaves them out"
         ),
     ] = []
     mapped: Annotated[
         list[Mapped],
         Field(
-            description="with `unknown_labels: nearest`: labels this model does not know, and the "
-            "class that each was taken for"
+            description="with `unknown_labels: nearest`: labels that the model does not know, "
+            "with the class that replaces each"
         ),
     ] = []
     warnings: Annotated[
@@ -130,7 +140,7 @@ class Answer(Reply):
     ] = []
     observed_relations: Annotated[
         list[ObservedRelation] | None,
-        Field(description="derived from positions; absent if none were given"),
+        Field(description="relations derived from positions; absent without positions"),
     ] = None
 
 
@@ -145,14 +155,15 @@ class ScoredRelation(Reply):
 
 @dataclass(slots=True)
 class Disagreement:
-    """Two objects (by id) that stand otherwise than the rest of the scene makes one expect.
+    """Two objects (by id) whose observed relation differs from the expected one.
 
-    `observed`: relations of `subject` to `object` that were stated or derived. `expected`: the
-    likeliest relation without all that is known of how the two stand, with its `probability`;
-    `observed_probability`: of the likeliest observed one.
+    `observed`: stated or derived relations of `subject` to `object`. `expected`: the likeliest
+    relation given the rest of the scene, without any observed relation of the two objects.
+    `probability`: probability of `expected`. `observed_probability`: probability of the likeliest
+    observed relation.
     """
 
-    # No model either: half of the observed relations may be in it.
+    # A dataclass too, because half of the observed relations may appear here.
     subject: str
     object: str
     observed: list[RelationName]
@@ -164,29 +175,29 @@ class Disagreement:
 class ExpectedRelation(ScoredRelation):
     """A relation and the probability that it holds, given that both objects are in the scene."""
 
-    observed: Annotated[bool, Field(description="the request states it, or positions show it")] = (
-        False
-    )
+    observed: Annotated[
+        bool, Field(description="the request states the relation, or positions show it")
+    ] = False
 
 
 class RelationsAnswer(Answer):
     """Relations, best first.
 
-    `probability`: the relation holds between the two, given that both are in the scene.
+    `probability`: the relation holds between the two objects, given that both are in the scene.
     """
 
     relations: list[ExpectedRelation]
     disagreements: Annotated[
         list[Disagreement],
         Field(
-            description="where another relation than what was stated or observed is expected: "
-            "from the rest of the scene alone it has a probability of at least one half; largest "
-            "ratio of the probabilities first, at most `top_k`"
+            description="pairs whose stated or derived relation differs from the expected one. The "
+            "expected relation has a probability of at least one half given the rest of the scene. "
+            "Largest ratio of the probabilities first, at most `top_k`"
         ),
     ]
 
 
-# No models: an answer holds thirty of them, and a model takes ten times as long.
+# Dataclasses: an answer has thirty of these, and a pydantic model takes ten times as long.
 @dataclass(slots=True)
 class Vector:
     """Metres along the axes of ``frame_id``."""
@@ -198,12 +209,13 @@ class Vector:
 
 @dataclass(slots=True)
 class Offset:
-    """From the centre of a placement's object to that of the missing one: add it to a position.
+    """Offset from the centre of a placement's object to the centre of the missing object.
 
-    Along the axes of `frame_id`; where the request names none, away from the viewer, to the left
-    and up. `std`: a robot that looks within 1.8 of them in the plane, or 2.15 in space, finds four
-    of five. `scenes`: training scenes that showed the two classes so; 0: the offset is what is
-    usual for the relation and for either class.
+    Add it to the position of the placement's object. The axes are those of `frame_id`. Without a
+    frame they point away from the viewer, to the left and up. `std`: standard deviations. Four of
+    five objects are within 1.8 of them in the plane, or 2.15 in space. `scenes`: number of training
+    scenes with this relation of the two classes. 0: the offset is the usual one of the relation and
+    of either class.
     """
 
     mean: Vector
@@ -212,7 +224,7 @@ class Offset:
 
 
 class Placement(Reply):
-    """Where a missing object would stand: in `relation` to the object with this id."""
+    """A likely place of a missing object: in `relation` to the object with this id."""
 
     relation: RelationName
     object: str
@@ -220,17 +232,18 @@ class Placement(Reply):
     offset: Annotated[
         Offset | None,
         Field(
-            description="how far from it, in metres; absent where training saw no poses, and for "
-            "left, right, front and behind in a map, odom or world frame without a viewpoint"
+            description="offset from the object in metres; absent if the training scenes have no "
+            "poses. Also absent for left, right, front and behind in a map, odom or world frame "
+            "without a viewpoint"
         ),
     ] = None
 
 
 @dataclass(slots=True)
 class Because:
-    """How much the presence of one object (by id) changes the log-odds of another."""
+    """The change of an object's log-odds by the presence of another object (by id)."""
 
-    # No model here either: an answer holds some thirty.
+    # A dataclass too: an answer has some thirty of these.
     object: str
     log_odds_change: Finite
 
@@ -238,8 +251,8 @@ class Because:
 class MissingObject(Reply):
     """A class that is not listed.
 
-    `probability`: the object is there although it was not listed, given `coverage`. `log_odds`: of
-    its presence, before calibration.
+    `probability`: an unlisted object of the class is present, given `coverage`. `log_odds`:
+    log-odds of its presence, before calibration.
     """
 
     label: str
@@ -249,27 +262,27 @@ class MissingObject(Reply):
     because: Annotated[
         list[Because],
         Field(
-            description="objects that change its log-odds most, strongest first, at most 3; the "
-            "first 32 entries have them"
+            description="objects that change the log-odds most, strongest first, at most 3. Only "
+            "the first 32 entries have them"
         ),
     ]
 
 
 class MissingAnswer(Answer):
-    """Unlisted classes, likeliest first; their probabilities do not sum to one."""
+    """Unlisted classes, likeliest first. Their probabilities do not sum to one."""
 
     coverage: Annotated[
         Probability | None,
-        Field(description="probability that a present object is listed, as it was in force"),
+        Field(description="applied probability that a present object is listed"),
     ] = None
     missing: list[MissingObject]
 
 
 class Outlier(Reply):
-    """How badly one object fits.
+    """How well one object fits the scene.
 
-    `probability`: it does not belong, where half of the scenes hold an intruder. `log_odds`: of its
-    class being present, given the rest of the scene.
+    `probability`: the object does not belong, if half of all scenes contain an intruder.
+    `log_odds`: log-odds that its class is present, given the rest of the scene.
     """
 
     object: str
@@ -280,51 +293,52 @@ class Outlier(Reply):
     because: Annotated[
         list[Because],
         Field(
-            description="objects that support the verdict, strongest first, at most 3: of an "
-            "outlier those that make it unlikely, of any other those that make it likely"
+            description="objects that support the verdict, strongest first, at most 3. For an "
+            "outlier, they make the object unlikely; for any other object, they make it likely"
         ),
     ]
     usually_with: Annotated[
         list[str],
-        Field(description="of an outlier: absent classes that would make it likely, at most 3"),
+        Field(description="for an outlier: absent classes that would make it likely, at most 3"),
     ] = []
 
 
 class MisplacedRelation(ScoredRelation):
-    """A relation as the request spelled it, and the probability that it is false."""
+    """A relation as the request spells it, and the probability that it is false."""
 
     is_misplaced: Annotated[
-        bool, Field(description="the probability reaches the threshold for `sensitivity`")
+        bool, Field(description="true if `probability` reaches the threshold of `sensitivity`")
     ] = False
 
 
 class OutliersAnswer(Answer):
-    """Every object, least fitting first, and every relation given or observed, least likely first.
+    """Objects, least fitting first, and stated or derived relations, least likely first.
 
-    In `misplaced`, `probability`: the relation is false.
+    In `misplaced`, `probability` means that the relation is false.
     """
 
     threshold: Annotated[
         Probability | None,
-        Field(description="probability from which an object is an outlier, as it was in force"),
+        Field(description="applied probability from which an object is an outlier"),
     ] = None
     outliers: list[Outlier]
     misplaced: list[MisplacedRelation]
 
 
 class GeneratedScene(Reply):
-    """A drawn scene: labels, relations between labels, and the context that was active."""
+    """A sampled scene: labels, relations between labels, and the active context units."""
 
     objects: list[str]
     relations: list[Relation]
     log_score: Finite
     context: Annotated[
-        dict[str, list[int]], Field(description="layer name to the numbers of its active units")
+        dict[str, list[int]],
+        Field(description="numbers of the active units, by the name of the layer"),
     ]
 
 
 class GenerateAnswer(Answer):
-    """Scenes that contain the evidence; the same `seed` draws the same ones again."""
+    """Scenes that contain the given objects; an equal `seed` gives equal scenes."""
 
     seed: int
     scenes: list[GeneratedScene]
@@ -334,7 +348,7 @@ AnswerT = TypeVar("AnswerT", bound=Answer)
 
 
 class BatchEntry(Reply, Generic[AnswerT]):
-    """The outcome of one scene: a `result`, or the `problem` it would have met alone."""
+    """The outcome of one scene: a `result`, or the `problem` of the scene."""
 
     status: int
     result: AnswerT | None = None
@@ -342,7 +356,7 @@ class BatchEntry(Reply, Generic[AnswerT]):
 
 
 class BatchAnswer(Reply, Generic[AnswerT]):
-    """One entry a scene, in order."""
+    """One entry for each scene, in the order of the request."""
 
     request_id: str
     results: list[BatchEntry[AnswerT]]
