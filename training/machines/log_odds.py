@@ -180,7 +180,7 @@ def relation_log_odds(
     relations = evidence.relations(machine)
     if machine.spec.G and relations is not None:
         if relations[0] is not edges:
-            raise ValueError("implied logits need the units of the evidence as edges")
+            raise ValueError("the observed relations must have the same layout as edges")
         logits = logits + draws.implied(machine, edges, relations[1] * relations[2])
     on = logits.sigmoid()
     p = draws.mean(on)
