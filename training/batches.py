@@ -60,7 +60,7 @@ class SceneTensors:
             source_names: sorted names of the sources.
             weight: (N,) weight of each scene in object learning.
             complete: (N,) bool; true if the object list covers nearly the whole scene.
-        """
+    """
 
     scenes: Sequence[EncodedScene]
     v: Tensor

@@ -344,9 +344,8 @@ def _instance_pairs(
     """Return the examples of a scene, (examples, 7).
 
     The columns are: scene, relation, class log-odds, log n_i + log n_j, log of the number of
-        classes,
-    whether the relation holds, and the source. Of unknown relations, only the best that an answer
-    may list are included.
+    classes, whether the relation holds, and the source. Of unknown relations, only the best that an
+    answer may list are included.
     """
     evidence = scene.evidence
     place = np.searchsorted(evidence.classes, scene.instance_classes)
@@ -385,9 +384,8 @@ def fit_misplaced(
 ) -> tuple[Slope, Thresholds]:
     """Fit the log-odds that a relation is false to its log-odds given the rest of the scene.
 
-    Also return the thresholds: in the hardest source, the most suspicious relation of an unaltered
-        scene
-    reaches a threshold in the share of scenes given by `ALARMS`.
+    The thresholds are fitted to unaltered scenes. Each threshold is reached in the share of scenes
+    given by `ALARMS`, in the hardest source, by the relation that is most likely to be false.
     """
     rng = np.random.default_rng(seed)
     rows: list[tuple[float, bool]] = []

@@ -299,7 +299,7 @@ def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
 
 
 def _rows(case: _Shown, coverage: float, weight: float) -> Floats:
-    """Return (n, 3) of the best ten classes: log-odds, log of the listed classes, hidden or not."""
+    """Return (n, 3) of the best classes: log-odds, log of the listed classes, hidden or not."""
     z = _mixed(case, coverage, weight)
     first = np.argsort(-z, kind="stable")[:_LISTED]
     size = np.full(len(first), np.log(case.listed))
@@ -319,7 +319,7 @@ def fit_outliers(
 ) -> dict[str, Any]:
     """Fit `popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
 
-    At the start of a robot's tour its list has few classes. The probability is fitted to whole
+    At the start of a tour, a robot has listed few classes. The probability is fitted to whole
     scenes and is too high for short lists. For example, a stove alone is rare in a procedural room.
     Short lists therefore have their own thresholds, fitted by the same rule to parts of the same
     scenes. They are at least the thresholds of whole scenes and at most those of shorter lists.

@@ -99,7 +99,7 @@ class ObjectiveConfig(_Section):
     name: Literal["contrastive_divergence", "persistent_cd", "composite", "relations"]
     k: int = Field(default=1, ge=1, description="Gibbs steps for each update (CD, PCD)")
     chains: int = Field(default=128, ge=1, description="number of persistent chains (PCD)")
-    presence_weight: float = Field(default=0.1, ge=0, description="weight of present classes")
+    presence_weight: float = Field(default=0.1, ge=0, description="weight of the presence term")
     relation_weight: float = Field(default=0.05, ge=0)
     unlisted: Literal["unobserved", "off"] = Field(
         default="unobserved", description="meaning of unlisted relations in annotated scenes"

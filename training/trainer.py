@@ -303,7 +303,7 @@ class Trainer:
         self.updates += 1
         decay = self.config.training.averaging
         if decay:
-            # A short average forgets its start faster (bias correction).
+            # With few updates, the average forgets its start faster (bias correction).
             weight = 1 - min(decay, self.updates / (self.updates + 10))
             for name, parameter in self.machine.named_parameters():
                 self.average[name].lerp_(parameter.detach(), weight)

@@ -4,9 +4,9 @@ The iteration starts with h2 at its prior and alternates, with damping:
 
     m2 = sigmoid(c2 + m1'J),   y = c1 + v'W + J m2 + sum_e slope_e(m1) U_e,   m1 = sigmoid(y)
 
-slope_e is r_e for an observed unit of the seed form, and the tangent of the relation term
-otherwise.
-With one layer it is exact in two cases: all relations observed (seed) or none observed (local).
+slope_e is r_e for an observed unit of the seed form. For other units it is the tangent of the
+relation term. With one layer, the result is exact in two cases: all relations are observed (seed
+form), or none is observed (local form).
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ deviation of the class:
 A rare class then behaves like classes with similar word vectors.
 
 A robot seldom sees a whole scene. In training the context therefore sees a random share of the
-objects, with a uniform share for each scene. Otherwise the context would learn relations of pairs
-that occur only in complete scenes of one source, and the pairs would not learn them.
+objects, with a uniform share for each scene. Otherwise the context would learn relations that hold
+in complete scenes of one source, and the model would not predict them in other scenes.
 
 A machine with implications is trained on the same scenes with a random share of their relations
 given, by log p(r_e | r_given, v, E[h1 | v]) of the other relations. The object part is unchanged.
@@ -140,7 +140,7 @@ class RelationLikelihood(Objective):
             self.offsets.copy_(state["offsets"])
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the mean negative log-likelihood of the scenes, plus a scene's part of the prior."""
+        """Return the mean negative log-likelihood of scenes, plus a scene's part of the prior."""
         with cached():
             return self._loss(machine, batch, generator)
 

@@ -191,7 +191,7 @@ class SceneRequest(Request):
             fail_fast=True,
             description="relations that hold. Relations that are not listed are unobserved, "
             "unless `relations_complete` is true. Without this field, relations are derived from "
-            "positions. With an empty list, no relation is derived, and all are unobserved",
+            "positions. With an empty list, no relation is stated and none is derived",
         ),
     ] = None
     relations_complete: Annotated[
@@ -289,7 +289,7 @@ class OutliersOptions(Request):
         Sensitivity,
         Field(
             description="alarm rate: about 2, 10 or 20 % of untouched scenes of the hardest large "
-            "source raise an alarm, and the same of lists of few classes"
+            "source raise an alarm. The same rates hold for lists of few classes"
         ),
     ] = "medium"
     threshold: Annotated[
