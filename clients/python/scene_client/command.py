@@ -294,7 +294,7 @@ def generate(
         try:
             draw(answer, plot)
         except (OSError, ValueError) as error:
-            _fail(f"no picture: {error}", MEANINGLESS)
+            _fail(f"the picture cannot be drawn: {error}", MEANINGLESS)
 
 
 # ------------------------------------------------------------------------------------- models
@@ -342,7 +342,7 @@ def _scene(
     if ignore_unknown and unknown_labels not in (None, "ignore"):
         _fail("--ignore-unknown contradicts --unknown-labels", MEANINGLESS)
     if things is None:
-        _fail("name what is there: labels, a file that ends in .json, or - for stdin", MEANINGLESS)
+        _fail("name the objects: labels, a file that ends in .json, or - for stdin", MEANINGLESS)
     files = [thing for thing in things if _is_file(thing)]
     if files and things != files[:1]:
         _fail(f"{files[0]} must stand alone, because it is a whole scene", MEANINGLESS)
@@ -378,7 +378,7 @@ def _read(name: str) -> dict[str, Any]:
     try:
         scene = json.loads(text)
     except (ValueError, RecursionError) as error:
-        _fail(f"{name}: no JSON: {error}", MEANINGLESS)
+        _fail(f"{name}: not JSON: {error}", MEANINGLESS)
     if is_message(scene):
         return _detected(name, scene)
     if isinstance(scene, list):
