@@ -1,1 +1,1 @@
-"""Training: from scenes to versioned artifacts. The service never imports it."""
+"""Training: turn scenes into versioned artifacts. The service never imports this package."""

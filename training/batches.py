@@ -1,4 +1,4 @@
-"""Encoded scenes as tensors: what an objective sees."""
+"""Encoded scenes as tensors, the input of an objective."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Batch:
-    """B scenes.
+    """A batch of B scenes as tensors.
 
     Attributes:
         v: (B, V) presence.
-        classes, counts: (B, n) int64, classes -1 where padded, counts 0 where nobody counted.
-        holds, observed: (B, A, n, n) relations between those classes.
-        room: (B,) int64, -1 where nobody said.
-        source: (B,) int64 index into the source names of the scene tensors.
+            classes: (B, n) int64 class indices; padding is -1.
+            counts: (B, n) int64 instances of each class; 0 means that the source gives no count.
+            holds, observed: (B, A, n, n) relations between those classes.
+            room: (B,) int64 room type; -1 means unknown.
+            source: (B,) int64 index into the source names of the scene tensors.
     """
 
     v: Tensor
@@ -42,21 +43,23 @@ class Batch:
         return len(self.v)
 
     def rows(self, index: Tensor) -> Batch:
-        """Some scenes of the batch (indices or a mask)."""
+        """Return the scenes at the given indices, or where a mask is true."""
         return Batch(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
 @dataclass(frozen=True)
 class SceneTensors:
-    """A whole set of scenes, from which batches are cut.
+    """A set of N scenes; `batch` returns some of them.
 
     Attributes:
-        scenes: the encoded scenes.
-        v: (N, V); room: (N,); source: (N,) int64 index into annotated_classes and source_names.
-        annotated_classes: (sources, V) bool.
-        source_names: sorted names of the sources.
-        weight: (N,) what a scene counts for in object learning.
-        complete: (N,) bool, the object list of a scene is nearly the whole scene.
+            scenes: the encoded scenes.
+            v: (N, V) presence of each class.
+            room: (N,) room types.
+            source: (N,) int64 index into annotated_classes and source_names.
+            annotated_classes: (sources, V) bool.
+            source_names: sorted names of the sources.
+            weight: (N,) weight of each scene in object learning.
+            complete: (N,) bool; true if the object list covers nearly the whole scene.
     """
 
     scenes: Sequence[EncodedScene]
@@ -78,7 +81,7 @@ class SceneTensors:
         return len(self.scenes)
 
     def batch(self, index: Tensor) -> Batch:
-        """The scenes at the given positions."""
+        """Return the scenes at the given positions as one batch."""
         chosen = [self.scenes[k].evidence for k in index.tolist()]
         n = max((len(e.classes) for e in chosen), default=0)
         relations = chosen[0].holds.shape[0] if chosen else 0
@@ -104,14 +107,14 @@ class SceneTensors:
 def scene_tensors(
     scenes: Sequence[EncodedScene], annotated: dict[str, np.ndarray], size: int
 ) -> SceneTensors:
-    """Tensors of encoded scenes.
+    """Return encoded scenes as tensors.
 
     Args:
-        annotated: per source, (V,) bool of the classes that it mentions.
-        size: V.
+            annotated: for each source, (V,) bool of the classes that the source mentions.
+            size: number of classes V.
 
-    Raises:
-        ValueError: a scene of a source that `annotated` does not know.
+        Raises:
+            ValueError: `annotated` has no entry for the source of a scene.
     """
     names = sorted(annotated)
     if missing := {scene.source for scene in scenes} - set(names):
@@ -130,7 +133,7 @@ def scene_tensors(
 
 
 def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
-    """The scenes at the given positions."""
+    """Return the scenes at the given positions."""
     return replace(
         scenes,
         scenes=[scenes.scenes[k] for k in index.tolist()],
@@ -141,12 +144,12 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
 
 
 def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
-    """(edges, r, observed) of a batch in the machine's own layout."""
+    """Return (edges, r, observed) of a batch in the layout of the machine."""
     return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 
 def seen_triples(scenes: Sequence[EncodedScene], size: int, minimum: int = 1) -> Tensor:
-    """(T, 3) of the (a, i, j) that hold in at least `minimum` scenes, sorted."""
+    """Return the sorted triples (a, i, j) that hold in at least `minimum` scenes, (T, 3)."""
     keys: list[np.ndarray] = []
     for scene in scenes:
         relation, subject, object_ = scene.evidence.holds.nonzero()

@@ -1,15 +1,17 @@
-"""From log-odds to the probabilities the service promises, fitted on validation scenes.
+"""Fit the calibration: it turns log-odds into the probabilities that the service returns.
+
+All fits use validation scenes. The entries are:
 
     missing, outlier   see `training.calibrate_objects`
-    relation   the relation holds between this pair of instances; fitted apart for scenes of which
-               no relation is told, and for those of which half of the pairs are told
-    placement  the same for a pair of which one was taken away
-    misplaced  the relation is false, where one triple in half of the scenes was altered
+    relation   the relation holds between this pair of instances; fitted once for scenes without
+               observed relations, and once for scenes where half of the pairs are observed
+    placement  the same for a pair whose subject or object was removed from the scene
+    misplaced  the relation is false; one triple was altered in half of the scenes
 
-All are logistic regressions (Platt scaling) on relations that a source states as true or false;
-unstated ones are left out. The ranking of relations is fitted with large sources weighted down,
-because one procedural source has more examples than all others together. The overall level is
-fitted with equal weights.
+All fits are logistic regressions (Platt scaling) on relations that a source states as true or
+false. Unstated relations are left out. One procedural source has more examples than all other
+sources together. The fit that ranks relations therefore gives large sources a lower weight. The fit
+of the overall level uses equal weights.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
@@ -48,25 +50,26 @@ from training.evaluation.outliers import kept_in_each_source
 from training.oracle.units import NO_UNIT
 
 _SCENES = 2500
-# A machine without a closed form draws its answers, at a hundred times the cost.
+# A machine without a closed form samples its answers, which takes a hundred times longer.
 _SCENES_OF_DRAWS = 300
 # An answer lists the best 20 relations by default.
 _LISTED = 20
 _OF_THE_REST = 0.02
 _ROUNDS = 3
-# Columns of an example, the scene first.
+# Columns of an example; column 0 is the scene.
 _RELATION, _LOGIT, _TRUTH, _SOURCE = 1, 2, 5, 6
-# A source's examples count by this power of their number less. At 0 the likeliest of eight is right
-# for .62 of the pairs of 3DSSG, at .25 for .73, at .5 for .82. A frequency table is right for .75.
+# The weight of an example is the number of listed examples of its source, to the power -_POWER.
+# Share of 3DSSG pairs whose likeliest of eight relations is right: .62 at power 0, .73 at .25,
+# .82 at .5. A frequency table reaches .75.
 _POWER = 0.5
-# The curve of all relations: how often it bends, its least slope, and the penalty on each change of
-# slope in log-likelihood.
+# The curve of all relations: the number of its bends, its least slope, and the penalty on each
+# change of slope (in log-likelihood).
 _BENDS = 7
 _LEAST_SLOPE = 0.05
 _STIFFNESS = 2.0
-# The truth of what a source leaves unsaid.
+# The truth value of a relation that the source does not state.
 _UNKNOWN = -1.0
-# Cases a scene: of one, chance alone would decide.
+# Cases drawn from each scene. With one case a scene, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
 
 
@@ -80,10 +83,10 @@ def calibrate(
     """Fit every entry of the calibration.
 
     Args:
-        artifact: with the neutral calibration.
-        scenes: validation scenes.
-        train: what popularity is counted in.
-        chosen: see `calibrate_objects`.
+            artifact: the artifact with the neutral calibration.
+            scenes: validation scenes.
+            train: training scenes, which give the popularity of classes.
+            chosen: see `calibrate_objects`.
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     objects = calibrate_objects(artifact, scenes, train, structure, seed, chosen)
@@ -108,7 +111,7 @@ def calibrate(
 
 
 def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[PairSlope, ...]:
-    """Per canonical relation, from class-level log-odds to instance pairs; nothing is given."""
+    """Fit the relations of instance pairs to class-level log-odds, without observed relations."""
     examples = _examples(_asked_pairs(artifact, scenes))
     return _fit_listed(examples, artifact.spec.A, _LISTED)
 
@@ -116,10 +119,11 @@ def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[P
 def fit_given(
     artifact: Artifact, scenes: Sequence[EncodedScene], alone: tuple[PairSlope, ...], seed: int = 0
 ) -> tuple[PairSlope, ...]:
-    """The same where half of the pairs of a scene are told about, and the others are asked.
+    """Fit the relations where half of the pairs of a scene are observed; the other half is asked.
 
-    The order of relations stays as it is where nothing is given: slopes of their own, fitted to the
-    few sources that list much, made what is told do harm in others.
+    The ranking of relations stays the one fitted without observed relations. Separate slopes would
+    be fitted to the few sources that list many relations. For other sources, observed relations
+    then made answers worse.
     """
     blocks = _asked_pairs(artifact, scenes, np.random.default_rng(seed))
     return _as_often_as_it_holds(_examples(blocks), alone, _LISTED)
@@ -128,10 +132,10 @@ def fit_given(
 def _asked_pairs(
     artifact: Artifact, scenes: Sequence[EncodedScene], rng: np.random.Generator | None = None
 ) -> list[NDArray[np.float64]]:
-    """Examples of each scene.
+    """Return the examples of each scene.
 
     Args:
-        rng: says which pairs of a scene are told about; without it all are asked.
+        rng: chooses which pairs of a scene are observed; without it, all pairs are asked.
     """
     blocks: list[NDArray[np.float64]] = []
     sources = sorted({encoded.source for encoded in scenes})
@@ -153,12 +157,13 @@ def _asked_pairs(
 def fit_placements(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> dict[str, tuple[PairSlope, ...]]:
-    """The same for the relations of an object that was taken away to those that stayed.
+    """Fit the relations between an object that was removed from a scene and the remaining objects.
 
     Returns:
-        `placement`, fitted to the likeliest places, which an answer lists; and `asked_place`,
-        fitted to every place alike, since a request may ask for any. Sources whose unlisted
-        relations are unobserved, such as people's sentences, are left out of the second.
+        `placement` is fitted to the likeliest places, because an answer lists these.
+        `asked_place` is fitted to all places with equal weight, because a request may ask for any
+        place. `asked_place` leaves out sources whose unlisted relations are unobserved, such as
+        people's sentences.
     """
     rng = np.random.default_rng(seed)
     structure = artifact.vocabulary.structure
@@ -193,13 +198,13 @@ def fit_placements(
 
 
 def _examples(blocks: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """All of them, but of relations that have no unit in the machine and so no log-odds to read."""
+    """Return all examples except those of relations without a unit, which have no log-odds."""
     every = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     return every[every[:, _LOGIT] > NO_UNIT]
 
 
 def _told(examples: NDArray[np.float64], sources: Sequence[str]) -> NDArray[np.float64]:
-    """Those of relations that their source, if unlisted, says are off; all where no source does."""
+    """Keep examples from sources that state which relations are false; all if no source does so."""
     telling = np.array([[how != "unobserved" for how in meaning_of(s).unlisted] for s in sources])
     relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
     told = telling[source, relation]
@@ -210,10 +215,11 @@ def _told(examples: NDArray[np.float64], sources: Sequence[str]) -> NDArray[np.f
 def _fit_listed(
     examples: NDArray[np.float64], relations: int, listed: int
 ) -> tuple[PairSlope, ...]:
-    """Fits of all relations to examples of which an answer lists the best so many of each scene.
+    """Fit all relations, mainly to the best `listed` examples of each scene, which an answer lists.
 
-    These decide: what is chosen for its high log-odds holds less often than log-odds alike among
-    all pairs. The others count a little. Unknown examples take their ranks and count nothing.
+    A listed example was selected for its high log-odds, so its relation holds less often than other
+    pairs with equal log-odds suggest. Unlisted examples have a small weight. Unknown examples take
+    part in the ranking and have no weight in the fit.
     """
     known = examples[:, _TRUTH] != _UNKNOWN
     slopes = _fit_each(examples[known], relations, np.ones(known.sum()))
@@ -227,10 +233,10 @@ def _fit_listed(
 def _as_often_as_it_holds(
     examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
 ) -> tuple[PairSlope, ...]:
-    """One rising curve over the logits of all relations, fitted to the listed examples, each alike.
+    """Fit one rising curve over the logits of all relations to the listed examples.
 
-    It makes probabilities right on average over all sources and leaves the order of relations,
-    which the sources decide alike.
+    The curve makes the probabilities right on average over all sources. It keeps the ranking of
+    relations from the fit that gives all sources a similar weight.
     """
     best = _among_best(examples, slopes, listed) & (examples[:, _TRUTH] != _UNKNOWN)
     examples = examples[best]
@@ -252,13 +258,13 @@ def _as_often_as_it_holds(
 def rising_curve(
     logits: NDArray[np.float64], truth: NDArray[np.bool_]
 ) -> tuple[float, float, tuple[tuple[float, float], ...]]:
-    """The log-odds of a truth as a rising, piecewise linear function of logits, (n,) both.
+    """Fit the log-odds of a truth as a rising, piecewise linear function of logits, both (n,).
 
-    A penalty on changes of slope holds where few examples lie.
+    A penalty on changes of slope stabilises the curve where there are few examples.
 
     Returns:
-        Intercept and slope of the line x where logits are least, and its bends: (at, change), see
-        `PairSlope`.
+        The intercept and the slope of the line at the lowest logits, and the bends (at, change);
+        see `PairSlope`.
     """
     at = np.quantile(logits, np.linspace(0, 1, _BENDS + 2)[1:-1])
     edges = np.concatenate([[-np.inf], at, [np.inf]])
@@ -287,7 +293,7 @@ def rising_curve(
 
 
 def _logits(examples: NDArray[np.float64], slopes: tuple[PairSlope, ...]) -> NDArray[np.float64]:
-    """Before they are bent."""
+    """Return the logits of the examples before the curve is applied."""
     table = np.array([(s.slope, s.log_count, s.log_classes, s.intercept) for s in slopes])
     weights = table[examples[:, _RELATION].astype(np.int64)]
     found: NDArray[np.float64] = (examples[:, _LOGIT:_TRUTH] * weights[:, :3]).sum(1)
@@ -295,7 +301,7 @@ def _logits(examples: NDArray[np.float64], slopes: tuple[PairSlope, ...]) -> NDA
 
 
 def _source_weights(examples: NDArray[np.float64], best: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """One over a power of how many listed examples of a relation a source has, (N,)."""
+    """Return (N,) weights: the number of listed examples of the source and relation to a power."""
     relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
     key = relation * (source.max(initial=0) + 1) + source
     counts = np.bincount(key[best], minlength=int(key.max(initial=-1)) + 1)
@@ -307,7 +313,7 @@ def _source_weights(examples: NDArray[np.float64], best: NDArray[np.bool_]) -> N
 def _among_best(
     examples: NDArray[np.float64], slopes: tuple[PairSlope, ...], listed: int
 ) -> NDArray[np.bool_]:
-    """Which of the examples are among the best so many of their scene."""
+    """Mark the examples that are among the best `listed` of their scene."""
     logits = _logits(examples, slopes)
     order = np.lexsort((-logits, examples[:, 0]))
     scene = examples[order, 0]
@@ -335,10 +341,11 @@ def _instance_pairs(
     structure: NDArray[np.bool_],
     asked: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """(examples, 7): scene, relation, class log-odds, log n_i + log n_j, log of all classes,
-    whether it holds, and the source.
+    """Return the examples of a scene, (examples, 7).
 
-    Of what is unknown, only the best that an answer may list.
+    The columns are: scene, relation, class log-odds, log n_i + log n_j, log of the number of
+    classes, whether the relation holds, and the source. Of unknown relations, only the best that an
+    answer may list are included.
     """
     evidence = scene.evidence
     place = np.searchsorted(evidence.classes, scene.instance_classes)
@@ -360,7 +367,7 @@ def _instance_pairs(
 
 
 def _so_many_best(values: NDArray[np.floating[Any]], count: int) -> float:
-    """The least of the `count` largest."""
+    """Return the least of the `count` largest values."""
     return float(np.partition(values, -count)[-count]) if len(values) > count else -np.inf
 
 
@@ -375,10 +382,10 @@ def _fit_relation(examples: NDArray[np.float64], weight: NDArray[np.float64]) ->
 def fit_misplaced(
     artifact: Artifact, scenes: Sequence[EncodedScene], seed: int = 0
 ) -> tuple[Slope, Thresholds]:
-    """Logistic regression of "this relation is false" on its log-odds given the rest.
+    """Fit the log-odds that a relation is false to its log-odds given the rest of the scene.
 
-    And the probabilities that the least likely relation of an unaltered scene reaches in as many
-    scenes of the hardest source as objects raise alarms.
+    The thresholds are fitted to unaltered scenes. Each threshold is reached in the share of scenes
+    given by `ALARMS`, in the hardest source, by the relation that is most likely to be false.
     """
     rng = np.random.default_rng(seed)
     rows: list[tuple[float, bool]] = []

@@ -1,13 +1,16 @@
-"""The calibration of what is said of objects: unlisted classes, intruders, and weights of evidence.
+"""Fit the calibration of answers about objects.
 
-    coverage   the default and the share of the partial posterior, by the rank of hidden classes
-    missing    p(there | not listed), on scenes of which 25, 50 and 75 % and all but one were shown;
-               a source counts by its scenes, near-duplicates by their weight
-    outlier    p(intruder), where half of the scenes are clean, and its thresholds
-    evidence   the pull of relations on what is said of objects
+    coverage   the default coverage and the weight of the partial posterior, chosen by the rank of
+               hidden classes
+    missing    p(present | not listed), fitted to scenes of which 25 %, 50 %, 75 % or all but one
+               class are shown; the weight of a source is its number of scenes, where
+               near-duplicates count by their weight
+    outlier    p(intruder) and its thresholds; half of the scenes are clean
+    evidence   the weight of relations and poses in answers about objects
 
-The prior of an intruder is proportional to popularity^alpha. Alpha and the logistic regression see
-intruders of three kinds alike: uniform, drawn by popularity, and typical of another room type.
+The prior of an intruder is proportional to popularity^alpha. Alpha and the logistic regression are
+fitted to three kinds of intruders, equally weighted: drawn uniformly, drawn by popularity, and
+typical of another room type.
 
 Source: Platt, "Probabilistic outputs for support vector machines" (1999).
 """
@@ -46,46 +49,47 @@ Floats = NDArray[np.float64]
 
 COVERAGES = (0.3, 0.4, 0.5, 0.6, 0.7)
 WEIGHTS = (0.3, 0.4, 0.5, 0.6, 0.7, 1.0)
-# At .5 the share of uniform intruders that is caught on sunrgbd falls from .47 to .35.
+# At alpha .5 the share of uniform intruders that is detected in sunrgbd falls from .47 to .35.
 ALPHAS = (0.0, 0.125, 0.25, 0.375)
 PULLS = (0.0, 0.1, 0.2, 0.5, 1.0)
 ALARMS = {"low": 0.02, "medium": 0.1, "high": 0.2}
 """Shares of untouched scenes of the hardest large source that raise an alarm."""
 
-# Lists of up to so many classes have thresholds of their own, where so many scenes tell them.
+# Lists of up to `_SHORT_LISTS` classes have their own thresholds if there are enough scenes.
 _SHORT_LISTS = 4
 _SHORT_LIST_SCENES = 30
 _NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
-# Scenes of a source.
+# Number of scenes used from each source.
 _PARTIAL_SCENES = 120
-# Classes of a scene that are hidden in turn, where all but one are shown.
+# Number of draws of the hidden class where all but one class are shown.
 _DRAWS_OF_ONE = 4
-# Real rooms that are smaller than what is drawn, and scenes of a room type that tell.
+# Generated scenes below this quantile of the sizes of real rooms are too small. `_UNSUITED` is the
+# same for the fit to a room type. A room type needs `_ROOM_SCENES` scenes for its own limits.
 _SMALL = 0.1
 _UNSUITED = 0.15
 _ROOM_SCENES = 20
 _EVIDENCE_SCENES = 400
-# A machine without a closed form draws its answers, at a hundred times the cost.
+# A machine without a closed form samples its answers, which takes a hundred times longer.
 _EVIDENCE_SCENES_OF_DRAWS = 100
-# For the sake of others: what uniform intruders may lose of hit@1 and of the share caught, and what
-# nearly complete lists may lose of MRR.
+# Losses that are accepted for gains elsewhere: hit@1 and detected share of uniform intruders, and
+# MRR of nearly complete lists.
 _UNIFORM_LOSS = np.array([0.04, 0.06])
 _COMPLETE_LOSS = 0.002
 _NEARLY_COMPLETE = ("75 %", "all but one")
-# Pulls within so much of the best are as good: the least of them is taken.
+# Weights whose MRR is within this distance of the best count as equal; the least of them is used.
 _AS_GOOD = 0.006
-# An answer lists ten classes by default; what is listed decides.
+# An answer lists ten classes by default, so the fit uses the ten best classes.
 _LISTED = 10
 
 
 def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
-    """Scenes with complete object lists, or all where there are none.
+    """Return scenes with complete object lists, or all scenes if no list is complete.
 
-    Of near-duplicates as many as their weight says.
+    Near-duplicates are sampled by their weight.
     """
     rng = np.random.default_rng(seed)
     complete = scenes.complete.numpy()
-    # A model of photographs alone has no others to be calibrated on.
+    # A model of photographs alone has no complete scenes for its calibration.
     complete = complete if complete.any() else ~complete
     kept = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
     return subset(scenes, torch.from_numpy(np.flatnonzero(kept)))
@@ -99,14 +103,14 @@ def calibrate_objects(
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> Calibration:
-    """The artifact's calibration with every entry of objects fitted.
+    """Return the artifact's calibration with every entry about objects fitted.
 
     Args:
-        validation: scenes that training has not seen.
-        train: what popularity and signatures of room types are counted in.
-        structure: (V,) bool.
-        chosen: has what was chosen on other validation scenes (coverage and its weight, weights of
-            evidence, alpha); without it they are chosen here.
+            validation: scenes that were not used in training.
+            train: scenes that give the popularity of classes and the signatures of room types.
+            structure: (V,) bool, true for structure classes.
+            chosen: a calibration with values chosen on other validation scenes: coverage and its
+                weight, weights of evidence, alpha. Without it, these values are chosen here.
     """
     scenes = complete_scenes(validation, seed)
     if not len(scenes):
@@ -129,12 +133,12 @@ def calibrate_objects(
 
 
 def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
-    """The artifact with some entries of its calibration replaced."""
+    """Return the artifact with some entries of its calibration replaced."""
     return replace(artifact, calibration=artifact.calibration.model_copy(update=entries))
 
 
 def popularity(train: SceneTensors) -> Floats:
-    """Log-odds of finding each class in a complete training scene, (V,); 1/2 smooths both sides."""
+    """Return the log-odds (V,) of each class in a complete training scene, smoothed by 1/2."""
     weight = train.weight * (train.complete if bool(train.complete.any()) else 1.0)
     count = (train.v * weight.unsqueeze(1)).sum(0).double().numpy()
     total = float(weight.sum())
@@ -143,9 +147,9 @@ def popularity(train: SceneTensors) -> Floats:
 
 
 def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
-    """Classes that 90 % of the scenes of each room type have at least, and of all scenes, (C + 1,).
+    """Return the 10 % quantile of the class counts of each room type and of all scenes, (C + 1,).
 
-    A type of fewer than 20 scenes takes the entry of all.
+    A room type with fewer than 20 scenes gets the value of all scenes.
     """
     sizes = ((train.v > 0) & ~structure).sum(1).numpy()
     every = int(np.quantile(sizes, _SMALL))
@@ -155,7 +159,7 @@ def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple
 
 
 def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
-    """What 85 % of the scenes of each room type exceed of `room_fit`, (C,); -1e9 for few scenes."""
+    """Return the 15 % quantile of `room_fit` of each room type, (C,); -1e9 for under 20 scenes."""
     found = []
     for t in range(artifact.spec.C):
         own = train.v[train.room == t].numpy()
@@ -171,9 +175,16 @@ def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """One scene of which a part is shown: log-odds (n,) of the unlisted classes, closed and by
-    coverage; which of them are hidden; how many are listed; the share's name; its source; and how
-    many scenes of that it stands for.
+    """One scene of which a part is shown.
+
+    Attributes:
+        closed: (n,) log-odds of the unlisted classes in closed form.
+        partial: their log-odds (n,) in the partial posterior, by coverage.
+        hidden: (n,) bool, the hidden ones among the unlisted classes.
+        listed: number of listed classes.
+        share: name of the share of shown classes.
+        source: index of the scene's source.
+        weight: number of scenes of its source that the scene represents.
     """
 
     closed: Floats
@@ -192,7 +203,7 @@ def fit_coverage(
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
-    """`coverage`, `coverage_weight` and `missing`."""
+    """Fit `coverage`, `coverage_weight` and `missing`."""
     cases = list(_shown(artifact, scenes, structure, seed))
     if not cases:
         return {}
@@ -213,7 +224,7 @@ def fit_coverage(
 
 
 def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
-    """Coverage and weight of the best MRR, that nearly keep that of nearly complete lists."""
+    """Choose coverage and weight by MRR; nearly complete lists lose `_COMPLETE_LOSS` at most."""
     nearly = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
     least = [_mrr(some, 0.5, 0.0) - _COMPLETE_LOSS for some in nearly]
     allowed = [(0.5, 0.0)] + [
@@ -240,7 +251,7 @@ def _shown(
     some, weight = subset(scenes, order[chosen]), stands_for[chosen].tolist()
     source_of = source[chosen].tolist()
     whole = recalibrated(artifact, coverage_weight=1.0)
-    # One hidden class of each scene alone would leave the choice to chance.
+    # With a single draw of the one hidden class, the choice would depend too much on chance.
     draws = [
         (name, share, seed + draw)
         for name, share in SHARES.items()
@@ -277,7 +288,7 @@ def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
 
 
 def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
-    """Mean over hidden classes of 1 / rank among the classes that are not hidden; sources alike."""
+    """Return the mean of 1 / rank of hidden classes among other classes; sources count equally."""
     found: dict[int, list[Floats]] = {}
     for case in cases:
         z = _mixed(case, coverage, weight)
@@ -288,7 +299,7 @@ def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
 
 
 def _rows(case: _Shown, coverage: float, weight: float) -> Floats:
-    """(n, 3) of the first so many classes: log-odds, log of the listed classes, hidden or not."""
+    """Return (n, 3) of the best classes: log-odds, log of the listed classes, hidden or not."""
     z = _mixed(case, coverage, weight)
     first = np.argsort(-z, kind="stable")[:_LISTED]
     size = np.full(len(first), np.log(case.listed))
@@ -306,12 +317,12 @@ def fit_outliers(
     seed: int = 0,
     chosen: Calibration | None = None,
 ) -> dict[str, Any]:
-    """`popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
+    """Fit `popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
 
-    A robot that has just begun to look lists few classes of a scene. The probability is fitted to
-    whole scenes and is too high there: in a procedural room a lone stove is rare. So such lists
-    have thresholds of their own, by the same rule, on parts of the same scenes: no lower than those
-    of whole scenes, and no higher than those of shorter lists.
+    At the start of a tour, a robot has listed few classes. The probability is fitted to whole
+    scenes and is too high for short lists. For example, a stove alone is rare in a procedural room.
+    Short lists therefore have their own thresholds, fitted by the same rule to parts of the same
+    scenes. They are at least the thresholds of whole scenes and at most those of shorter lists.
     """
     score = MachineScore(machine_of(artifact.weights))
     prior = np.array(artifact.calibration.popularity)
@@ -362,9 +373,9 @@ def fit_outliers(
 def listing(
     scenes: SceneTensors, structure: Tensor, listed: int, rng: np.random.Generator
 ) -> tuple[SceneTensors, Tensor]:
-    """The scenes of more classes than so many, and presence (N, V) of so many of them.
+    """Return scenes with more than `listed` classes, and presence (N, V) of `listed` of them each.
 
-    Structure is listed as it was and does not count.
+    Structure classes stay listed and are not counted.
     """
     plain = (scenes.v > 0) & ~structure
     large = (plain.sum(1) > listed).nonzero().squeeze(1)
@@ -395,10 +406,10 @@ def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds
 
 
 def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
-    """The alpha of the best mean of hit@1 and share caught, over kinds of intruders.
+    """Choose the alpha with the best mean of hit@1 and detected share over the kinds of intruders.
 
-    An alpha is allowed if uniform intruders lose at most .04 of hit@1 and .06 of the share caught,
-    against alpha 0.
+    Uniform intruders may lose at most .04 of hit@1 and .06 of the detected share compared with
+    alpha 0.
     """
     found = {
         alpha: {name: _found(scores.with_prior(alpha * prior)) for name, scores in kinds.items()}
@@ -410,7 +421,7 @@ def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
 
 
 def _found(scores: IntruderScores) -> Floats:
-    """(2,): hit@1, and the share caught where a tenth of untouched scenes raises an alarm."""
+    """Return hit@1 and the detected share when 10 % of the untouched scenes raise an alarm."""
     worst = np.full(scores.scenes, np.inf)
     np.minimum.at(worst, scores.scene[scores.clean], scores.log_odds[scores.clean])
     limit = np.quantile(worst[np.isfinite(worst)], ALARMS["medium"])
@@ -424,7 +435,7 @@ def _found(scores: IntruderScores) -> Floats:
 def fit_evidence(
     artifact: Artifact, validation: SceneTensors, structure: Tensor, seed: int = 0
 ) -> EvidenceWeights:
-    """The pull of relations and poses on objects under which hidden classes rank best."""
+    """Choose the weights of relations and poses in answers about objects, by MRR."""
     plain = structure.numpy()
     found = artifact.calibration.evidence
     scenes = complete_scenes(validation, seed)
@@ -449,7 +460,7 @@ def fit_evidence(
 
 
 def least_of_the_best(scores: dict[float, float]) -> float:
-    """The least pull that is as good as the best: what brings nothing may do harm elsewhere."""
+    """Return the least weight that counts as equal to the best; a needless weight may do harm."""
     enough = max(scores.values()) - _AS_GOOD
     return min(pull for pull, score in scores.items() if score >= enough)
 

@@ -1,8 +1,8 @@
-"""Scenes as questions: what is stated, what is hidden, what is altered.
+"""Scenes as questions: their stated, hidden and altered parts.
 
-What is drawn for a scene depends on the seed and on the scene's name alone: not on the model, on
-the other scenes, or on how they are batched. So every model is asked the same questions, one source
-at a time or all together.
+The random choices for a scene depend only on the seed and the scene's name. They do not depend on
+the model, the other scenes or the batches. So every model is asked the same questions, for one
+source or for all sources together.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _VERTICAL = [CANONICAL.index("on-top"), CANONICAL.index("above")]
 
 
 def scene_rng(scene: EncodedScene, seed: int) -> np.random.Generator:
-    """The random numbers of one scene."""
+    """Return the random generator of one scene."""
     return np.random.default_rng([seed, crc32(scene.scene_id.encode())])
 
 
 def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> SceneTensors:
-    """At most `limit` scenes, the same ones for every model, in their order."""
+    """Return at most `limit` scenes in their order; every model gets the same scenes."""
     if limit is None or len(scenes) <= limit:
         return scenes
     place = [crc32(f"{seed} {scene.source} {scene.scene_id}".encode()) for scene in scenes.scenes]
@@ -40,7 +40,7 @@ def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> Scene
 
 
 def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Triple]) -> Scene:
-    """The instances at the given positions as a request would give them."""
+    """Return the instances at the given positions as a scene, like that of a request."""
     objects = tuple(
         SceneObject(id=str(k), label=str(c), class_index=int(c))
         for k, c in enumerate(encoded.instance_classes[list(kept)])
@@ -50,11 +50,11 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
 
 
 def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
-    """(A, N, N) which relations of instances are known, on or off, without choice.
+    """Return (A, N, N) bool: the truth of a relation is known, and an annotator did not choose it.
 
-    A source that lists left and front here and there, and never says that they do not hold, tells
-    nothing of how often they do: of these only pairs that stand one on or above another are kept,
-    since left and front are off there unless listed.
+    Some sources list left and front occasionally and never state that they do not hold. Such
+    sources do not tell how often the relations hold. For them, only pairs with one object on or
+    above the other are kept, because left and front do not hold there unless listed.
     """
     unlisted = meaning_of(encoded.source).unlisted
     known, holds = encoded.instance_observed.copy(), encoded.instance_holds
@@ -62,7 +62,7 @@ def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
     stacked |= stacked.T
     for a in range(min(len(known), len(unlisted))):
         off = known[a] & ~holds[a]
-        # Where there are no poses, neighbours are the pairs that an annotator chose to relate.
+        # Without poses, "neighbours" are the pairs that an annotator chose to relate.
         chosen = unlisted[a] == "off for neighbours" and encoded.instance_positions is None
         if chosen or (unlisted[a] == "unobserved" and not (off & ~stacked).any()):
             known[a] &= stacked & off.any()
@@ -72,7 +72,7 @@ def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
 def taken_away(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[int, list[int]] | None:
-    """(a class drawn from those that may be missing, the instances of all others)."""
+    """Draw a class that may be missing; return it with the instances of all other classes."""
     classes = encoded.evidence.classes
     removable = classes[~structure[classes]]
     if len(removable) < 2:
@@ -84,10 +84,13 @@ def taken_away(
 def told_pairs(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], list[Triple]]:
-    """Half of the pairs of a scene are told about: those left to ask (N, N), and what is told.
+    """Draw half of the pairs of a scene as observed.
 
-    Which ones is decided without looking at what holds between them: had half of the relations been
-    given, a pair of which nothing is said would be likelier to have none.
+    The draw ignores the relations of the pairs. If half of the relations were drawn instead, pairs
+    without an observed relation would have fewer relations than other pairs.
+
+    Returns:
+        (N, N) bool of the pairs left to ask, and the observed triples.
     """
     size = len(encoded.instance_classes)
     half = np.triu(rng.random((size, size)) < 0.5, 1)
@@ -103,16 +106,16 @@ def occupied_place(
     shown: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> tuple[int, int] | None:
-    """A place beside an object that is shown, drawn from those where anything stands.
+    """Draw an occupied place beside a shown object.
 
-    Whether that is shown too plays no part in the choice: had only places of hidden objects been
-    drawn, every place would be more likely to miss one.
+    The draw ignores whether the object at the place is shown. If only places of hidden objects were
+    drawn, every place would seem more likely to have a missing object.
 
     Args:
         shown: (n,) instances.
 
     Returns:
-        The canonical relation, and the instance that is its object.
+        The canonical relation and the instance that is its object; None without such a place.
     """
     usable = ~structure[encoded.instance_classes]
     stands = encoded.instance_holds & known_relations(encoded) & usable[:, None] & (usable & shown)
@@ -126,7 +129,7 @@ def occupied_place(
 def altered_case(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[Scene, tuple[int, int, int] | None] | None:
-    """A scene with its triples; in half of them one was replaced by one that is not true there."""
+    """Return a scene with its triples; in half of the cases a false triple replaces one of them."""
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds & usable[:, None] & usable[None, :]
     triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(holds)]
@@ -157,6 +160,6 @@ def logistic(
     truth: NDArray[np.bool_],
     weight: NDArray[np.float64] | None = None,
 ) -> list[float]:
-    """Coefficients and intercept of an (almost) unpenalised logistic regression."""
+    """Return coefficients and intercept of an (almost) unpenalised logistic regression."""
     fit = LogisticRegression(C=1e6, max_iter=1000).fit(features, truth, weight)
     return [float(x) for x in (*fit.coef_[0], fit.intercept_[0])]

@@ -1,7 +1,6 @@
 """The command line: init, train, compare, publish, tune, evaluate, list.
 
-Ctrl-C during training leaves a checkpoint of the last finished epoch; the same command goes on from
-it.
+Ctrl-C during training keeps a checkpoint of the last finished epoch. The same command then resumes.
 """
 
 from __future__ import annotations
@@ -57,13 +56,15 @@ Data = Annotated[
     Path | None,
     typer.Option(
         "--data",
-        help="folder with the scene files; by default the configuration's own, or "
-        f"{DATA} for what ships",
+        help="folder with the scene files; default: the configuration's own folder, or "
+        f"{DATA} for shipped configurations",
     ),
 ]
-Runs = Annotated[Path, typer.Option("--runs", help="folder for training runs")]
+Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
 StorePath = Annotated[Path, typer.Option("--store", help="the model store")]
-Alias = Annotated[str | None, typer.Option("--alias", help="point this alias at it afterwards")]
+Alias = Annotated[
+    str | None, typer.Option("--alias", help="afterwards, point this alias at the version")
+]
 _RUNS, _STORE = Path("runs"), Path("model_store")
 
 
@@ -72,20 +73,20 @@ def train(
     configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
     data: Data = None,
     runs: Runs = _RUNS,
-    seed: Annotated[int | None, typer.Option(help="in place of the configuration's")] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="ignore a checkpoint")] = False,
+    seed: Annotated[int | None, typer.Option(help="seed, overrides the configuration")] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="ignore an existing checkpoint")] = False,
     final: Annotated[
         bool,
         typer.Option(
             "--final",
-            help="learn from all scenes but a tenth, which calibrates; with --publish the figures "
-            "are those of the run without --final, which must be finished",
+            help="learn from 90 % of all scenes and calibrate on the rest; --publish then takes "
+            "its figures from the run without --final, which must be finished",
         ),
     ] = False,
     tensorboard: Annotated[
-        Path | None, typer.Option("--tensorboard", help="write the curves there as well")
+        Path | None, typer.Option("--tensorboard", help="also write the curves to this folder")
     ] = None,
-    publish: Annotated[str | None, typer.Option(help="publish as this version")] = None,
+    publish: Annotated[str | None, typer.Option(help="publish the run as this version")] = None,
     alias: Alias = None,
     store: StorePath = _STORE,
 ) -> None:
@@ -115,7 +116,7 @@ def train(
 @app.command()
 def publish(
     folder: Annotated[Path, typer.Argument(help="a finished run")],
-    version: Annotated[str, typer.Argument(help="such as 1.0.0")],
+    version: Annotated[str, typer.Argument(help="for example 1.0.0")],
     data: Data = None,
     store: StorePath = _STORE,
     alias: Alias = None,
@@ -123,23 +124,26 @@ def publish(
         bool,
         typer.Option(
             "--promote",
-            help="move `default`, or --alias, unless the version is worse than what it serves",
+            help="move `default`, or --alias, unless the version is worse than the served one",
         ),
     ] = False,
     margin: Annotated[
-        float, typer.Option(min=0, help="with --promote: worse by so much is bearable")
+        float, typer.Option(min=0, help="with --promote: largest accepted loss of a metric")
     ] = MARGIN,
     even_if_worse: Annotated[
-        bool, typer.Option("--even-if-worse", "--force", help="promote it all the same")
+        bool, typer.Option("--even-if-worse", "--force", help="promote even a worse version")
     ] = False,
-    limit: Annotated[int, typer.Option(min=2, help="with --promote: scenes to compare on")] = 300,
+    limit: Annotated[
+        int, typer.Option(min=2, help="with --promote: number of scenes for the comparison")
+    ] = 300,
 ) -> None:
     """Calibrate, evaluate and publish a finished run.
 
-    With --promote it is compared first with what the alias serves, on test scenes that neither has
-    learnt from. Where a primary metric is worse by more than the margin (the whole 95 % interval of
-    the paired difference), nothing is published, and the exit code is 3. The exit code is also 3 if
-    the new version has no measurements of relations and the served version has them.
+    With --promote, the run is first compared with the version that the alias serves. The comparison
+    uses test scenes that neither version has learnt from. The run is refused if a primary metric is
+    worse by more than the margin (the whole 95 % interval of the paired difference). It is also
+    refused if it has no measurements of relations and the served version has them. A refused run is
+    not published, and the exit code is 3.
     """
     try:
         run = load_run(folder)
@@ -153,7 +157,7 @@ def publish(
     except WorseError as error:
         show(error.comparison, console)
         console.print(f"[red]refused:[/red] {error}", soft_wrap=True)
-        console.print("nothing was published; --even-if-worse publishes and promotes all the same")
+        console.print("nothing was published; --even-if-worse publishes and promotes it anyway")
         raise typer.Exit(3) from None
     except (RunError, ConfigError, DatasetError, RegistryError) as error:
         fail(error)
@@ -168,9 +172,9 @@ def evaluate_command(
     part: Annotated[str, typer.Option(help="train, validation or test")] = "test",
     output: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
 ) -> None:
-    """Evaluate stored models on the split they were trained with: what a model card shows.
+    """Evaluate stored models on the split of their training: the figures of a model card.
 
-    The baselines' figures are those of `benchmark`.
+    `benchmark` measures the baselines.
     """
     try:
         tables: dict[str, list[Row]] = {}
@@ -179,7 +183,7 @@ def evaluate_command(
             config = Config.model_validate(artifact.manifest.training["config"])
             wanted = source or [source_name(name) for name in config.data.sources]
             with console.status("reading scenes"):
-                # All sources take part in the split, so that the parts are those of training.
+                # All sources take part in the split, so that the parts equal those of training.
                 scenes = split_and_encode(
                     config.data, read_sources(config.data, data or DATA), artifact.vocabulary
                 )
@@ -189,7 +193,7 @@ def evaluate_command(
                 raise ConfigError(f"part must be one of {', '.join(some)}, not {part!r}")
             index = [k for k, scene in enumerate(some[part].scenes) if scene.source in wanted]
             if not index:
-                raise ConfigError(f"{reference} kept no {part} scenes back")
+                raise ConfigError(f"{reference} has no {part} scenes of these sources")
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
                 tables[reference] = evaluate(
@@ -210,7 +214,7 @@ def evaluate_command(
 
 @app.command(name="list")
 def list_command(store: StorePath = _STORE) -> None:
-    """The store's models, and the configurations that come with the package."""
+    """List the models of the store and the shipped configurations."""
     try:
         models = load_model_set(Store(store))
     except RegistryError as error:
@@ -253,7 +257,7 @@ def _train(
         with Display(trainer, console, tensorboard) as display:
             result = trainer.run(display.progress, display.ended, display.objects)
     except KeyboardInterrupt:
-        # As the next run will find it: the last epoch may have ended and not been kept.
+        # Reload the checkpoint: the last epoch may be finished and not saved.
         kept = len(trainer.epochs) if trainer.resume() else 0
         console.print(f"stopped after epoch {kept}; the same command goes on from there")
         raise typer.Exit(130) from None
@@ -286,7 +290,7 @@ def _published(artifact: Artifact) -> None:
 
 @dataclass(frozen=True)
 class _Gate:
-    """How strictly a promotion is judged, see `publish`."""
+    """Settings of the comparison before a promotion, see `publish`."""
 
     alias: str
     margin: float
@@ -297,7 +301,7 @@ class _Gate:
 def _promote(
     run: FinishedRun, scenes: SplitScenes, root: Path, store: Store, version: str, gate: _Gate
 ) -> None:
-    """Publish and point the alias at the version, unless it is worse than what that serves."""
+    """Publish and promote the version, unless it is worse than the version the alias serves."""
     before = seat(store, gate.alias)
     found: list[Comparison] = []
     with console.status("publishing") as status:
@@ -329,7 +333,7 @@ def _promote(
     if before.note:
         console.print(before.note, soft_wrap=True)
     _published(artifact)
-    # Nobody may have moved the alias since the comparison: then it would have been with another.
+    # Fails if the alias has moved since the comparison, which used the earlier version.
     target = AliasTarget(name=artifact.manifest.name, version=version)
     store.set_alias(gate.alias, target, expected=before.target)
     was = f", before {before.target}" if before.target is not None else ""

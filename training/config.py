@@ -1,4 +1,4 @@
-"""The one validated file that says how a model is trained; stored with the artifact."""
+"""The validated configuration of a training run; it is stored with the artifact."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from app.inference.variants import VARIANTS, Form, Variant
 from training.machines import MachineSpec, build
 
 DATA = Path("../shared/data")
-"""Where the sources that are known by name are looked for."""
+"""Folder in which the named sources are looked up."""
 
 
 class ConfigError(ValueError):
-    """A configuration file that cannot be used; says which entry and why."""
+    """A configuration that cannot be used; the message gives the entry and the reason."""
 
 
 def is_file(source: str) -> bool:
-    """A source that is a file, not a name."""
+    """Return whether a source is a file rather than a name."""
     return "." in Path(source).name
 
 
 def source_name(source: str) -> str:
-    """What the scenes of a source are said to come from: its name, or its file's first word."""
+    """Return the name of a source; for a file, the part of its name before the first dot."""
     return Path(source).name.partition(".")[0] if is_file(source) else source
 
 
@@ -37,11 +37,11 @@ class _Section(BaseModel):
 
 
 class DataConfig(_Section):
-    """Which scenes, and how they are split.
+    """The scenes, their vocabulary and how the scenes are split.
 
-    A source is a name (`rooms` is the built-in generator, any other one a file `<name>.jsonl.gz`
-    in the data folder) or a file of any known format. Files, the vocabulary's too, are looked for
-    in the data folder, which for such a configuration is its own: see `data_folder`.
+    A source is a name or a file of any known format. The name `rooms` stands for the built-in
+    generator; any other name stands for the file `<name>.jsonl.gz` in the data folder. The data
+    folder of a configuration that names files is the configuration's own folder, see `data_folder`.
     """
 
     sources: tuple[str, ...] = Field(min_length=1)
@@ -51,13 +51,13 @@ class DataConfig(_Section):
     split: Literal["group", "stable", "random", "final"] = "group"
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
-    limit: int | None = Field(default=None, ge=10, description="at most so many scenes a source")
+    limit: int | None = Field(default=None, ge=10, description="most scenes from each source")
     words: str = Field(
-        default="", description="file of word vectors in the data folder; none where empty"
+        default="", description="file of word vectors in the data folder; empty: no vectors"
     )
-    # Not written where they say nothing, as below.
+    # Left out of the dump when empty, so that digests of earlier runs stay valid.
     terms: str = Field(
-        default="", exclude_if=lambda words: not words, description="of use, for files of one's own"
+        default="", exclude_if=lambda words: not words, description="terms of use of own files"
     )
     research_only: bool = Field(default=False, exclude_if=lambda only: not only)
 
@@ -70,7 +70,7 @@ class DataConfig(_Section):
 
     @property
     def files(self) -> bool:
-        """It names files rather than shipped things alone."""
+        """Whether the configuration names files rather than only shipped sources."""
         return self.vocabulary.endswith(".json") or any(map(is_file, self.sources))
 
 
@@ -81,35 +81,35 @@ class MachineConfig(_Section):
     H1: int = Field(default=200, ge=1)
     H2: int = Field(default=100, ge=0)
     K: int = Field(default=32, ge=0)
-    G: int = Field(default=0, ge=0, description="rank of what given relations imply (Triway)")
-    N: int = Field(default=0, ge=0, description="chain samples stored for new chains")
+    G: int = Field(default=0, ge=0, description="rank of the implication factors (Triway)")
+    N: int = Field(default=0, ge=0, description="number of stored chain samples")
     form: Form = "seed"
     min_triple_count: int = Field(default=1, ge=1)
     initial_scale: float = Field(default=0.05, gt=0)
     initial_c1: float = 0.0
-    # Not written where it is empty, so that runs and reports from before it keep their digest.
+    # Left out of the dump when empty, so that digests of earlier runs stay valid.
     without: tuple[str, ...] = Field(
-        default=(), exclude_if=lambda names: not names, description="weights held at zero, by name"
+        default=(), exclude_if=lambda names: not names, description="names of weights held at zero"
     )
 
 
 class ObjectiveConfig(_Section):
-    """What is minimised, and the knobs of that objective."""
+    """The objective to minimise, and its settings."""
 
     name: Literal["contrastive_divergence", "persistent_cd", "composite", "relations"]
-    k: int = Field(default=1, ge=1, description="Gibbs steps an update (CD, PCD)")
-    chains: int = Field(default=128, ge=1, description="persistent chains (PCD)")
-    presence_weight: float = Field(default=0.1, ge=0, description="presence against absence")
+    k: int = Field(default=1, ge=1, description="Gibbs steps for each update (CD, PCD)")
+    chains: int = Field(default=128, ge=1, description="number of persistent chains (PCD)")
+    presence_weight: float = Field(default=0.1, ge=0, description="weight of the presence term")
     relation_weight: float = Field(default=0.05, ge=0)
     unlisted: Literal["unobserved", "off"] = Field(
-        default="unobserved", description="relations that geometry left open in annotated scenes"
+        default="unobserved", description="meaning of unlisted relations in annotated scenes"
     )
-    generative_weight: float = Field(default=0.0, ge=0, description="of PCD within composite")
-    room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of withheld room types")
+    generative_weight: float = Field(default=0.0, ge=0, description="weight of PCD (composite)")
+    room_dropout: float = Field(default=0.5, ge=0, le=1, description="share of hidden room types")
     structure_dropout: float = Field(default=0.5, ge=0, le=1)
     object_dropout: float = Field(default=0.0, ge=0, lt=1)
     count_dropout: float = Field(
-        default=0.0, ge=0, le=1, description="share of scenes whose relations see no counts"
+        default=0.0, ge=0, le=1, description="share of scenes with hidden counts"
     )
     offset_prior: float = Field(
         default=8.0, ge=0, description="precision of the offsets of the sources (relations)"
@@ -118,30 +118,30 @@ class ObjectiveConfig(_Section):
         default=16.0, ge=0, description="precision of the relation weights (relations)"
     )
     word_weight: float = Field(
-        default=0.0, ge=0, description="scale of what word vectors say of classes (relations)"
+        default=0.0, ge=0, description="scale of the word-vector term (relations)"
     )
     source_weights: dict[str, float] = Field(
-        default={}, description="what a relation of a source counts for, 1 unless named (relations)"
+        default={}, description="weight of relations by source, default 1 (relations)"
     )
 
 
 class ObjectsConfig(_Section):
-    """The first phase: the object part by persistent chains (local form)."""
+    """The first phase: it trains the object part by persistent chains (local form)."""
 
-    epochs: int = Field(default=0, ge=0, description="passes over the scenes; 0 leaves it out")
-    learning_rate: float = Field(default=0.2, gt=0, description="at the start; falls to 0")
+    epochs: int = Field(default=0, ge=0, description="passes over the scenes; 0 skips the phase")
+    learning_rate: float = Field(default=0.2, gt=0, description="initial rate; falls to 0")
     chains: int = Field(default=64, ge=1)
     batch_size: int = Field(default=32, ge=1)
 
 
 class PolishConfig(_Section):
-    """The last phase: persistent chains on the object part (local form)."""
+    """The last phase: it adjusts the object part by persistent chains (local form)."""
 
     updates: int = Field(default=0, ge=0)
     chains: int = Field(default=512, ge=1)
-    k: int = Field(default=2, ge=1, description="Gibbs steps an update")
+    k: int = Field(default=2, ge=1, description="Gibbs steps for each update")
     learning_rate: float = Field(default=0.002, gt=0)
-    anchor: float = Field(default=0.1, ge=0, description="pull to the weights before")
+    anchor: float = Field(default=0.1, ge=0, description="penalty on changes of the weights")
 
 
 class TrainingConfig(_Section):
@@ -154,15 +154,15 @@ class TrainingConfig(_Section):
     batch_size: int = Field(default=64, ge=1)
     weight_decay: float = Field(default=0.0, ge=0)
     relation_decay: float = Field(default=0.0, ge=0, description="decay of the relation weights")
-    relation_rate: float = Field(default=1.0, gt=0, description="their share of the learning rate")
-    averaging: float = Field(default=0.0, ge=0, lt=1, description="decay of the weight average")
+    relation_rate: float = Field(default=1.0, gt=0, description="rate factor of relation weights")
+    averaging: float = Field(default=0.0, ge=0, lt=1, description="decay of average weights")
     patience: int | None = Field(default=None, ge=1)
     seed: int = 0
     threads: int = Field(default=1, ge=1)
 
 
 class Config(_Section):
-    """Everything that decides the weights."""
+    """The complete configuration of a training run."""
 
     name: str = Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")
     description: str = ""
@@ -205,24 +205,24 @@ class Config(_Section):
 
     @property
     def digest(self) -> str:
-        """sha256 of the configuration; a checkpoint resumes only under the one it began with."""
+        """sha256 of the configuration; a checkpoint resumes only with the same digest."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
 def shipped_configs() -> dict[str, Path]:
-    """The configurations that come with the package, by name."""
+    """Return the files of the configurations in this package, by name."""
     folder = Path(__file__).parent / "configs"
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def config_path(reference: str) -> Path:
-    """The file of a shipped configuration, a TOML file, or the one a folder of its name holds."""
+    """Return the file of a shipped configuration, of a path, or of a folder with that file."""
     path = shipped_configs().get(reference, Path(reference))
     return path / f"{path.resolve().name}.toml" if path.is_dir() else path
 
 
 def data_folder(reference: str, config: Config, given: Path | None = None) -> Path:
-    """Where a configuration's scenes are: as given, beside the file, or where known sources are."""
+    """Return the given folder, else the folder of the configuration's own files, else `DATA`."""
     if given is not None:
         return given
     return config_path(reference).parent if config.data.files else DATA
@@ -232,7 +232,7 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
     """Read a TOML file, a folder that `init` made, or a shipped configuration by its name.
 
     Raises:
-        ConfigError: no such file, not TOML, or an entry that does not fit.
+        ConfigError: the file is missing, is not TOML, or has an invalid entry.
     """
     path = config_path(reference)
     if not path.is_file():
@@ -250,10 +250,10 @@ def load_config(reference: str, *, seed: int | None = None) -> Config:
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
-    """A configuration with entries changed, each named as in "training.epochs".
+    """Return a configuration with changed entries; names are like "training.epochs".
 
     Raises:
-        ConfigError: there is no such entry, or the values do not fit.
+        ConfigError: an entry does not exist, or a value is invalid.
     """
     values = config.model_dump()
     for name, value in settings.items():
@@ -270,15 +270,15 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
 
 
 def config_toml(config: Config) -> str:
-    """The configuration as a TOML file that `load_config` reads."""
+    """Return the configuration as TOML text that `load_config` reads."""
     return sections_toml(config.model_dump(mode="json", exclude_none=True))
 
 
 def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None = None) -> str:
-    """Entries and sections as TOML, with a reason above an entry where there is one.
+    """Return entries and sections as TOML text, with a comment above an entry if a reason is given.
 
     Args:
-        reasons: by "section.entry".
+        reasons: comments by "section.entry".
     """
     sections = {name: own for name, own in values.items() if isinstance(own, Mapping)}
     lines = [_entry(name, value) for name, value in values.items() if name not in sections]
@@ -292,7 +292,7 @@ def sections_toml(values: Mapping[str, Any], reasons: Mapping[str, str] | None =
 
 
 def _entry(name: str, value: Any) -> str:
-    # JSON and TOML write the values of a configuration alike.
+    # JSON and TOML write these values in the same way.
     return f"{name} = {json.dumps(value, ensure_ascii=False)}"
 
 

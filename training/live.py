@@ -1,4 +1,4 @@
-"""What a training run shows: its progress as it goes, its curve when it ends, and TensorBoard."""
+"""Displays of a training run: progress bar, final curve and TensorBoard."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _LEVELS = "▁▂▃▄▅▆▇█"
 _WIDTH = 21
-# Figures of the summary: title, and attribute of an epoch.
+# Curves of the summary: title, and attribute of `Epoch`.
 _CURVES = (
     ("objective", "loss"),
     ("missing objects, MRR", "mrr_validation"),
@@ -29,10 +29,10 @@ _CURVES = (
 
 
 class Display:
-    """A bar over the epochs, with updates, objective, validation scores and the time left.
+    """A progress bar over the epochs with updates, objective, validation scores and remaining time.
 
     Args:
-        logs: a folder for TensorBoard, None for none.
+        logs: folder for TensorBoard; None writes no log.
     """
 
     def __init__(self, trainer: Trainer, console: Console, logs: Path | None = None) -> None:
@@ -67,7 +67,7 @@ class Display:
         self._bar.stop()
 
     def progress(self, epoch: int, done: float, loss: float) -> None:
-        """After an update."""
+        """Show the progress after an update."""
         trainer = self._trainer
         total = trainer.config.training.epochs
         note = f"epoch {epoch + 1}/{total}, update {trainer.updates:,}, objective {loss:.3f}"
@@ -76,17 +76,17 @@ class Display:
         self._bar.update(self._task, completed=epoch + done, note=note)
 
     def objects(self, done: float) -> None:
-        """While the objects are trained, before the first epoch."""
+        """Show the progress of the object phase, before the first epoch."""
         self._bar.update(self._task, completed=0, note=f"objects, {done:.0%}")
 
     def ended(self, epoch: Epoch) -> None:
-        """After an epoch."""
+        """Log a finished epoch."""
         if self._log is not None:
             self._log(epoch, self._trainer.updates)
 
 
 def scores(epoch: Epoch) -> str:
-    """The validation scores that there are."""
+    """Return the available validation scores as text."""
     found = f"MRR {epoch.mrr_validation:.3f}"
     if not math.isnan(epoch.r_precision_validation):
         found += f", R-precision {epoch.r_precision_validation:.3f}"
@@ -94,8 +94,8 @@ def scores(epoch: Epoch) -> str:
 
 
 def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
-    """Writes every epoch, at its number of updates, where TensorBoard reads it."""
-    # Late, for it takes longer to import than a small run to train.
+    """Return a function that logs every epoch at its number of updates for TensorBoard."""
+    # Imported here, because the import takes longer than a small run.
     from torch.utils.tensorboard import SummaryWriter
 
     writer = SummaryWriter(str(folder / config.name / f"seed-{config.training.seed}"))
@@ -114,14 +114,14 @@ def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
         for name, attribute in names.items():
             if not math.isnan(value := getattr(epoch, attribute)):
                 writer.add_scalar(name, value, updates)
-        # An interrupted run has its curve.
+        # Flushed at once, so that an interrupted run keeps its curve.
         writer.flush()
 
     return log
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """The values as a line of blocks from the lowest to the highest, means where there are many."""
+    """Return the values as a line of blocks, scaled from lowest to highest; many are averaged."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return ""
@@ -136,7 +136,7 @@ def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
 
 
 def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: Console) -> None:
-    """Print the curve, the best epoch, how long it took, and what to do next."""
+    """Print the curve, the best epoch, the duration and the next commands."""
     best = result.epochs[result.best_epoch]
     table = Table("curve", "", "first", "best epoch", "last", title_justify="left")
     table.title = f"{trainer.config.name}, seed {trainer.config.training.seed}"
@@ -164,13 +164,13 @@ def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: C
 
 
 def _advice(result: TrainingResult) -> str:
-    """What the shape of the curve says."""
+    """Return advice drawn from the position of the best epoch."""
     total, best = len(result.epochs), result.best_epoch + 1
     if total >= 10 and best == total:
         return "the last epoch was the best: more epochs may help (training.epochs)"
     if total >= 10 and best <= total // 2:
         return (
-            "the best epoch came early, what followed was learnt by heart: fewer epochs, fewer "
-            "hidden units (machine.H1) or more decay (training.weight_decay) may help"
+            "the best epoch came early and later epochs overfitted: fewer epochs, fewer hidden "
+            "units (machine.H1) or more decay (training.weight_decay) may help"
         )
     return ""

@@ -1,20 +1,20 @@
-"""The object part of a machine by maximum likelihood: persistent chains while the rate falls to 0.
+"""Train the object part of a machine by maximum likelihood with persistent chains.
 
-In the local form relations sum to one, so that log p(v) has a gradient of its own,
+In the local form the relations sum to one, so that log p(v) has its own gradient:
 
     d log p(v) / dW = v' E[h1 | v] - E_model[v' h1]
 
-and the same for b, c1, c2, J and Q. The first expectation is a mean field (exact with one layer),
-the second runs over Gibbs chains that go on between the updates. The rate falls linearly to 0, so
-that the chains follow a machine that stands still in the end, and the weights are averaged over the
-last part of the run.
+The gradients of b, c1, c2, J and Q have the same form. The first expectation is a mean field, which
+is exact with one layer. The second expectation uses Gibbs chains that continue between updates. The
+learning rate falls linearly to 0, so that the weights hardly change at the end and the chains can
+follow. The weights are averaged over the last part of the run.
 
-Room types come afterwards, with the other weights as they are: Q[t] by the gradient of
-log p(v | t), a few chains for each type. Trained together, the few chains of a type could not
-follow it.
+The weights Q of room types are trained afterwards, with all other weights fixed. Q[t] follows the
+gradient of log p(v | t), with a few chains for each type. In joint training, the few chains of a
+type could not follow the weights.
 
-Scenes count by their weight, and only those whose object list is nearly complete take part.
-`fine_tune` does less, after an objective that trained objects and relations together.
+Scenes count by their weight. Only scenes with a nearly complete object list take part. `fine_tune`
+is a shorter version for use after an objective that trained objects and relations together.
 
 Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008);
 Salakhutdinov and Hinton, "Deep Boltzmann machines" (2009), for two layers.
@@ -37,11 +37,12 @@ from training.machines.gibbs import Clamp, State, initial_state, run
 from training.machines.mean_field import Evidence, mean_field
 
 OBJECT_WEIGHTS = ("b", "c1", "c2", "W", "J", "Q")
-# The last part of the run is averaged, by a running mean that then forgets as slowly as this.
+# The weights of this last share of the run are averaged. Later weights count at least
+# `_FORGETTING`.
 _AVERAGED = 0.3
 _FORGETTING = 0.002
-# The phase of the room types: chains and scenes of each type in an update, updates, rate, and the
-# precision of the weights in scenes.
+# The phase of the room types: chains and scenes of each type in an update, number of updates,
+# learning rate, and precision of the prior of the weights (in scenes).
 _PER_ROOM = 12
 _ROOM_UPDATES = 1500
 _ROOM_RATE = 0.2
@@ -50,7 +51,7 @@ _ROOM_PRIOR = 0.5
 _SWEEPS = 200
 # Updates between two calls of `progress`.
 _REPORTED = 100
-# The fine tuning: its weights, the decay of their average, sweeps before samples are stored.
+# Fine tuning: its weights, the decay of their average, and the sweeps before samples are stored.
 _FINE_TUNED = ("b", "c1", "c2", "W", "Q")
 _FINE_TUNED_AVERAGING = 0.98
 _FINE_TUNED_SWEEPS = 50
@@ -58,7 +59,7 @@ _FINE_TUNED_SWEEPS = 50
 
 @dataclass
 class _Chains:
-    """Persistent chains: presence (B, V), context (B, H1) and (B, H2), room types (B,)."""
+    """Persistent chains: presence (B, V), hidden units (B, H1) and (B, H2), room types (B,)."""
 
     v: Tensor
     h1: Tensor
@@ -76,9 +77,9 @@ def fit_objects(
     """Train b, c1, c2, W, J and Q of a local machine in place.
 
     Args:
-        train: scenes; those with incomplete object lists are left out.
-        config: passes over the data, rate, chains and batch size; no pass does nothing.
-        progress: called with the share of the updates that are done.
+        train: training scenes; scenes with incomplete object lists are left out.
+        config: epochs, learning rate, chains and batch size; 0 epochs skip the phase.
+        progress: called with the finished share of the updates.
 
     Raises:
         FloatingPointError: the weights diverged.
@@ -102,7 +103,9 @@ def fit_objects(
                 average[name].lerp_(weight, share)
             if (update + 1) % _REPORTED == 0 or update + 1 == updates:
                 if not all(bool(weight.isfinite().all()) for weight in weights.values()):
-                    raise FloatingPointError("the objects diverged: lower objects.learning_rate")
+                    raise FloatingPointError(
+                        "the weights of the objects diverged: lower objects.learning_rate"
+                    )
                 progress((update + 1) / updates)
         for name, weight in weights.items():
             weight.copy_(average[name])
@@ -114,7 +117,7 @@ def _withheld(v: Tensor, room: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fit_rooms(machine: BoltzmannMachine, scenes: _Scenes, generator: torch.Generator) -> None:
-    """Train Q by log p(v | t), every room type of the scenes for itself."""
+    """Train Q by log p(v | t), independently for every room type of the scenes."""
     known = scenes.room >= 0
     counts = torch.zeros(len(machine.Q)).index_add_(0, scenes.room[known], scenes.weight[known])
     rooms = counts.nonzero().squeeze(1)
@@ -144,9 +147,10 @@ def _fit_rooms(machine: BoltzmannMachine, scenes: _Scenes, generator: torch.Gene
 def store_samples(
     machine: BoltzmannMachine, train: SceneTensors, room_dropout: float, seed: int
 ) -> None:
-    """Fill the machine's stored samples with the ends of N long chains that began at scenes.
+    """Store the final states of N long chains that start at scenes.
 
-    Each sample keeps the room type of its scene; a share of the chains runs without it.
+    Each sample keeps the room type of its scene. A share `room_dropout` of the chains runs without
+    it.
     """
     if not machine.spec.N:
         return
@@ -167,14 +171,14 @@ class _Scenes:
     def __init__(self, train: SceneTensors, generator: torch.Generator):
         kept = train.complete.nonzero().squeeze(1)
         if not len(kept):
-            raise ValueError("no scene of the training part has a complete list of objects")
+            raise ValueError("no training scene has a complete object list")
         self.v, self.room, self.weight = train.v[kept], train.room[kept], train.weight[kept]
         self.size = float(self.weight.sum())
         self._generator = generator
         self._order, self._place = torch.zeros(0, dtype=torch.int64), 0
 
     def draw(self, count: int) -> tuple[Tensor, Tensor]:
-        """Presence and room types of some scenes, (B, V) and (B,)."""
+        """Return presence (B, V) and room types (B,) of the next scenes."""
         parts = []
         while count:
             if self._place == len(self._order):
@@ -186,7 +190,7 @@ class _Scenes:
         return self.v[index], self.room[index]
 
     def _shuffle(self) -> None:
-        """A pass over the scenes: each as often as its weight says, in random order."""
+        """Begin a pass in random order; each scene occurs as often as its weight states."""
         times = self.weight.floor()
         extra = torch.rand(len(times), generator=self._generator) < self.weight - times
         index = torch.arange(len(times)).repeat_interleave(times.long() + extra)
@@ -217,7 +221,7 @@ def _update(
 
 
 def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generator) -> Tensor:
-    """Move the chains by one sweep; returns the mean of h1 that was drawn last, (B, H1)."""
+    """Run the chains for one sweep; return the mean (B, H1) from which h1 was sampled last."""
     chains.v = bernoulli(machine.object_logits(chains.h1).sigmoid(), generator)
     if machine.spec.H2:
         h2 = machine.second_layer_logits(chains.h1).sigmoid()
@@ -247,16 +251,17 @@ def fine_tune(
     room_dropout: float,
     seed: int,
 ) -> None:
-    """Pull the samples of a local machine to the data and store N of them, in place.
+    """Move the samples of a local machine towards the data and store N samples, in place.
 
-    Conditional likelihoods give accurate conditionals and biased samples: scenes with 50 % too many
-    objects. Persistent contrastive divergence with many chains, on b, c1, c2, W and Q, removes the
-    bias. A term anchor · sum (θ - θ_before)² keeps the answers. Afterwards the chains go on with
-    the averaged weights, each under the room type of its first scene.
+    Training by conditional likelihoods gives accurate conditionals and biased samples: scenes have
+    50 % too many objects. Persistent contrastive divergence with many chains, on b, c1, c2, W and
+    Q, removes the bias. The penalty anchor · sum (θ - θ_before)² keeps the conditionals accurate.
+    The stored samples come from chains run with the averaged weights, each with the room type of
+    its first scene.
 
     Args:
-        config: how many updates and chains; none of either does nothing.
-        room_dropout: share of chains and scenes whose room type is withheld.
+        config: number of updates and chains; with 0 updates and N = 0, nothing happens.
+        room_dropout: share of chains and scenes with a hidden room type.
     """
     if not config.updates and not machine.spec.N:
         return
@@ -305,7 +310,7 @@ def fine_tune(
 def _settled(
     machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
 ) -> State:
-    """Chains at scenes, with the context drawn given them."""
+    """Return chains that start at scenes, with hidden units sampled given the scenes."""
     field = mean_field(machine, Evidence(v, room=room))
     return replace(
         initial_state(machine, v, generator, Clamp(room=room)),

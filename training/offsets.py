@@ -1,15 +1,15 @@
-"""Offsets of placements, learnt from scenes with poses.
+"""Fit the offsets between placed objects to scenes with poses.
 
-Of a canonical relation, and on each axis alone, the offset of a thing of class i from one of class
-j is normal, with a mean m and a variance s of the pair's own:
+Take a canonical relation and an axis. The offset of an object of class i from an object of class j
+is normal, with a mean m and a variance s for each pair of classes:
 
     s ~ inverse-gamma(alpha, beta)    m given s ~ normal(mu + u_i + v_j, s / kappa)
     u_i and v_j given s ~ normal(0, s / (kappa lambda))
 
 mu, kappa, alpha and beta belong to the relation and the axis. They maximise the likelihood of all
-pairs in turn with the effects u and v of the classes, which their pairs tell together. Given all
-that, a pair's offset is known in closed form: much seen, it rests on the pair; little or never
-seen, on its classes and its relation. `docs/decisions/offsets.md` holds what else was tried.
+pairs, in alternation with the class effects u and v. Given these values, the offset of a pair has a
+closed form. For frequent pairs the data of the pair dominate; for rare pairs the classes and the
+relation dominate. `docs/decisions/offsets.md` describes the alternatives.
 """
 
 from __future__ import annotations
@@ -30,25 +30,27 @@ from training.datasets import EncodedScene
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Shrinks the effect of a class: as if so many more of its pairs had shown none.
+# Shrinks the effect of a class like `LAMBDA` additional pairs without an effect.
 LAMBDA: Final = 4.0
-# Below 1 a pair of which nothing is known has no variance to speak of.
+# At alpha <= 1 the variance of an unseen pair is not finite.
 _LEAST_ALPHA: Final = 1.5
-# A source of fewer scenes is too small for the others to be weighed down to it.
+# Sources with fewer scenes than this do not lower the weights of larger sources.
 _FEW: Final = 100
 _ROUNDS, _SWEEPS = 4, 10
-# Of a box's centre as annotated, in metres; without it equal heights would have no variance.
+# Resolution of an annotated box centre in metres; without it, equal heights would have variance 0.
 _RESOLUTION: Final = 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """N offsets between things that stand in a relation.
+    """N offsets between related objects.
 
     Attributes:
         offset: (N, 3) metres from the relation's object to its subject, in viewer axes.
-        relation, subject, other: (N,) canonical relation, and the two classes.
-        scene: (N,) position of the scene; source: (N,) number of its source.
+        relation: (N,) canonical relation.
+        subject, other: (N,) classes of the relation's subject and object.
+        scene: (N,) position of the scene.
+        source: (N,) index of its source.
     """
 
     offset: Floats
@@ -59,12 +61,12 @@ class Seen:
     source: Ints
 
     def some(self, some: NDArray[np.bool_]) -> Seen:
-        """A part of them, (N,) bool."""
+        """Return the offsets where `some` (N,) is true."""
         return Seen(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
 
 
 def seen_offsets(scenes: Sequence[EncodedScene]) -> Seen:
-    """The offsets between all things of scenes with poses that stand in a relation."""
+    """Return the offsets between all related objects of scenes with poses."""
     sources = sorted({scene.source for scene in scenes})
     offsets, rows = [np.zeros((0, 3))], [np.zeros((0, 5), dtype=np.int64)]
     for place, scene in enumerate(scenes):
@@ -81,10 +83,10 @@ def seen_offsets(scenes: Sequence[EncodedScene]) -> Seen:
 
 
 def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
-    """What scenes teach of V classes; None where none of them has poses.
+    """Fit the offsets of V classes; return None if no scene has poses.
 
-    The things of a scene are no independent witnesses: those of one pair weigh one together. And
-    every source weighs as much as the others, since boxes of one world are alike beyond chance.
+    Instances of one pair of classes in a scene are dependent, so together they weigh as one. Every
+    source has the same total weight, because boxes of one source resemble each other.
     """
     seen = seen_offsets(scenes)
     if not len(seen.offset):
@@ -113,13 +115,14 @@ def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
 
 
 class Pairs(NamedTuple):
-    """P pairs of classes in one relation, each by the moments of its offsets.
+    """P pairs of classes in one relation, with the moments of their offsets.
 
     Attributes:
         subject, other: (P,) classes, ascending by subject, then by object.
-        scenes: (P,) how many scenes showed it.
-        n: (P, 1) what these weigh.
-        mean: (P, 3) of the offsets; scatter: (P, 3) weighted sum of squares around it.
+        scenes: (P,) number of scenes with the pair.
+        n: (P, 1) total weight of the pair.
+        mean: (P, 3) weighted mean of the offsets.
+        scatter: (P, 3) weighted sum of squares around the mean.
     """
 
     subject: Ints
@@ -134,7 +137,7 @@ def _pairs(seen: Seen) -> Pairs:
     classes = np.stack([seen.subject, seen.other], axis=1)
     found, pair = np.unique(classes, axis=0, return_inverse=True)
     pair = pair.reshape(-1)
-    # Things of one pair in one scene.
+    # Instances of the same pair of classes in one scene.
     _, first, group, size = np.unique(
         np.stack([pair, seen.scene]),
         axis=1,
@@ -153,14 +156,14 @@ def _pairs(seen: Seen) -> Pairs:
 
 
 def _sums(group: Ints, values: Floats, groups: int) -> Floats:
-    """(G, k) sums of values (N, k) over each group."""
+    """Return the sums (G, k) of values (N, k) over each group."""
     found = np.zeros((groups, values.shape[1]))
     np.add.at(found, group, values)
     return found
 
 
 def _balance(seen: Seen) -> Floats:
-    """(N,) the weight of each one's source: that of its scenes if the sources had equally many."""
+    """Return (N,) weights of the offsets; they balance large and small sources."""
     count = np.array(
         [len(np.unique(seen.scene[seen.source == s])) for s in range(seen.source.max() + 1)]
     )
@@ -171,11 +174,12 @@ def _balance(seen: Seen) -> Floats:
 
 @dataclass(eq=False)
 class _Fit:
-    """What is known of one relation; all of the last axis are x, y and z.
+    """Fitted parameters of one relation; the last axis is x, y and z.
 
     Attributes:
-        kappa, alpha, beta, mu: (3,); u, v: (V, 3).
-        doubt_u, doubt_v: (V, 3) variances of u and v, as parts of s / kappa.
+        kappa, alpha, beta, mu: (3,) parameters of the prior.
+        u, v: (V, 3) effects of the subject's and the object's class.
+        doubt_u, doubt_v: (V, 3) variances of u and v, in units of s / kappa.
     """
 
     kappa: Floats
@@ -188,11 +192,11 @@ class _Fit:
     doubt_v: Floats
 
     def expected(self, pairs: Pairs) -> Floats:
-        """(P, 3) where the offset of a pair is expected before it was seen."""
+        """Return the prior mean (P, 3) of the offset of each pair."""
         return self.mu + self.u[pairs.subject] + self.v[pairs.other]
 
     def predict(self, pairs: Pairs) -> tuple[Floats, Floats]:
-        """Mean and variance, (P, 3), of the next offset of each pair."""
+        """Return mean and variance, (P, 3), of the next offset of each pair."""
         kappa = self.kappa / (1 + self.doubt_u[pairs.subject] + self.doubt_v[pairs.other])
         return posterior(
             *(self.expected(pairs), kappa, self.alpha, self.beta),
@@ -200,9 +204,9 @@ class _Fit:
         )
 
     def tables(self) -> tuple[Floats, Floats, Floats]:
-        """Mean and variance of pairs never seen: (6,) of unknown classes, (V, 6) what each adds.
+        """Return mean and variance of unseen pairs: (6,) of unknown classes, (V, 6) of each class.
 
-        The same as `predict` of nothing, which is a sum over the two classes.
+        The result equals `predict` for a pair without data, as a sum over the two classes.
         """
         spread = self.beta / (self.alpha - 1)
         unknown = 1 / LAMBDA
@@ -223,11 +227,11 @@ def posterior(
     mean: Floats,
     scatter: Floats,
 ) -> tuple[Floats, Floats]:
-    """Mean and variance of the next draw after n, under the normal–inverse-gamma prior.
+    """Return mean and variance of the next draw after n draws, with a normal–inverse-gamma prior.
 
     Args:
-        expected, kappa, alpha, beta: of the prior; alpha + n / 2 must be above 1.
-        n, mean, scatter: how many were drawn, their mean, and their squares around it.
+        expected, kappa, alpha, beta: parameters of the prior; alpha + n / 2 must be above 1.
+        n, mean, scatter: number of draws, their mean, and their sum of squares around the mean.
     """
     after = kappa + n
     rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
@@ -244,7 +248,7 @@ def log_likelihood(
     mean: Floats,
     scatter: Floats,
 ) -> Floats:
-    """Of the draws, mean and variance integrated out; see `posterior`."""
+    """Return the log-likelihood of the draws, mean and variance integrated out; see `posterior`."""
     after, shape = kappa + n, alpha + n / 2
     rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
     found: Floats = (
@@ -255,7 +259,7 @@ def log_likelihood(
 
 
 def _fit(pairs: Pairs, V: int) -> _Fit:
-    """Hyperparameters and effects of one relation, in turn."""
+    """Fit hyperparameters and effects of one relation in alternation."""
     nothing = np.zeros((V, 3))
     start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
     fit = _Fit(
@@ -270,7 +274,7 @@ def _fit(pairs: Pairs, V: int) -> _Fit:
 
 
 def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
-    """kappa, alpha and beta of one axis."""
+    """Fit kappa, alpha and beta of one axis by maximum likelihood."""
 
     def loss(logs: Floats) -> float:
         kappa, alpha, beta = np.exp(logs)
@@ -283,8 +287,8 @@ def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
 
 
 def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
-    """mu, u and v given the rest: each in turn the mean of what the others leave, shrunk."""
-    # What a pair's own mean tells of the effects, next to s / kappa.
+    """Fit mu, u and v in alternation: each is the shrunk weighted mean of the residuals."""
+    # Weight of a pair's own mean for the effects, relative to s / kappa.
     weight = pairs.n / (pairs.n + fit.kappa)
 
     below_u = _sums(pairs.subject, weight, V) + LAMBDA
@@ -299,5 +303,5 @@ def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
 
 
 def _stored(table: Floats) -> NDArray[np.float32]:
-    """In half precision, as artifacts keep it."""
+    """Round a table to half precision, as artifacts store it."""
     return table.astype(np.float16).astype(np.float32)

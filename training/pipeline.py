@@ -1,4 +1,4 @@
-"""From a configuration to split, encoded scenes, for training and evaluation alike."""
+"""Read, split and encode the scenes of a configuration, for training and evaluation."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ from training.trainer import TrainingData
 
 @dataclass(frozen=True)
 class SplitScenes:
-    """Encoded scenes of every part, with what they were read from.
+    """Encoded scenes of every part, and their origin.
 
     Attributes:
-        data: the section that named them.
-        vocabulary: class indices of the scenes.
-        parts: per part, its scenes over all sources.
-        counts, digests: per source, scenes read and sha256 of what was read.
-        shuffle: seed of the permutation, None where the scenes are as they were read.
-        words: (V, D) unit word vectors of the classes; None without any.
+        data: the configuration section that names the sources.
+        vocabulary: classes; the scenes use their indices.
+        parts: scenes of all sources, by part.
+        counts, digests: number of scenes and sha256 of their contents, by source.
+        shuffle: seed of the permutation of objects; None if the objects are not permuted.
+        words: (V, D) unit word vectors of the classes; None without word vectors.
     """
 
     data: DataConfig
@@ -56,9 +56,9 @@ class SplitScenes:
 
     @property
     def digest(self) -> str:
-        """sha256 of all that decides what is learnt from: contents, vocabulary, split, shuffling.
+        """sha256 of the training input: contents, vocabulary, split and shuffling.
 
-        Names alone would not do: a corrected file has the same ones.
+        The names of the files are not enough, because a corrected file keeps its name.
         """
         decisive = {
             "data": self.data.model_dump(mode="json"),
@@ -69,7 +69,13 @@ class SplitScenes:
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
 
     def training_data(self) -> TrainingData:
-        """Tensors for the trainer. What a source annotates is learnt from its training part."""
+        """Return tensors for the trainer.
+
+        The training part of a source decides which classes the source annotates.
+
+        Raises:
+            ConfigError: a source has no scene in the training part.
+        """
         annotated = annotated_classes(self.parts["train"], self.vocabulary)
         every = {scene.source for scenes in self.parts.values() for scene in scenes}
         for source in every - set(annotated):
@@ -90,9 +96,9 @@ class SplitScenes:
         )
 
     def shuffled(self, seed: int) -> SplitScenes:
-        """The same with the objects of training and validation scenes permuted between scenes.
+        """Return a copy with the objects of training and validation scenes permuted between scenes.
 
-        Test scenes stay as they are.
+        Test scenes are unchanged.
         """
         structure = self.vocabulary.structure
         permuted = {
@@ -103,12 +109,12 @@ class SplitScenes:
 
 
 def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]]:
-    """The scenes of every source under its name.
+    """Read the scenes of every source; return them by the source's name.
 
-    A source is a file, or `<source>.jsonl.gz` in `root` or in its folder `extra`.
+    A source is a file, or `<source>.jsonl.gz` in `root` or in `root/extra`.
 
     Raises:
-        ConfigError: there is no such file.
+        ConfigError: a file is missing.
         DatasetError: a file is malformed.
     """
     scenes: dict[str, list[AnnotatedScene]] = {}
@@ -133,10 +139,10 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
 
 
 def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path) -> Vocabulary:
-    """The vocabulary a configuration names, with the typical sizes of its scenes.
+    """Return the vocabulary named by the configuration, with the typical sizes from its scenes.
 
     Raises:
-        ConfigError: an unknown name, or a file in `root` that holds no vocabulary.
+        ConfigError: the name is unknown, or the file in `root` holds no vocabulary.
     """
     if data.vocabulary == "indoor":
         vocabulary = indoor_vocabulary()
@@ -167,11 +173,11 @@ def split_and_encode(
     vocabulary: Vocabulary | None = None,
     root: Path = DATA,
 ) -> SplitScenes:
-    """Split all sources together (groups are shared between them) and encode each part.
+    """Split all sources together, because they share groups, and encode each part.
 
     Args:
-        vocabulary: that of a published model; by default the configuration's.
-        root: where the file of the configuration's vocabulary is.
+        vocabulary: vocabulary of a published model; default: that of the configuration.
+        root: folder of the configuration's vocabulary file.
 
     Raises:
         ConfigError: see `build_vocabulary`.
@@ -191,10 +197,10 @@ def split_and_encode(
 
 
 def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch.Tensor | None:
-    """The vectors of the classes, (V, D).
+    """Return the word vectors of the classes, (V, D).
 
     Raises:
-        DatasetError: there is no such file, or it holds no vectors.
+        DatasetError: the file is missing or holds no vectors.
     """
     if not data.words:
         return None
@@ -203,7 +209,7 @@ def _word_vectors(data: DataConfig, vocabulary: Vocabulary, root: Path) -> torch
 
 
 def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
-    """sha256 of the scenes' contents, whatever file format they came in."""
+    """Return the sha256 of the scenes' contents, independent of the file format."""
     sha = hashlib.sha256()
     for scene in scenes:
         sha.update(repr(scene).encode())
@@ -211,5 +217,5 @@ def digest_of(scenes: Sequence[AnnotatedScene]) -> str:
 
 
 def prepare(config: Config, root: Path) -> SplitScenes:
-    """Read, split and encode what a configuration names."""
+    """Read, split and encode the scenes of a configuration."""
     return split_and_encode(config.data, read_sources(config.data, root), root=root)

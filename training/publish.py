@@ -1,4 +1,4 @@
-"""From a finished run to a version in the store: calibrate, evaluate, describe, publish."""
+"""Publish a finished run as a version in the store: calibrate, evaluate, describe, publish."""
 
 from __future__ import annotations
 
@@ -52,13 +52,12 @@ def publish_run(
 ) -> Artifact:
     """Calibrate on validation scenes, learn offsets from training scenes, evaluate, and publish.
 
-    Weights are stored in half precision; they are calibrated and evaluated as they are stored.
+    Weights are stored in half precision. Calibration and evaluation use the stored precision.
 
     Args:
-        measured: a run of the same configuration that kept test scenes back, and its scenes: its
-            figures are published and what was chosen for it is kept, since `run` has learnt from
-            all scenes.
-        judge: sees the model as it would be published; whatever it raises keeps it from being so.
+        measured: a run of the same configuration that kept test scenes back, and its scenes. Its
+            figures and its chosen values are published, because `run` has learnt from all scenes.
+        judge: called with the calibrated model; an exception from it stops the publication.
 
     Raises:
         RunError: the run learnt from other scenes.
@@ -109,7 +108,7 @@ def calibrated_draft(
     offsets: Offsets | None = None,
     chosen: Calibration | None = None,
 ) -> Artifact:
-    """A run as it would be published, its weights rounded as they are stored.
+    """Return the calibrated artifact of a run, with weights rounded to the stored precision.
 
     Args:
         chosen: see `calibrate_objects`.
@@ -127,7 +126,7 @@ def calibrated_draft(
 
 @torch.no_grad()
 def as_stored(machine: BoltzmannMachine) -> BoltzmannMachine:
-    """The machine, its matrices rounded to half precision in place, as the store keeps them."""
+    """Round the matrices of the machine to half precision in place, as the store keeps them."""
     for parameter in machine.parameters():
         if parameter.dim() > 1:
             parameter.copy_(parameter.half().float())
@@ -140,9 +139,9 @@ def draft_artifact(
     calibration: Calibration | None = None,
     offsets: Offsets | None = None,
 ) -> Artifact:
-    """An artifact in memory alone, with the neutral calibration unless one is given."""
+    """Return an artifact in memory only; the default calibration is the neutral one."""
     return Artifact(
-        manifest=None,  # type: ignore[arg-type]  # nothing that answers a question looks at it
+        manifest=None,  # type: ignore[arg-type]  # questions never read it
         weights=weights_of(machine),
         vocabulary=vocabulary,
         calibration=calibration or Calibration.neutral(machine.spec.A),
@@ -155,7 +154,7 @@ def draft_artifact(
 
 
 def _measure(artifact: Artifact, data: TrainingData, progress: Callable[[str], None]) -> list[Row]:
-    """Figures on the test part; none where there is none."""
+    """Return figures on the test part; empty without test scenes."""
     if not len(data.test):
         return []
     return evaluate(
@@ -174,7 +173,7 @@ def _training(run: FinishedRun, measured: tuple[FinishedRun, SplitScenes] | None
 
 
 def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
-    """What the model was trained on, with digests and terms."""
+    """Return the sources of the training data, with digests and terms."""
     sources = []
     for source, count in scenes.counts.items():
         words, research_only = terms_of(source, scenes.data)
@@ -191,7 +190,7 @@ def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
 
 
 def metrics(rows: list[Row]) -> tuple[Metric, ...]:
-    """The evaluation's rows as the manifest keeps them."""
+    """Return the rows of the evaluation in the form of the manifest."""
     return tuple(
         Metric(
             task=row.task,
@@ -207,18 +206,18 @@ def metrics(rows: list[Row]) -> tuple[Metric, ...]:
 
 
 def terms_of(source: str, data: DataConfig) -> tuple[str, bool]:
-    """Terms of use in words, and whether they allow research only.
+    """Return the terms of use of a source as text, and whether they allow research only.
 
-    Those of a known source, or those that the configuration states for the user's own files.
+    The terms of the user's own files come from the configuration.
     """
     if source in SOURCES and source in data.sources:
         return SOURCES[source].terms, SOURCES[source].research_only
-    words = data.terms or "scenes of the user's own, whose terms were not stated"
+    words = data.terms or "the user's own scenes, without stated terms of use"
     return words, data.research_only
 
 
 def terms(scenes: SplitScenes) -> str:
-    """One sentence on what the weights may be used for."""
+    """Return a sentence about the allowed use of the weights."""
     every = {source: terms_of(source, scenes.data) for source in scenes.counts}
     if research := [source for source, (_, research_only) in every.items() if research_only]:
         return f"Research use only: trained on {', '.join(research)}. Not for commercial robots."

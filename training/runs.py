@@ -1,10 +1,10 @@
-"""The folder of a training run: its checkpoint and curve while it trains, its result afterwards.
+"""The folder of a training run.
 
 config.json        the validated configuration
-checkpoint.pt      training state of the last finished epoch, for resuming
-model.safetensors  the best weights, with the shape in the header
-curve.csv, .png    reconstruction error per epoch
-result.json        best epoch, seconds, what it learnt from
+checkpoint.pt      training state after the last finished epoch, for resuming
+model.safetensors  the best weights; its header holds the shape of the machine
+curve.csv, .png    reconstruction error of each epoch
+result.json        best epoch, duration in seconds, data folder and digest of the scenes
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 
 
 class RunError(RuntimeError):
-    """A folder without a finished run, or a checkpoint that cannot be resumed; says why."""
+    """A folder holds no finished run, or its checkpoint cannot be resumed; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Epoch:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """The machine with its best weights, the curve, and where the best epoch was."""
+    """The machine with its best weights, the curve, and the index of the best epoch."""
 
     machine: BoltzmannMachine
     epochs: list[Epoch]
@@ -55,11 +55,11 @@ class TrainingResult:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run as it is read back.
+    """A finished run, as loaded from its folder.
 
     Attributes:
-        data: the folder that its scenes were read from, on the machine that it ran on.
-        scenes: digest of the scenes, their vocabulary and split; "" where the run does not say.
+        data: folder of the scenes, on the computer of the run.
+        scenes: digest of the scenes, their vocabulary and split; "" if the run has no digest.
     """
 
     config: Config
@@ -71,15 +71,15 @@ class FinishedRun:
     scenes: str = ""
 
     def require(self, scenes: str) -> None:
-        """The run learnt from these scenes.
+        """Check that the run learnt from the scenes with the given digest.
 
         Raises:
-            RunError: it learnt from others.
+            RunError: the run learnt from other scenes.
         """
         if self.scenes and self.scenes != scenes:
             raise RunError(
-                f"{self.config.name} learnt from other scenes than there are now, or with another "
-                "vocabulary or split: train it again (--fresh)"
+                "the scenes, vocabulary or split have changed since the training of "
+                f"{self.config.name}: train it again (--fresh)"
             )
 
 
@@ -91,7 +91,7 @@ def save_run(
     data: Path | None = None,
     scenes: str = "",
 ) -> None:
-    """Write the weights and the result; `result.json` last, since it marks the run as finished.
+    """Write the weights, then `result.json`, which marks the run as finished.
 
     Args:
         data, scenes: see `FinishedRun`.
@@ -115,7 +115,7 @@ def load_run(folder: Path) -> FinishedRun:
     """Read a finished run.
 
     Raises:
-        RunError: a file is missing or unreadable.
+        RunError: a file is missing or cannot be read.
     """
     for name in ("config.json", "model.safetensors", "result.json"):
         if not (folder / name).is_file():
@@ -135,7 +135,7 @@ def load_run(folder: Path) -> FinishedRun:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write to a sibling, fsync, rename: a crash leaves the old checkpoint."""
+    """Write to a temporary file, fsync, rename; after a crash the old checkpoint remains."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     with temporary.open("wb") as file:
@@ -146,10 +146,10 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
-    """Read a checkpoint that began with the configuration and scenes of the given digest.
+    """Read a checkpoint of the configuration and scenes with the given digest.
 
     Raises:
-        RunError: unreadable, or begun under another configuration or on other scenes.
+        RunError: the file cannot be read, or belongs to another configuration or other scenes.
     """
     try:
         state: dict[str, Any] = torch.load(path, weights_only=True)
@@ -157,14 +157,14 @@ def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
         raise RunError(f"{path.name} cannot be read: {error}") from error
     if state.get("digest") != digest:
         raise RunError(
-            f"{path.name} was begun with another configuration or on other scenes: use --fresh to "
-            "start over"
+            f"{path.name} belongs to another configuration or other scenes: use --fresh to start "
+            "over"
         )
     return state
 
 
 def write_csv(path: Path, epochs: list[Epoch]) -> None:
-    """One line per epoch."""
+    """Write one row for each epoch."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Epoch)])
         writer.writeheader()
@@ -172,7 +172,7 @@ def write_csv(path: Path, epochs: list[Epoch]) -> None:
 
 
 def write_plot(path: Path, epochs: list[Epoch], title: str) -> None:
-    """Reconstruction error per epoch, objects and relations side by side."""
+    """Plot the reconstruction error by epoch, objects and relations side by side."""
     import matplotlib
 
     matplotlib.use("Agg")

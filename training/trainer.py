@@ -1,7 +1,7 @@
-"""One trainer for every machine and objective: updates, early stopping, checkpoints, curves.
+"""The trainer of every machine and objective: updates, early stopping, checkpoints, curves.
 
-With one thread and the same seed two runs give bit-identical weights, whether or not either was
-interrupted and resumed at an epoch's end.
+With one thread, two runs with the same seed give bit-identical weights. This also holds if a run is
+interrupted and resumed after an epoch.
 """
 
 from __future__ import annotations
@@ -38,24 +38,25 @@ from training.runs import (
 
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
-# Called while the objects are trained, with the share that is done.
+# Called during the training of the objects, with the finished share.
 ObjectProgress = Callable[[float], None]
-# At the full learning rate: the rest are relation weights, which overfit within an epoch at it.
+# Weights with the full learning rate. At that rate, relation weights overfit within an epoch.
 _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
-# Called after every update with (epoch, share of the epoch done, mean loss so far).
+# Called after every update with (epoch, finished share of the epoch, mean loss so far).
 Progress = Callable[[int, float, float], None]
-# Called with every epoch that has ended.
+# Called with every finished epoch.
 Ended = Callable[[Epoch], None]
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Tensors of the three parts, and what the machine's shape follows from.
+    """Tensors of the three parts, and the data that fixes the machine's shape.
 
     Attributes:
-        digest: of the scenes, their vocabulary and split; a run is not gone on with on others.
-        words: (V, D) unit word vectors of the classes, 0 where unknown; None without any.
+        digest: digest of the scenes, their vocabulary and split; a run resumes only with the same
+            one.
+        words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
     """
 
     train: SceneTensors
@@ -69,7 +70,7 @@ class TrainingData:
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
-    """A machine at its start: small random matrices, biases at the training frequencies."""
+    """Return a machine with small random matrices and with biases at the training frequencies."""
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
@@ -89,7 +90,8 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
     with torch.no_grad():
         annotated = data.train.annotated_classes[data.train.source].sum(0)
-        # A class that no source annotates must start as a rare one, not at even odds.
+        # A class that no source annotates must start as rare, because even odds would be far too
+        # high.
         annotated = torch.where(annotated > 0, annotated, len(data.train))
         machine.b.copy_(log_odds_of(data.train.v.sum(0), annotated))
         machine.c1.fill_(shape.initial_c1)
@@ -101,12 +103,12 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
-    """Smoothed log-odds of a frequency; 1/2 is added to both sides."""
+    """Return the log-odds of a frequency, smoothed by 1/2 on both sides."""
     return ((count + 0.5) / (total - count + 0.5)).log()
 
 
 def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
-    """Relation biases at the frequencies seen where relations were annotated."""
+    """Set the relation biases to the frequencies in scenes with annotated relations."""
     A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
     held, seen, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
     logs, times, annotated = torch.zeros(V), torch.zeros(V), 0
@@ -132,12 +134,12 @@ def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
 
 
 class Trainer:
-    """Trains one configuration on one set of scenes.
+    """Train one configuration on one set of scenes.
 
     Args:
-        config: what to train.
+        config: the configuration.
         data: tensors of the split scenes.
-        folder: where `checkpoint.pt`, `curve.csv` and `curve.png` go; None keeps nothing.
+        folder: folder of `checkpoint.pt`, `curve.csv` and `curve.png`; None writes no files.
     """
 
     def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
@@ -186,7 +188,7 @@ class Trainer:
         return torch.optim.AdamW(groups, lr=t.learning_rate, fused=True)
 
     def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
-        """One cycle: a linear rise over a tenth of the updates, then a cosine down to zero."""
+        """One cycle: linear rise over a tenth of the updates, then a cosine down to zero."""
         t = self.config.training
         if t.schedule == "constant":
             return torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda _: 1.0)
@@ -203,10 +205,10 @@ class Trainer:
     # -- the run --------------------------------------------------------------------------------
 
     def resume(self) -> bool:
-        """Go on from the folder's checkpoint; False where there is none.
+        """Continue from the folder's checkpoint; return False without a checkpoint.
 
         Raises:
-            RunError: the checkpoint is unreadable or of another configuration.
+            RunError: the checkpoint cannot be read or belongs to another configuration.
         """
         if self.folder is None or not (self.folder / "checkpoint.pt").exists():
             return False
@@ -229,10 +231,10 @@ class Trainer:
         ended: Ended | None = None,
         objects: ObjectProgress = lambda _: None,
     ) -> TrainingResult:
-        """Train the objects if they have a phase of their own, then to the last epoch or until
-        patience runs out.
+        """Train the objects if they have their own phase, then the epochs.
 
-        KeyboardInterrupt passes through; the last finished epoch is on disk by then.
+        Training ends after the last epoch or when patience runs out. KeyboardInterrupt is passed
+        on; the checkpoint of the last finished epoch is then on disk.
         """
         if not self.objects_trained:
             began = time.perf_counter()
@@ -301,7 +303,7 @@ class Trainer:
         self.updates += 1
         decay = self.config.training.averaging
         if decay:
-            # A young average forgets its start faster (bias correction).
+            # With few updates, the average forgets its start faster (bias correction).
             weight = 1 - min(decay, self.updates / (self.updates + 10))
             for name, parameter in self.machine.named_parameters():
                 self.average[name].lerp_(parameter.detach(), weight)
@@ -309,7 +311,7 @@ class Trainer:
 
     @torch.no_grad()
     def _close_epoch(self, number: int, loss: float, began: float) -> None:
-        """Measure the (averaged) weights on validation scenes and remember the best."""
+        """Evaluate the (averaged) weights on validation scenes and keep the best."""
         parameters = dict(self.machine.named_parameters())
         current = {name: p.detach().clone() for name, p in parameters.items()}
         if self.config.training.averaging:
@@ -341,7 +343,7 @@ class Trainer:
         )
 
     def _validate(self) -> tuple[float, float]:
-        """(MRR of removed objects, R-precision of relations) on a fixed part of validation."""
+        """Return MRR of removed objects and R-precision of relations on fixed validation scenes."""
         generator = torch.Generator().manual_seed(0)
         pick = torch.randperm(len(self.data.validation), generator=generator)[:_VALIDATION_SCENES]
         sample = subset(self.data.validation, pick)
@@ -383,7 +385,7 @@ class Trainer:
         if not self.epochs:
             return
         write_csv(self.folder / "curve.csv", self.epochs)
-        # A plot takes longer than an epoch on few scenes.
+        # With few scenes, a plot takes longer than an epoch.
         if time.perf_counter() - self._drawn > _DRAWN_EVERY:
             self._draw()
 
@@ -394,6 +396,6 @@ class Trainer:
 
 
 def _with_relations(scenes: SceneTensors) -> SceneTensors:
-    """The scenes of which any relation is known; all of them where there is none."""
+    """Return the scenes with any observed relation, or all scenes if there are none."""
     kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
     return subset(scenes, torch.tensor(kept, dtype=torch.int64)) if kept else scenes

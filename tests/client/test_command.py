@@ -133,7 +133,7 @@ def test_scenes_are_drawn(scene: Any, tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"\x89PNG")
     done = scene("generate", "--plot", str(tmp_path / "out.doc"))
     assert done.exit_code == 2
-    assert "no picture" in done.stderr
+    assert "picture cannot be drawn" in done.stderr
 
 
 def test_without_matplotlib_nothing_is_asked_and_the_way_out_is_said(
@@ -158,14 +158,14 @@ def test_a_refusal_is_1_and_says_what_was_meant(scene: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (("missing",), "name what is there: labels"),
+        (("missing",), "name the objects: labels"),
         (("missing", "bed", "--at", "over bed"), "--at must be one of left, right"),
         (("missing", "bed", "--at", "nightstand"), '"on-top desk"'),
         (("missing", "bed", "--relation", "bed over lamp"), "--relation"),
         (("missing", "nowhere.json"), "nowhere.json"),
         (("missing", "scenes/nowhere"), "scenes/nowhere: No such file"),
         (("missing", "bed", "nowhere.json"), "nowhere.json must stand alone"),
-        (("missing", "-"), "no JSON"),
+        (("missing", "-"), "not JSON"),
         (("missing", "bed", "--timeout", "0"), "the timeout must be"),
         (("missing", "bed", "--no-such-option"), "no-such-option"),
         (("--url", "robot", "missing", "bed"), "http://"),

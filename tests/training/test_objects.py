@@ -154,7 +154,7 @@ def test_room_types_improve_the_conditional_likelihood_alone():
 
 def test_without_a_complete_scene_there_is_nothing_to_learn_from():
     data = tensors([replace(one, complete=False) for one in drawn(TARGET)], V)
-    with pytest.raises(ValueError, match="complete list of objects"):
+    with pytest.raises(ValueError, match="complete object list"):
         fit_objects(machine_of(), data, CONFIG, seed=0)
 
 

@@ -1,7 +1,7 @@
-"""The Boltzmann machines: energies, conditionals, expectations, samplers. Tensors only.
+"""The Boltzmann machines: energies, conditionals, expectations and samplers, on tensors only.
 
-Symbols are those of the project's model page: v, r, h1, h2; b, c1, c2, W, J; d, s, o, S, O, R, M,
-U.
+The symbols are those of the project's model page: v, r, h1, h2; b, c1, c2, W, J; d, s, o, S, O, R,
+M, U.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ VARIANTS: dict[str, type[BoltzmannMachine]] = {
 
 
 def build(spec: MachineSpec) -> BoltzmannMachine:
-    """A machine of the given shape with all weights zero."""
+    """Return a machine of the given shape with all weights zero."""
     return VARIANTS[spec.variant](spec)
 
 

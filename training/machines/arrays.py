@@ -1,4 +1,4 @@
-"""A machine as the arrays that the service answers from, and back."""
+"""Convert a machine to the arrays of the service, and back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from training.machines import BoltzmannMachine, build
 
 
 def weights_of(machine: BoltzmannMachine) -> Weights:
-    """Copies of the machine's tensors."""
+    """Return copies of the machine's tensors."""
     arrays = {
         name: np.array(tensor.detach().numpy(), order="C")
         for name, tensor in machine.state_dict().items()
@@ -22,7 +22,7 @@ def weights_of(machine: BoltzmannMachine) -> Weights:
 
 @lru_cache(maxsize=16)
 def machine_of(weights: Weights) -> BoltzmannMachine:
-    """The machine that has these weights; it shares their memory and is not to be changed."""
+    """Return the machine with these weights; it shares their memory, so do not change it."""
     with torch.device("meta"):
         machine = build(weights.spec)
     state = {name: torch.from_numpy(array) for name, array in weights.arrays.items()}

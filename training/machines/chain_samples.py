@@ -1,18 +1,18 @@
-"""Where chains start: samples of the machine's own long chains.
+"""Starting states of Gibbs chains: stored samples of the machine's own long chains.
 
-A chain that starts at nothing needs thousands of sweeps to find all kinds of rooms, since one kind
-leads to another through scenes of neither. So a trained machine stores N chain samples, each with
-its room type (`BoltzmannMachine.fantasies` and `.fantasy_rooms`, the names in the artifact), and a
-new chain goes on from one of them.
+A chain with an empty start needs thousands of sweeps to reach all kinds of rooms, because scenes
+between two kinds are improbable. A trained machine therefore stores N chain samples, each with its
+room type. The artifact names them `fantasies` and `fantasy_rooms`. A new chain continues from one
+of the samples.
 
-With evidence the samples are weighed before one is drawn for each chain,
+With evidence, each chain draws its sample by the weight w:
 
     log w = sum_{i observed} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
             - 6 [drawn under another room type than t],
 
-h1 at its mean given the sample: sampling importance resampling, followed by sweeps. Where no sample
-was drawn under t, the last term is h1·Q[t]. A few sweeps do not lead from one kind of room to
-another, whatever Q is.
+where h1 is at its mean given the sample. This is sampling importance resampling, followed by
+sweeps. If no sample was drawn under t, the last term is h1·Q[t]. The term is needed because a few
+sweeps do not lead from one kind of room to another, whatever Q is.
 
 Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008), for
 fantasy particles; Gordon, Salmond and Smith, "Novel approach to nonlinear/non-Gaussian Bayesian
@@ -37,12 +37,12 @@ from training.machines.mean_field import Evidence, mean_field
 
 
 def words(classes: int) -> int:
-    """32-bit words that a scene of so many classes takes."""
+    """Return the number of 32-bit words for a scene over `classes` classes."""
     return -(-classes // weights.WORD)
 
 
 def pack_scenes(v: Tensor) -> Tensor:
-    """Presence (N, V) as bits, (N, words) int32."""
+    """Return presence (N, V) packed into bits, (N, words) int32."""
     bits = np.zeros((len(v), words(v.shape[1]) * weights.WORD), dtype=np.uint8)
     bits[:, : v.shape[1]] = v.numpy() > 0
     packed = np.packbits(bits, axis=1, bitorder="little").view("<i4").astype(np.int32)
@@ -50,15 +50,15 @@ def pack_scenes(v: Tensor) -> Tensor:
 
 
 def unpack_scenes(packed: Tensor, classes: int) -> Tensor:
-    """Presence (N, V) float of scenes as bits."""
+    """Return presence (N, V) as floats from packed bits."""
     return torch.from_numpy(weights.unpack_scenes(packed.numpy(), classes))
 
 
 class ChainSamples:
-    """The stored samples of a machine whose weights do not change, weighed by evidence.
+    """The stored samples of a machine, with weights given the evidence.
 
     Args:
-        machine: read here; later changes to it are not seen.
+        machine: a machine with fixed weights; it is read once, here.
     """
 
     def __init__(self, machine: BoltzmannMachine) -> None:
@@ -69,18 +69,20 @@ class ChainSamples:
             self.v = unpack_scenes(machine.fantasies, machine.spec.V).to(machine.b.dtype)
             field = mean_field(machine, Evidence(self.v))
             self.h1, self.h2 = field.y.sigmoid(), field.h2
-            # log w of each given class, room type and held unit, a row for each sample.
+            # Terms of log w for each given class, room type and held unit; one row for each sample.
             self._present = logsigmoid(machine.object_logits(self.h1))
             self._room = self.h1 @ machine.Q.T
             self._unit = logsigmoid(field.y)
 
     @torch.no_grad()
     def start(self, given: Tensor, generator: torch.Generator, clamp: Clamp = FREE) -> State:
-        """A state for each chain: a sample that suits its evidence; without any, the evidence.
+        """Return a state for each chain: a sample drawn by its weight given the evidence.
+
+        Without stored samples, the chains start at the evidence.
 
         Args:
-            given: (B, V), 1 for classes that must be there.
-            clamp: room types and held units count as evidence too; see `Clamp`.
+            given: (B, V), 1 for classes that must be present.
+            clamp: room types and held units, which are also evidence; see `Clamp`.
         """
         machine = self.machine
         if not machine.spec.N:
@@ -91,7 +93,7 @@ class ChainSamples:
         return _held(bare_state(machine, self.v[chosen].maximum(given), h1, h2), clamp)
 
     def log_weight(self, given: Tensor, clamp: Clamp = FREE) -> Tensor:
-        """log w of every sample, (B, N); see the module."""
+        """Return log w of every sample, (B, N); see the module."""
         weight = given @ self._present.T
         if clamp.room is not None and self.machine.spec.C:
             known = (clamp.room >= 0).to(given.dtype).unsqueeze(1)
@@ -105,7 +107,7 @@ class ChainSamples:
 
 
 def _held(state: State, clamp: Clamp) -> State:
-    """The state with held units on."""
+    """Return the state with the held units on."""
     h1 = state.h1 if clamp.h1 is None else torch.where(clamp.h1, 1.0, state.h1)
     h2 = state.h2 if clamp.h2 is None else torch.where(clamp.h2, 1.0, state.h2)
     return replace(state, h1=h1, h2=h2)

@@ -1,17 +1,16 @@
-"""Weighted draws of h1 from p(h1 | evidence): the estimator behind every answer without a closed
-form.
+"""Weighted draws of h1 from p(h1 | evidence), used for every answer without a closed form.
 
-Given h1, unobserved relations sum out and observed ones multiply, unit by unit. So with a factorial
-proposal q (the mean-field fixed point) each draw h carries the weight
+Given h1, unobserved relations sum out, and the likelihood of observed relations is a product over
+units. The proposal q is factorial: the mean-field fixed point. Each draw h then has the weight
 
-    log w = h·x + sum_e term_e(ℓ_e(h)) - log q(h),   x = c1 + v'W + J h2,
+    log w = h·x + sum_e term_e(ℓ_e(h)) - log q(h),   x = c1 + v'W + J h2.
 
-with the likelihood of observed relations raised to a power (`pull`) where they must count for
-less. Any expectation over p(h1 | evidence) is a weighted mean. The uniforms behind the draws are
-fixed (a scrambled Sobol sequence), so the same evidence always gives the same answer. With two
-layers h2 is held at its mean-field value.
+The likelihood of observed relations can be raised to a power (`pull`) to reduce their influence.
+Any expectation over p(h1 | evidence) is a weighted mean. The uniform numbers are fixed (a scrambled
+Sobol sequence), so equal evidence always gives the same answer. With two layers, h2 stays at its
+mean-field value.
 
-Source: self-normalised importance sampling; Rao–Blackwellised, since only h1 is ever drawn.
+Source: self-normalised importance sampling; Rao–Blackwellised, because only h1 is sampled.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ from training.machines.mean_field import Evidence, MeanField, mean_field
 
 @dataclass(frozen=True)
 class HiddenDraws:
-    """Draws of the first hidden layer.
+    """Weighted draws of the first hidden layer.
 
     Attributes:
         h1: (M, B, H1) binary.
         log_weight: (M, B), normalised over M.
         log_evidence: (B,) estimate of log sum_{h1, unobserved r} exp(-E) without the object biases.
-        field: the mean-field fixed point behind the proposal.
+        field: the mean-field fixed point of the proposal.
     """
 
     h1: Tensor
@@ -46,32 +45,34 @@ class HiddenDraws:
 
     @property
     def effective_size(self) -> Tensor:
-        """(B,) effective number of draws, 1 / sum w²."""
+        """Effective number of draws, 1 / sum w², (B,)."""
         return (-(2 * self.log_weight).logsumexp(0)).exp()
 
     def implied(
         self, machine: BoltzmannMachine, edges: Edges, given: Tensor, *, apart: bool = False
     ) -> Tensor:
-        """What the given relations (B, E), 1 where on, imply for the others, (B, E).
+        """Return the logit shifts (B, E) implied by the given relations (B, E), 1 where on.
 
-        How strictly is for the objects to say: the context is taken at its mean without relations.
+        The strictness of the implications depends on the context. The context is at its mean given
+        the objects, without relations.
         """
         return machine.implied(edges, given, self.field.x.sigmoid(), apart=apart)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Expectation of values (M, B, ...) over the draws, (B, ...)."""
+        """Return the expectation of values (M, B, ...) over the draws, (B, ...)."""
         weight = self.log_weight.exp()
         return torch.einsum("mb,mb...->b...", weight, values)
 
     def log_mean_exp(self, values: Tensor) -> Tensor:
-        """log E[exp(values)], (B, ...)."""
+        """Return log E[exp(values)], (B, ...)."""
         weight = self.log_weight.reshape(*self.log_weight.shape, *[1] * (values.dim() - 2))
         return (values + weight).logsumexp(0)
 
     def standard_error(self, values: Tensor) -> Tensor:
-        """Standard error of `mean(values)` by the delta method, (B, ...).
+        """Return the standard error of `mean(values)` by the delta method, (B, ...).
 
-        An upper bound in practice: the Sobol sequence does better than independent draws.
+        In practice it is an upper bound, because a Sobol sequence has smaller errors than
+        independent draws.
         """
         deviation = (values - self.mean(values)) ** 2
         return torch.einsum("mb,mb...->b...", (2 * self.log_weight).exp(), deviation).sqrt()
@@ -79,7 +80,7 @@ class HiddenDraws:
 
 @lru_cache(maxsize=8)
 def fixed_uniforms(count: int, units: int) -> Tensor:
-    """(count, units) quasi-random numbers in (0, 1), the same in every process."""
+    """Return (count, units) quasi-random numbers in (0, 1), the same in every process."""
     engine = torch.quasirandom.SobolEngine(units, scramble=True, seed=20180521)
     return engine.draw(count, dtype=torch.float64).clamp(1e-9, 1 - 1e-9)
 
@@ -91,10 +92,10 @@ def draw_hidden(
     draws: int = 64,
     pull: float = 1.0,
 ) -> HiddenDraws:
-    """Weighted draws of h1 given the evidence.
+    """Return weighted draws of h1 given the evidence.
 
     Args:
-        draws: M; a power of two keeps the Sobol sequence balanced.
+        draws: number of draws M; a power of two keeps the Sobol sequence balanced.
         pull: weight of the observed relations' likelihood, from 0 to 1.
     """
     field = mean_field(machine, evidence, pull=pull)

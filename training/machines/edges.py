@@ -1,8 +1,8 @@
-"""Which relation units are in play: the layout of r.
+"""The layout of relation units r.
 
-A relation unit e = (a, i, j) says that object class i stands in canonical relation a to class j.
-There are A·V² of them, far too many to allocate, so every computation names the ones it speaks of.
-A row of `Edges` belongs to a scene; a unit outside the row is off.
+A relation unit e = (a, i, j) states that object class i has the canonical relation a to class j.
+There are A·V² units, which is too many to allocate. Every computation therefore lists the units it
+uses. A row of `Edges` belongs to a scene; units outside the row are off.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from torch import Tensor
 
 
 class Edges(ABC):
-    """Relation units, one row a scene (a single row is shared by all scenes).
+    """Relation units, with one row for each scene or one row for all scenes.
 
-    `relation`, `subject` and `object` are (B or 1, E) int64, the a, i, j of each unit; `valid` is
-    (B or 1, E) bool: padding is False and such a unit is off.
+    Attributes:
+        relation, subject, object: (B or 1, E) int64, the a, i, j of each unit.
+        valid: (B or 1, E) bool; False marks padding, and such a unit is off.
     """
 
     relation: Tensor
@@ -36,20 +37,20 @@ class Edges(ABC):
     @property
     @abstractmethod
     def classes(self) -> Tensor:
-        """(B or 1, n) int64, the classes that `BoltzmannMachine.edges` makes these units from."""
+        """Classes (B or 1, n) int64 from which `BoltzmannMachine.edges` builds these units."""
 
     @abstractmethod
     def expand(self, rows: int) -> Edges:
-        """The units of one scene for each of so many."""
+        """Return the units of one scene, repeated for `rows` scenes."""
 
     @abstractmethod
     def ends_present(self, v: Tensor) -> Tensor:
-        """(..., B, E) float: 1 where both ends of a unit are present in v (..., B, V)."""
+        """Return (..., B, E) floats: 1 where both ends of a unit are present in v (..., B, V)."""
 
 
 @dataclass(frozen=True)
 class TripleEdges(Edges):
-    """A table of units, the same for every scene; attributes as in `Edges`, (1, E)."""
+    """A table of units that all scenes share; attributes as in `Edges`, (1, E)."""
 
     relation: Tensor
     subject: Tensor
@@ -63,15 +64,15 @@ class TripleEdges(Edges):
 
     @property
     def classes(self) -> Tensor:
-        """(1, 0): the table is the same for all classes."""
+        """(1, 0), because the table is the same for all classes."""
         return self.subject.new_zeros(1, 0)
 
     def expand(self, rows: int) -> TripleEdges:
-        """The same row, which all scenes share."""
+        """Return this object, because all scenes share the row."""
         return self
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """(..., B, E) float: 1 where both ends of a unit are present."""
+        """Return (..., B, E) floats: 1 where both ends of a unit are present."""
         present: Tensor = v[..., self.subject[0]] * v[..., self.object[0]] * self.valid
         return present
 
@@ -80,12 +81,12 @@ class TripleEdges(Edges):
 class PairEdges(Edges):
     """All A·n·m units between n subject classes and m object classes of each scene.
 
-    Units are laid out as (A, n, m), flattened, so that shared weights act by small matrix products;
-    the index of each single unit is formed only when somebody asks.
+    Units have the layout (A, n, m), flattened, so that shared weights act by small matrix products.
+    The indices of single units are computed on first use.
 
     Attributes:
-        relations: A.
-        subjects, objects: (B, n) and (B, m) int64, class indices (0 where padded).
+        relations: number of canonical relations A.
+        subjects, objects: (B, n) and (B, m) int64 class indices, 0 where padded.
         valid_subjects, valid_objects: (B, n) and (B, m) bool, False where padded.
         log_subjects, log_objects: (B, n) and (B, m), log of the number of instances of each class.
     """
@@ -106,28 +107,28 @@ class PairEdges(Edges):
 
     @property
     def classes(self) -> Tensor:
-        """(B, n), the subjects, -1 where padded."""
+        """The subject classes, (B, n), -1 where padded."""
         return torch.where(self.valid_subjects, self.subjects, -1)
 
     def expand(self, rows: int) -> PairEdges:
-        """A row for each scene."""
+        """Return the units of one scene, repeated for `rows` scenes."""
         ends = [getattr(self, field.name) for field in fields(self) if field.name != "relations"]
         return PairEdges(self.relations, *(end.expand(rows, -1) for end in ends))
 
     @cached_property
     def relation(self) -> Tensor:  # type: ignore[override]
-        """(B, E) int64, a of each unit."""
+        """a of each unit, (B, E) int64."""
         axis = torch.arange(self.relations, device=self.subjects.device)
         return self._flat(axis[:, None, None])
 
     @cached_property
     def subject(self) -> Tensor:  # type: ignore[override]
-        """(B, E) int64, i of each unit."""
+        """i of each unit, (B, E) int64."""
         return self._flat(self.subjects[:, None, :, None])
 
     @cached_property
     def object(self) -> Tensor:  # type: ignore[override]
-        """(B, E) int64, j of each unit."""
+        """j of each unit, (B, E) int64."""
         return self._flat(self.objects[:, None, None, :])
 
     @cached_property
@@ -137,7 +138,7 @@ class PairEdges(Edges):
         return self._flat(pairs.unsqueeze(1))
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """(..., B, E) float: 1 where both ends of a unit are present in v (..., B, V)."""
+        """Return (..., B, E) floats: 1 where both ends of a unit are present in v (..., B, V)."""
         lead = v.shape[:-1]
         subject = v.gather(-1, self.subjects.expand(*lead, -1)) * self.valid_subjects
         object_ = v.gather(-1, self.objects.expand(*lead, -1)) * self.valid_objects
@@ -145,7 +146,7 @@ class PairEdges(Edges):
         return pairs.expand(*lead, self.relations, -1, -1).flatten(-3)
 
     def unflatten(self, values: Tensor) -> Tensor:
-        """(..., E) to (..., A, n, m)."""
+        """Reshape (..., E) to (..., A, n, m)."""
         shape = (self.relations, self.subjects.shape[-1], self.objects.shape[-1])
         return values.reshape(*values.shape[:-1], *shape)
 
@@ -162,14 +163,14 @@ def pair_edges(
     log_subjects: Tensor | None = None,
     log_objects: Tensor | None = None,
 ) -> PairEdges:
-    """The relation units between given classes.
+    """Return the relation units between the given classes.
 
     Args:
         subjects: (B, n) int64, -1 where padded.
-        relations: A.
-        objects: (B, m) int64, -1 where padded; the subjects unless given.
-        log_subjects, log_objects: log of the instances per class, shaped as the classes; omitted
-            means one instance each.
+        relations: number of canonical relations A.
+        objects: (B, m) int64, -1 where padded; default: the subjects.
+        log_subjects, log_objects: log of the instances of each class, shaped like the classes;
+            default: one instance each.
     """
     if objects is None:
         objects, log_objects = subjects, log_subjects
@@ -191,18 +192,18 @@ def pair_edges(
 
 
 def triple_edges(triples: Tensor) -> TripleEdges:
-    """One shared row of units from a (T, 3) table of (a, i, j)."""
+    """Return one shared row of units from a (T, 3) table of (a, i, j)."""
     relation, subject, object_ = triples.long().T.unsqueeze(1).unbind(0)
     return TripleEdges(relation, subject, object_, torch.ones_like(subject, dtype=torch.bool))
 
 
 def triple_keys(relation: Tensor, subject: Tensor, object_: Tensor, classes: int) -> Tensor:
-    """One int64 key per unit, ordered as (a, i, j)."""
+    """Return one int64 key for each unit, ordered as (a, i, j)."""
     return (relation * classes + subject) * classes + object_
 
 
 def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of keys in a sorted table of keys, and whether each is there."""
+    """Return the positions of keys in a sorted table, and whether the table has each key."""
     if not table.numel():
         return torch.zeros_like(keys), torch.zeros_like(keys, dtype=torch.bool)
     position = torch.searchsorted(table, keys.contiguous()).clamp(max=table.numel() - 1)
@@ -210,12 +211,12 @@ def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def present_classes(v: Tensor, leading: Tensor | None = None) -> Tensor:
-    """The classes present in each row of v, (B, n) int64 padded with -1; `leading` ones first.
+    """Return the classes present in each row of v, (B, n) int64, padded with -1.
 
     Args:
-        leading: (B, k) classes that are present and keep their order.
+        leading: (B, k) present classes that come first, in the given order.
     """
-    # numpy lists the units that are on several times faster than torch does.
+    # numpy lists the active units several times faster than torch.
     present = v.detach().numpy() > 0
     lead = np.zeros((len(v), 0), np.int64) if leading is None else leading.numpy()
     rows = np.arange(len(v))[:, None]

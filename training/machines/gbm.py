@@ -22,7 +22,7 @@ from training.machines.rbm import RBM, scale
 
 
 class GBM(RBM):
-    """ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1; relations as in the RBM otherwise."""
+    """ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1; otherwise relations are as in the RBM."""
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__(spec)
@@ -52,7 +52,7 @@ class GBM(RBM):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """Given h1 and r in the seed form."""
+        """Sample v given h1; in the seed form also given r."""
         logits = self._object_input(h1)
         if self.relations_act:
             logits = logits + self.relation_input(edges, r)
@@ -78,5 +78,5 @@ class GBM(RBM):
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """As in the RBM; the two-way edges are scaled by beta."""
+        """Scale as in the RBM; the two-way edges are multiplied by beta."""
         return scale(self, beta, base, keep=("b", "d"))

@@ -1,19 +1,19 @@
-"""Block Gibbs sampling with any units clamped and any unobserved.
+"""Block Gibbs sampling with any units clamped and any units unobserved.
 
-One step draws, in turn,
+One step samples the blocks in this order:
 
-    h1 | v, r, h2   factorial in the seed form. In the local form unobserved relations drop out and
-                    observed ones are met by Metropolis–Hastings, proposing blocks of h1 from
-                    p(h1 | v, h2)
+    h1 | v, r, h2   factorial in the seed form. In the local form unobserved relations drop out.
+                    Observed relations are handled by Metropolis–Hastings, which proposes blocks of
+                    h1 from p(h1 | v, h2)
     h2 | h1         factorial
-    v  | h1         RBM, GBM: given r, factorial. Triway: with every unobserved relation summed out,
-                    factorial in the local form and object after object in the seed form
-    r  | v, h1      factorial; where relations imply each other, group after group given those
-                    before, by the chain rule
+    v  | h1         RBM and GBM: factorial, given r. Triway: with every unobserved relation summed
+                    out; factorial in the local form, object after object in the seed form
+    r  | v, h1      factorial. Where relations imply each other: group after group, given earlier
+                    groups, by the chain rule
 
-A plain block sampler freezes the gated seed form: while a relation of i is on, p(v_i = 1) = 1.
-Hence v is drawn with R_i summed out (`collapsed`, the default); the plain kernel stays for
-contrastive divergence, whose one step need not mix.
+A plain block sampler cannot leave its state in the gated seed form: while a relation of i is on,
+p(v_i = 1) = 1. Hence v is sampled with R_i summed out (`collapsed`, the default). The plain kernel
+remains for contrastive divergence, whose single step need not mix.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
 
 _PROPOSAL_BLOCKS = 8
-# Relations that imply each other are drawn in twice so many groups, each given those before it.
+# Relations that imply each other are sampled in twice this number of groups.
 _RELATION_GROUPS = 4
-# Below so many chains, or above so large a share of objects present, the dense product is faster.
+# With fewer chains, or with a larger share of present objects, the dense product is faster.
 _CHAINS = 16
 _PRESENT = 0.12
 
 
 @dataclass(frozen=True)
 class State:
-    """One configuration per chain: v (B, V), r (B, E) over `edges`, h1 (B, H1), h2 (B, H2)."""
+    """One state of each chain: v (B, V), r (B, E) over `edges`, h1 (B, H1), h2 (B, H2)."""
 
     v: Tensor
     h1: Tensor
@@ -51,12 +51,12 @@ class State:
 
 @dataclass(frozen=True)
 class Clamp:
-    """Units that keep their value, and relations that are observed.
+    """Clamped units and observed relations.
 
     Attributes:
-        v, h1, h2: bool masks broadcastable to the blocks; None clamps nothing.
+        v, h1, h2: bool masks broadcastable to the blocks; None clamps no unit.
         edges, r, observed: observed relations, as in `Evidence`. In a Triway machine both ends of
-            an observed unit must be clamped present: an absent object has no relations to observe.
+            an observed unit must be clamped as present.
         room: (B,) int64 room types.
     """
 
@@ -74,7 +74,7 @@ class Clamp:
 
     @property
     def relations(self) -> tuple[Edges, Tensor, Tensor] | None:
-        """(edges, r, observed), or None where no relation is observed."""
+        """(edges, r, observed), or None without observed relations."""
         if self.edges is None or self.r is None or self.observed is None:
             return None
         return self.edges, self.r, self.observed
@@ -86,7 +86,7 @@ FREE = Clamp()
 def initial_state(
     machine: BoltzmannMachine, v: Tensor, generator: torch.Generator, clamp: Clamp = FREE
 ) -> State:
-    """A state at v with the context drawn from its prior and relations drawn given both."""
+    """Return a state at v, with h1 and h2 sampled from their biases and r given v and h1."""
     rows = len(v)
     h1 = bernoulli(machine.context_bias(clamp.room).sigmoid().expand(rows, -1), generator)
     h2 = bernoulli(machine.c2.sigmoid().expand(rows, -1), generator)
@@ -95,7 +95,7 @@ def initial_state(
 
 
 def bare_state(machine: BoltzmannMachine, v: Tensor, h1: Tensor, h2: Tensor) -> State:
-    """A state without relations, for the local form, where they do not act on the rest."""
+    """Return a state without relations, for the local form, where unobserved relations drop out."""
     edges = machine.edges(torch.zeros(len(v), 0, dtype=torch.int64))
     return State(v, h1, h2, v.new_zeros(len(v), edges.shape[-1]), edges)
 
@@ -110,11 +110,11 @@ def gibbs_step(
     collapsed: bool = True,
     relations: bool = True,
 ) -> State:
-    """One sweep over h1, h2, v and r.
+    """Run one sweep over h1, h2, v and r.
 
     Args:
-        collapsed: draw v with its unobserved relations summed out (Triway, seed form).
-        relations: draw r at the end; False keeps the old r where only v matters (local form).
+        collapsed: sample v with its unobserved relations summed out (Triway, seed form).
+        relations: sample r at the end; False keeps the old r if only v matters (local form).
     """
     h1 = sample_h1(machine, state, generator, clamp)
     state = replace(state, h1=h1)
@@ -131,7 +131,7 @@ def reconstruct(
     collapsed: bool = True,
     relations: bool = True,
 ) -> State:
-    """The second half of a Gibbs step: h2, v and r drawn anew given h1."""
+    """Run the second half of a Gibbs step: sample h2, v and r given h1."""
     h1, h2 = state.h1, state.h2
     if machine.spec.H2:
         drawn = bernoulli(machine.second_layer_logits(h1).sigmoid(), generator)
@@ -153,7 +153,7 @@ def run(
     *,
     relations: bool = True,
 ) -> State:
-    """So many Gibbs steps; see `gibbs_step`."""
+    """Run `sweeps` Gibbs steps; see `gibbs_step`."""
     for _ in range(sweeps):
         state = gibbs_step(machine, state, generator, clamp, relations=relations)
     return state
@@ -162,7 +162,7 @@ def run(
 def sample_h1(
     machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp = FREE
 ) -> Tensor:
-    """h1 | v, r, h2, (B, H1)."""
+    """Sample h1 | v, r, h2, (B, H1)."""
     v, h2 = state.v, state.h2
     second = h2 if machine.spec.H2 else None
     x = presence_product(v, machine.W).add_(machine.context_bias(clamp.room))
@@ -188,13 +188,13 @@ def sample_h1(
 
 
 def presence_product(v: Tensor, W: Tensor) -> Tensor:
-    """v @ W, (B, H), for binary v (B, V) and W (V, H), as the sum of the rows of W that v names.
+    """Return v @ W, (B, H), for binary v (B, V) and W (V, H), as a sum of rows of W.
 
-    A scene holds a dozen of some hundred classes: most of a dense product multiplies by zero.
+    A scene has about a dozen of some hundred classes, so a dense product mostly multiplies by zero.
     """
     if len(v) < _CHAINS:
         return v @ W
-    # numpy lists the units that are on several times faster than torch does.
+    # numpy lists the active units several times faster than torch.
     on = np.flatnonzero(v.detach().numpy() != 0)
     if on.size > _PRESENT * v.numel():
         return v @ W
@@ -217,7 +217,7 @@ def sample_v(
     *,
     collapsed: bool = True,
 ) -> Tensor:
-    """v | h1, with unobserved relations summed out where `collapsed`, else v | h1, r; (B, V)."""
+    """Sample v | h1 with unobserved relations summed out (`collapsed`), else v | h1, r; (B, V)."""
     drawn = machine.sample_objects(
         *(state.v, state.h1, state.r, state.edges, generator), held=clamp.v, collapsed=collapsed
     )
@@ -231,7 +231,7 @@ def sample_relations(
     generator: torch.Generator,
     clamp: Clamp = FREE,
 ) -> tuple[Edges, Tensor]:
-    """r | v, h1 over the units that v leaves open; observed units keep their value.
+    """Sample r | v, h1 over the open units of v; observed units keep their value.
 
     Returns:
         The units and r (B, E). In a Triway machine the classes of `clamp.edges` come first.
@@ -249,7 +249,7 @@ def sample_relations(
 
 
 def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
-    """A random group for each unit (..., n, n), never the same for a(i, j) and a(j, i)."""
+    """Return a random group for each unit (..., n, n); a(i, j) and a(j, i) always differ."""
     group = torch.randint(_RELATION_GROUPS, like.shape, generator=generator)
     later = torch.randint(2, like.shape, generator=generator).triu(1)
     later = later + (1 - later.mT).tril(-1)
@@ -259,7 +259,7 @@ def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
 def _observed_weight(
     machine: BoltzmannMachine, v: Tensor, h1: Tensor, relations: tuple[Edges, Tensor, Tensor]
 ) -> Tensor:
-    """log p(observed r | v, h1), (B,)."""
+    """Return log p(observed r | v, h1), (B,)."""
     edges, r, observed = relations
     logits = machine.relation_logits(edges, v, h1)
     return machine.relation_term(logits, machine.gate(edges, v), r, observed).sum(-1)

@@ -1,9 +1,9 @@
-"""Log-odds of objects and of relations: what every scoring answer is made of.
+"""Log-odds of objects and relations, from which all scores are computed.
 
     object    log p(v_i = 1 | rest) - log p(v_i = 0 | rest), with all relations R_i of i unobserved
     relation  log p(r_e = 1 | rest) - log p(r_e = 0 | rest), with e unobserved
 
-The rest may be any mixture of observed and unobserved units. See `Evidence`.
+The rest may contain observed and unobserved units. See `Evidence`.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from training.machines.mean_field import Evidence, mean_field
 
 
 class _ContextGain(torch.autograd.Function):
-    """G[b,i] = sum_k [softplus(x_bk + W_ik) - softplus(x_bk)] without a (B, V, H1) tensor.
+    """Compute G[b,i] = sum_k [softplus(x_bk + W_ik) - softplus(x_bk)] without a (B, V, H1) tensor.
 
-    Written as log(1 + sigmoid(x)(exp(W) - 1)): one transcendental a term, and exp(W) is shared.
-    The backward pass recomputes row by row, so memory stays at one (V, H1) block.
+    The form log(1 + sigmoid(x)(exp(W) - 1)) needs one transcendental function for each term and
+    shares exp(W). The backward pass recomputes row by row, so memory stays at one (V, H1) block.
     """
 
     @staticmethod
@@ -43,7 +43,7 @@ class _ContextGain(torch.autograd.Function):
         grad_W = torch.zeros_like(growth)
         scale = growth + 1
         for b, row in enumerate(mean):
-            # posterior of h1 with i present: sigmoid(x + W) = s e^W / (1 + s (e^W - 1))
+            # Posterior of h1 with i present: sigmoid(x + W) = s e^W / (1 + s (e^W - 1)).
             posterior = (scale * row).div_(torch.addcmul(torch.ones_like(scale), growth, row))
             weighted = posterior.mul_(gradient[b].unsqueeze(1))
             grad_x[b] = weighted.sum(0) - row * gradient[b].sum()
@@ -52,7 +52,7 @@ class _ContextGain(torch.autograd.Function):
 
 
 def context_gain(x: Tensor, W: Tensor) -> Tensor:
-    """sum_k [softplus(x + W_ik) - softplus(x)] for hidden logits x (B, H1) and all i, (B, V)."""
+    """Return sum_k [softplus(x + W_ik) - softplus(x)], (B, V), for hidden logits x (B, H1)."""
     gain: Tensor = _ContextGain.apply(x, W)  # type: ignore[no-untyped-call]
     return gain
 
@@ -64,15 +64,15 @@ def object_log_odds(
     candidates: Tensor | None = None,
     pull: float = 1.0,
 ) -> Tensor:
-    """Log-odds of candidate objects with the context at the mean-field fixed point, (B, N).
+    """Return the log-odds of candidate objects at the mean-field fixed point, (B, N).
 
-    Exact for one layer where no relation is observed and the form is local; with a second layer h2
-    is held at its mean-field value; in the seed form, and with relations observed, the context is
-    replaced by its factorial approximation (`presence_log_odds` weighs draws instead).
-    Candidates must be absent in `evidence.v`. Differentiable.
+    The result is exact for one layer in the local form without observed relations. A second layer
+    h2 stays at its mean-field value. In the seed form, and with observed relations, the context is
+    replaced by its factorial approximation; `presence_log_odds` uses weighted draws instead.
+    Candidates must be absent in `evidence.v`. The result is differentiable.
 
     Args:
-        candidates: (B or 1, N) int64; all V classes by default.
+        candidates: (B or 1, N) int64; default: all V classes.
         pull: weight of the observed relations, see `mean_field`.
     """
     field = mean_field(machine, evidence, pull=pull)
@@ -94,18 +94,20 @@ def presence_log_odds(
     candidates: Tensor,
     draws: HiddenDraws | None = None,
 ) -> Tensor:
-    """log p(v_i = 1 | rest) - log p(v_i = 0 | rest) for candidates absent in the evidence, (B, N).
+    """Return log p(v_i = 1 | rest) - log p(v_i = 0 | rest) of absent candidates, (B, N).
 
-    Local form without observed relations: `object_log_odds`, exact with one layer. Otherwise
+    In the local form without observed relations, this is `object_log_odds`, exact with one layer.
+    Otherwise the formula is
 
         log-odds_i = b_i + G_i + log E_w[exp(W_i·h1 + attraction_i)] - log mean exp(W_i·h1)
 
-    over weighted draws of h1, with G_i = log E_q[exp(W_i·h1)] in closed form under the proposal q
-    of the draws, unweighted in the last term: a control that takes out what both err in common.
+    over weighted draws of h1. G_i = log E_q[exp(W_i·h1)] has a closed form under the proposal q of
+    the draws. The last term uses the unweighted draws; it is a control variate that removes the
+    common error of both terms.
 
     Args:
         candidates: (B or 1, N) int64.
-        draws: of h1 given the evidence; 64 by default.
+        draws: draws of h1 given the evidence; default: 64 draws.
     """
     if not machine.relations_act and evidence.edges is None:
         return object_log_odds(machine, evidence, candidates=candidates)
@@ -122,7 +124,7 @@ def presence_log_odds(
 def weights_with(
     machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
 ) -> Tensor:
-    """Weights that turn draws of h1 given the evidence into draws given it and one object more.
+    """Return weights that turn draws of h1 into draws given one more object.
 
     p(h1 | rest, v_i = 1) ∝ p(h1 | rest) exp(W_i·h1 + attraction_i(h1)), for one row of evidence.
 
@@ -148,7 +150,7 @@ def _object_input(machine: BoltzmannMachine, h1: Tensor, candidates: Tensor) -> 
 def _attraction(
     machine: BoltzmannMachine, evidence: Evidence, draws: HiddenDraws, candidates: Tensor
 ) -> Tensor:
-    """What unobserved relations add to the log-odds, (M, B, N)."""
+    """Return the contribution of unobserved relations to the log-odds, (M, B, N)."""
     if evidence.edges is None:
         return draws.h1.new_zeros(())
     return machine.attraction(evidence.v, draws.h1, evidence.edges, candidates)
@@ -161,14 +163,14 @@ def relation_log_odds(
     *,
     count: int = 64,
 ) -> tuple[Tensor, Tensor]:
-    """Log-odds of the units of `edges`, each unobserved in the evidence, with standard errors.
+    """Return log-odds, with standard errors, of units of `edges` that the evidence does not have.
 
-    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms, x_e what the observed
-    relations imply; -inf where the gate is off.
+    p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms. x_e is the shift
+    implied by the observed relations. The log-odds are -inf where the gate is off.
 
     Raises:
-        ValueError: the machine knows implications, and relations are observed in another layout
-            than `edges`.
+        ValueError: the machine has implications (G > 0), and the layout of the observed relations
+            differs from `edges`.
 
     Returns:
         (B, E) log-odds and (B, E) standard errors of the log-odds.
@@ -178,7 +180,7 @@ def relation_log_odds(
     relations = evidence.relations(machine)
     if machine.spec.G and relations is not None:
         if relations[0] is not edges:
-            raise ValueError("what relations imply is known in the layout of the evidence only")
+            raise ValueError("the observed relations must have the same layout as edges")
         logits = logits + draws.implied(machine, edges, relations[1] * relations[2])
     on = logits.sigmoid()
     p = draws.mean(on)
@@ -188,17 +190,18 @@ def relation_log_odds(
 
 
 def relation_log_odds_observed(machine: BoltzmannMachine, evidence: Evidence) -> Tensor:
-    """Log-odds of every unit given all the others, in closed form (seed form), (B, E).
+    """Return log-odds of every unit given all other units, in closed form (seed form), (B, E).
 
         ℓ⁰_e + sum_k [softplus(x_k + U_ek) - softplus(x_k)],   x without e
 
-    Exact for one layer; with two, h2 is held at its mean-field value given all relations.
+    The result is exact for one layer. With two layers, h2 stays at its mean-field value given all
+    relations.
 
     Raises:
-        ValueError: in the local form, or where a unit is unobserved.
+        ValueError: the machine has the local form, or a unit is unobserved.
     """
     if not machine.relations_act:
-        raise ValueError("the local form has no closed form with relations observed")
+        raise ValueError("the local form has no closed form with observed relations")
     relations = evidence.relations(machine)
     if relations is None or not bool(relations[2].all()):
         raise ValueError("every relation unit must be observed")

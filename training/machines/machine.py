@@ -1,19 +1,19 @@
-"""The interface that the three machines share, and all of the energy but its relation logits.
+"""The common interface of the machines, and the whole energy except its relation logits.
 
     E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_e r_e ℓ_e(v,h1)
 
-with the sum over the variant's relation units e = (a,i,j). A variant says which units exist, when
-one may be on (its gate) and what its logit ℓ_e is; everything else is here. With a room type t
-given, c1 stands for c1 + Q[t]: the room type is a condition, not a unit of the model.
+The sum runs over the variant's relation units e = (a,i,j). A variant defines the existing units,
+the gate that allows a unit to be on, and the logit ℓ_e. All other terms are defined here. With a
+given room type t, c1 stands for c1 + Q[t]: the room type is a condition, not a unit of the model.
 
-Two forms of the relation part, for every variant:
+Every variant has two forms of the relation part:
 
     seed    - r_e ℓ_e - κ_a         for every active unit
     local   - r_e ℓ_e + log(1 + exp ℓ_e)
 
-The local form leaves p(r | v, h1) as it is and makes unobserved relations drop out of everything
-else. The seed form keeps the paper's energy; its κ (0 in the paper) compensates for the attraction
-that a summed-out relation exerts on its two ends.
+The local form keeps p(r | v, h1), and unobserved relations drop out of all other conditionals. The
+seed form keeps the paper's energy. Its κ (0 in the paper) compensates for the attraction that a
+summed-out relation has on its two ends.
 
 Shapes: leading sample dimensions first, then scenes B, then units. Energies have the leading shape.
 """
@@ -38,7 +38,8 @@ class BoltzmannMachine(nn.Module, ABC):
     Source: Bozcan, Oymak, Alemdar, Kalkan, "What is (missing or wrong) in the scene?", ICRA 2018.
     """
 
-    # Triples have weights of their own beside shared ones, which `objectives.relations` may fit.
+    # True if triples have their own weights beside the shared ones; `objectives.relations` may fit
+    # them.
     has_residuals = False
 
     def __init__(self, spec: MachineSpec) -> None:
@@ -53,7 +54,7 @@ class BoltzmannMachine(nn.Module, ABC):
         self.register_buffer("triples", torch.zeros(spec.T, 3, dtype=torch.int32))
         self.triples: Tensor
         if spec.N:
-            # N chain samples as bits, (N, ceil(V / 32)), and their room types, -1 for none.
+            # N chain samples as bits, (N, ceil(V / 32)), and their room types, -1 for unknown.
             empty = torch.zeros(spec.N, -(-spec.V // 32), dtype=torch.int32)
             self.register_buffer("fantasies", empty)
             self.register_buffer("fantasy_rooms", torch.full((spec.N,), -1, dtype=torch.int32))
@@ -79,7 +80,7 @@ class BoltzmannMachine(nn.Module, ABC):
         self.triple_keys = keys
 
     def set_triples(self, triples: Tensor) -> Self:
-        """Say which (a, i, j) have a weight of their own; (T, 3), distinct and sorted."""
+        """Set the triples (a, i, j) that have their own weights; (T, 3), distinct and sorted."""
         if tuple(triples.shape) != (self.spec.T, 3):
             raise ValueError(f"triples must be ({self.spec.T}, 3), not {tuple(triples.shape)}")
         self.triples.copy_(triples)
@@ -88,7 +89,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator, scale: float = 0.01) -> Self:
-        """Draw the matrices from N(0, scale²); biases stay as they are."""
+        """Draw the matrices from N(0, scale²); biases are unchanged."""
         for parameter in self.parameters():
             if parameter.dim() > 1:
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * scale)
@@ -100,7 +101,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
         Args:
             by_relation: (A,) log-odds that an observed relation holds.
-            by_unit: (T,) log-odds that a scene with relations holds each triple of the table.
+            by_unit: (T,) log-odds of each triple of the table in scenes with relations.
             usual: (V,) mean log of the instances of each class.
         """
 
@@ -113,28 +114,28 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
-        """The relation units of scenes that hold the given classes.
+        """Return the relation units between the given classes of each scene.
 
         Args:
             classes: (B, n) int64, -1 where padded.
-            counts: (B, n) instances per class, 0 where unknown; one each where omitted.
+            counts: (B, n) instances of each class, 0 where unknown; default: one each.
         """
 
     @abstractmethod
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """The machine's units, the place of each pair's unit among them, and whether it has one.
+        """Return the machine's units, the place of each pair's unit, and whether there is one.
 
-        The last two are (B, A·n·m). Pairs without a unit have an arbitrary place.
+        The last two are (B, A·n·m). For a pair without a unit the place is arbitrary.
         """
 
     @abstractmethod
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Relations between the classes of scenes as (edges, r, observed) of this machine.
+        """Return the relations between classes as (edges, r, observed) in this machine's layout.
 
-        In an ungated machine the units that touch an absent class are off, and observed so where
-        the scene's relations were annotated at all.
+        In an ungated machine the units of absent classes are off. They count as observed if the
+        scene has any annotated relation.
 
         Args:
             classes, counts: (B, n), as in `edges`.
@@ -145,50 +146,50 @@ class BoltzmannMachine(nn.Module, ABC):
     def open_units(
         self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
     ) -> tuple[Edges, Tensor, Tensor]:
-        """The units that v leaves open, as (edges, r, observed), and r as far as it is given."""
+        """Return the units that v leaves open, as (edges, r, observed); r has the given values."""
 
     @abstractmethod
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """(..., B, E): 1 where a unit may be on, given v (..., B, V)."""
+        """Return (..., B, E): 1 where a unit may be on, given v (..., B, V)."""
 
     @abstractmethod
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """ℓ_e(v, h1), (..., B, E); h1 is (..., B, H1), binary or a mean."""
+        """Return ℓ_e(v, h1), (..., B, E); h1 is (..., B, H1), binary or a mean."""
 
     @abstractmethod
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """sum_e weight_e U_e, (..., B, H1), for weight (..., B, E)."""
+        """Return sum_e weight_e U_e, (..., B, H1), for weight (..., B, E)."""
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """sum_e r_e ℓ_e(v, 0), (..., B), and sum_e r_e U_e, (..., B, H1)."""
+        """Return sum_e r_e ℓ_e(v, 0), (..., B), and sum_e r_e U_e, (..., B, H1)."""
         bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 
     def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """What given relations add to the logits of the others, (B, E); see `triway`.
+        """Return the logit shifts (B, E) that given relations imply for others; see `triway`.
 
-        Nothing but in a machine that has weights for it.
+        The shifts are zero in machines without implication weights.
 
         Args:
             given: (B, E), 1 where a unit is given as on.
             h1: (B, H1) means given the objects.
-            apart: without what the relations of two classes imply for each other.
+            apart: leave out the implications between relations of the same two classes.
         """
         del edges, h1, apart
         return torch.zeros_like(given)
 
     @abstractmethod
     def relation_context(self, edges: Edges) -> Tensor:
-        """The rows U_e, (B or 1, E, H1). Allocates them: for few units only."""
+        """Return the rows U_e, (B or 1, E, H1). They are allocated, so use few units only."""
 
     @abstractmethod
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """What summing out the unobserved relations R_i of a candidate i adds to its log-odds.
+        """Return the log-odds that summing out the unobserved relations R_i adds to candidate i.
 
         Args:
-            v: (..., B, V), each candidate counted as absent.
+            v: (..., B, V); each candidate counts as absent.
             h1: (..., B, H1).
-            edges: the units of the scene; those that touch a candidate are unobserved.
+            edges: the units of the scene; units of a candidate are unobserved.
             candidates: (B or 1, N) int64.
 
         Returns:
@@ -198,7 +199,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Values (B, E) of units as relations between classes, (B, A, n, n); -inf without a unit.
+        """Return values (B, E) of units as a table (B, A, n, n) over classes; -inf without a unit.
 
         Args:
             classes: (B, n) int64, -1 where padded; `edges` are their units.
@@ -211,10 +212,10 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def acting_units(self, v: Tensor) -> Edges | None:
-        """Units that act on objects while they are unobserved; None in the local form."""
+        """Return the unobserved units that act on objects; None in the local form."""
 
     def context_units(self, edges: Edges) -> Edges | None:
-        """Of these units, those that the context sees unobserved while relations are learnt."""
+        """Return the units that act on the context unobserved while relations are trained."""
         del edges
         return None
 
@@ -229,37 +230,37 @@ class BoltzmannMachine(nn.Module, ABC):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """v given h1 and, where it acts, r, (B, V); see `training.machines.gibbs`.
+        """Sample v given h1 and, in forms where r acts on v, given r, (B, V); see `gibbs`.
 
         Args:
-            held: bool, broadcastable to v: these keep their value where it matters to others.
-            collapsed: unobserved relations are summed out, if they act.
+            held: bool, broadcastable to v; held objects keep their value while others are sampled.
+            collapsed: sum out unobserved relations that act on objects.
         """
         del v, r, edges, held, collapsed
         return bernoulli(self._object_input(h1).sigmoid_(), generator)
 
     def _object_input(self, h1: Tensor) -> Tensor:
-        # addmm: the bias enters with the product; memory is what a sweep waits for.
+        # addmm adds the bias within the product, because memory access limits the speed of a sweep.
         return torch.addmm(self.b, h1, self.W.T)
 
     def begin_independent(self, machine: BoltzmannMachine) -> None:
         """Set this machine's relation weights to those of `machine` at beta = 0, see `scaled`."""
 
     def relation_log_partition(self) -> float:
-        """What the relation units of independent objects add to log Z."""
+        """Return the part of log Z from the relation units of independent objects."""
         return 0.0
 
     @abstractmethod
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """The machine on the path from `base` (independent objects) at beta = 0 to this one at 1.
+        """Return the machine at beta on the path from `base` (independent objects, 0) to this (1).
 
-        Without a base every logit is multiplied by beta: the machine at temperature 1 / beta.
+        Without a base, beta multiplies every logit. This is the machine at temperature 1 / beta.
         """
 
     # -- the relation part ----------------------------------------------------------------------
 
     def relation_term(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Each unit's contribution to log sum_{unobserved r} exp(-E), given h1; (..., B, E).
+        """Return each unit's part of log sum_{unobserved r} exp(-E), given h1; (..., B, E).
 
         Args:
             logits, gate: ℓ_e and the gate, (..., B, E).
@@ -272,7 +273,7 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.where(observed, r * logits, summed) * gate
 
     def relation_slope(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Derivative of `relation_term` by the logit, (..., B, E)."""
+        """Return the derivative of `relation_term` by the logit, (..., B, E)."""
         mean = logits.sigmoid()
         if not self.relations_act:
             return torch.where(observed, r - mean, 0.0) * gate
@@ -281,7 +282,7 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- energies -------------------------------------------------------------------------------
 
     def context_bias(self, room: Tensor | None) -> Tensor:
-        """c1 + Q[t], (B or 1, H1); room is (B,) int64, -1 where no room type is given."""
+        """Return c1 + Q[t], (B or 1, H1); room is (B,) int64, -1 where the room type is unknown."""
         if room is None or not self.spec.C:
             return self.c1.unsqueeze(0)
         return self.c1 + self.Q[room.clamp(min=0)] * (room >= 0).unsqueeze(-1)
@@ -295,7 +296,7 @@ class BoltzmannMachine(nn.Module, ABC):
         edges: Edges,
         room: Tensor | None = None,
     ) -> Tensor:
-        """E(v, r, h1, h2), shape (..., B); +inf where a unit is on that its gate holds off."""
+        """Return E(v, r, h1, h2), shape (..., B); +inf if a unit is on and its gate is off."""
         gate = self.gate(edges, v)
         logits = self.relation_logits(edges, v, h1)
         observed = torch.ones_like(gate, dtype=torch.bool)
@@ -304,12 +305,12 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.where((r > gate).any(-1), torch.inf, energy)
 
     def object_energy(self, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor | None) -> Tensor:
-        """The energy without relations, (..., B)."""
+        """Return the energy without relations, (..., B)."""
         context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
         return -(v @ self.b + h2 @ self.c2 + context + ((h1 @ self.J) * h2).sum(-1))
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """sum of κ_a over active units, (..., B); zero but for a compensated seed form."""
+        """Return the sum of κ_a over active units, (..., B); 0 unless the seed form has κ."""
         return v.new_zeros(v.shape[:-1])
 
     def hidden_logits(
@@ -320,10 +321,10 @@ class BoltzmannMachine(nn.Module, ABC):
         h2: Tensor | None = None,
         room: Tensor | None = None,
     ) -> Tensor:
-        """x = c1 + v'W + sum_e r_e U_e + J h2: p(h1 = 1 | v, r, h2) = sigmoid(x) in the seed form.
+        """Return x = c1 + v'W + sum_e r_e U_e + J h2.
 
-        In the local form the relations enter x only through their own weights (`draw_hidden`), so r
-        must be left out there: pass zeros.
+        In the seed form p(h1 = 1 | v, r, h2) = sigmoid(x). In the local form relations affect h1
+        only through the weights of draws (`draw_hidden`), so pass zeros for r.
         """
         x = self.context_bias(room) + v @ self.W + self.hidden_input(edges, r)
         return x if h2 is None else x + h2 @ self.J.T
@@ -336,12 +337,14 @@ class BoltzmannMachine(nn.Module, ABC):
         h2: Tensor | None = None,
         room: Tensor | None = None,
     ) -> Tensor:
-        """F = -log sum_{h1} exp(-E), shape (..., B), where a closed form exists.
+        """Return F = -log sum_{h1} exp(-E), shape (..., B), where a closed form exists.
 
-        Seed form: every unit of `edges` observed as r, the others off. Local form: every relation
-        unobserved (r = None), which is exact. A second layer must be given as h2.
+        In the seed form, every unit of `edges` is observed as r and other units are off. In the
+        local form, every relation is unobserved (r = None), and F is exact. A second layer must be
+        given as h2.
 
         Raises:
+            ValueError: there is no closed form.
             ValueError: where no closed form exists.
         """
         if self.spec.H2 and h2 is None:
@@ -359,7 +362,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def free_energy_given(
         self, v: Tensor, context: Tensor, h2: Tensor | None = None, room: Tensor | None = None
     ) -> Tensor:
-        """-log sum_{h1} of the object part with h1's input raised by context (..., B, H1).
+        """Return -log sum_{h1} exp(-E) of the object part, with context (..., B, H1) added to x.
 
         -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k, shape (..., B).
         """
@@ -372,9 +375,9 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- conditionals of the other blocks -------------------------------------------------------
 
     def second_layer_logits(self, h1: Tensor) -> Tensor:
-        """c2 + h1'J: p(h2 = 1 | h1) = sigmoid of it, (..., B, H2)."""
+        """Return c2 + h1'J, (..., B, H2): the logits of p(h2 = 1 | h1)."""
         return self.c2 + h1 @ self.J
 
     def object_logits(self, h1: Tensor) -> Tensor:
-        """b + W h1, (..., B, V): log-odds of v_i given h1 but for its relations."""
+        """Return b + W h1, (..., B, V): log-odds of v_i given h1, without the relations of i."""
         return self.b + h1 @ self.W.T

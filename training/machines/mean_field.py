@@ -1,11 +1,12 @@
 """Mean field: the factorial approximation of p(h1, h2 | v, observed r).
 
-Alternates, from h2 at its prior and with damping,
+The iteration starts with h2 at its prior and alternates, with damping:
 
     m2 = sigmoid(c2 + m1'J),   y = c1 + v'W + J m2 + sum_e slope_e(m1) U_e,   m1 = sigmoid(y)
 
-where slope_e is r_e for an observed unit of the seed form and the tangent of the relation term
-otherwise. With one layer and nothing but observed relations (seed) or none (local) it is exact.
+slope_e is r_e for an observed unit of the seed form. For other units it is the tangent of the
+relation term. With one layer, the result is exact in two cases: all relations are observed (seed
+form), or none is observed (local form).
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from training.machines.machine import BoltzmannMachine
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of some scenes.
+    """The observed values of some scenes.
 
     Attributes:
         v: (B, V) presence.
         edges: the relation units that may be on.
         r: (B, E) values of the observed units, 0 elsewhere.
         observed: (B, E) bool.
-        room: (B,) int64, -1 where no room type is given; None for none at all.
+        room: (B,) int64 room types, -1 where unknown; None if all are unknown.
     """
 
     v: Tensor
@@ -39,9 +40,10 @@ class Evidence:
     room: Tensor | None = None
 
     def relations(self, machine: BoltzmannMachine) -> tuple[Edges, Tensor, Tensor] | None:
-        """(edges, r, observed), or None where relations say nothing about the context.
+        """Return (edges, r, observed), or None if relations do not affect the context.
 
-        Unobserved relations drop out of the local form, so there only observed ones matter.
+        In the local form unobserved relations drop out, so only observed relations affect the
+        context.
         """
         if self.edges is None or not self.edges.shape[-1]:
             return None
@@ -58,7 +60,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class MeanField:
-    """The fixed point: logits y of h1 (B, H1), without relations x (B, H1), means of h2 (B, H2)."""
+    """The fixed point: logits y of h1 and x without relations (B, H1), means of h2 (B, H2)."""
 
     y: Tensor
     x: Tensor
@@ -73,13 +75,13 @@ def mean_field(
     damping: float = 0.8,
     pull: float = 1.0,
 ) -> MeanField:
-    """One fixed point of h1 and h2 given the evidence; differentiable in the weights.
+    """Return one fixed point of h1 and h2 given the evidence; differentiable in the weights.
 
     Args:
-        iterations: sweeps over both layers.
-        damping: share of the old relation slopes kept in a sweep.
-        pull: weight of the observed relations: between the fixed point without any, 0, and that
-            with all, 1.
+        iterations: number of sweeps over both layers.
+        damping: share of the old relation slopes that a sweep keeps.
+        pull: weight of the observed relations; it interpolates between the fixed point without
+            relations (0) and the fixed point with all of them (1).
     """
     if pull < 1 and evidence.relations(machine) is not None:
         without = mean_field(machine, unobserved(evidence), iterations=iterations, damping=damping)
@@ -97,7 +99,8 @@ def mean_field(
     if two_layers:
         h2 = machine.c2.sigmoid().expand(len(base), -1)
         x = torch.addmm(base, h2, machine.J.T)
-    # What relations add to x; linear in r, whatever h1 is, where all of a seed form are observed.
+    # Contribution of relations to x. In the seed form it is linear in r if all relations are
+    # observed.
     added = gate = base.new_zeros(())
     slopes = None
     if relations is not None:
@@ -119,7 +122,7 @@ def mean_field(
 
 
 def unobserved(evidence: Evidence) -> Evidence:
-    """The same with every relation unobserved."""
+    """Return the evidence with every relation unobserved."""
     if evidence.observed is None:
         return evidence
     return replace(evidence, observed=torch.zeros_like(evidence.observed))

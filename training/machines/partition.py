@@ -1,9 +1,9 @@
-"""log Z by annealed importance sampling, from below and from above.
+"""log Z by annealed importance sampling (AIS): a lower and an upper estimate.
 
-The path runs over machines of the same family, from independent objects at beta = 0, whose log Z is
-a sum, to the machine itself at beta = 1 (`BoltzmannMachine.scaled`). Forward runs give a stochastic
-lower bound in expectation, E[log w] ≤ log Z; reverse runs, started from samples of the machine, an
-upper one.
+The path runs over machines of the same family (`BoltzmannMachine.scaled`). It starts at beta = 0
+with independent objects, whose log Z is a sum, and ends at the machine itself at beta = 1. Forward
+runs give a lower bound in expectation, E[log w] ≤ log Z. Reverse runs start from samples of the
+machine and give an upper bound.
 
 Sources: Neal, "Annealed importance sampling" (2001); Salakhutdinov and Murray, "On the quantitative
 analysis of deep belief networks" (2008); Burda, Grosse and Salakhutdinov, "Accurate and
@@ -32,10 +32,11 @@ class LogPartition:
     """An estimate of log Z.
 
     Attributes:
-        log_z: log of the mean weight (forward), or minus that of the inverse weights (reverse).
-        standard_error: of log_z, by the delta method over chains.
-        bound: mean of log w over chains: below log Z in expectation (forward) or above it
-        (reverse).
+        log_z: log of the mean weight (forward), or minus the log of the mean inverse weight
+            (reverse).
+        standard_error: standard error of log_z, by the delta method over chains.
+        bound: mean of log w over chains; in expectation below log Z (forward) or above it
+            (reverse).
     """
 
     log_z: float
@@ -44,11 +45,12 @@ class LogPartition:
 
     @classmethod
     def of_weights(cls, base: float, log_weight: Tensor, *, reverse: bool = False) -> LogPartition:
-        """From the log weights (chains,) of runs from, or with `reverse` to, a base.
+        """Return the estimate from the log weights (chains,) of forward or reverse runs.
 
         Args:
             base: log Z of the base.
-            log_weight: of either direction, as its own path accumulates them.
+            log_weight: log weights, as the path of that direction accumulates them.
+            reverse: the runs lead to the base, not from it.
         """
         sign, count = (-1 if reverse else 1), len(log_weight)
         mean = float(log_weight.logsumexp(0)) - math.log(count)
@@ -58,9 +60,10 @@ class LogPartition:
 
 
 def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> BoltzmannMachine:
-    """The machine at beta = 0: objects independent with log-odds b (the machine's own by default).
+    """Return the machine at beta = 0: independent objects with log-odds b (default: the machine's).
 
-    Relation units of the RBM and GBM keep their bias d; those of the Triway weigh nothing.
+    Relation units of the RBM and GBM keep their bias d. Those of the Triway contribute a factor of
+    one.
     """
     base = build(machine.spec).to(machine.b.dtype).requires_grad_(False)
     with torch.no_grad():
@@ -71,7 +74,7 @@ def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> Bolt
 
 
 def base_log_partition(machine: BoltzmannMachine, base: BoltzmannMachine) -> float:
-    """Exact log Z of `base`."""
+    """Return the exact log Z of `base`."""
     log_z = float(softplus(base.b).sum()) + (machine.spec.H1 + machine.spec.H2) * math.log(2)
     return log_z + base.relation_log_partition()
 
@@ -84,7 +87,7 @@ def ais(
     generator: torch.Generator,
     base: BoltzmannMachine | None = None,
 ) -> LogPartition:
-    """Forward AIS over increasing betas from 0 to 1."""
+    """Run forward AIS over increasing betas from 0 to 1."""
     _check(betas)
     base = independent_base(machine) if base is None else base
     start = machine.scaled(0.0, base)
@@ -107,7 +110,7 @@ def reverse_ais(
     generator: torch.Generator,
     base: BoltzmannMachine | None = None,
 ) -> LogPartition:
-    """Reverse AIS from samples of the machine, `state`, over the same increasing betas."""
+    """Run reverse AIS from samples of the machine (`state`), over the same increasing betas."""
     _check(betas)
     base = independent_base(machine) if base is None else base
     log_weight = torch.zeros(len(state.v), dtype=torch.float64)

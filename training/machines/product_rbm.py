@@ -1,10 +1,10 @@
-"""The RBM with the Triway's shared weights: what factors alone bring, without the tri-way edges.
+"""The RBM with the Triway's shared weights, for comparisons: factors without tri-way edges.
 
     E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
     U_t = P[a] + sum_k S[i,k] M[a,k] O[j,k]
 
-for t = (a,i,j) among the triples seen in training. Relations are ungated, as in the RBM.
-Their context weights share the factors S, O, M and P, as in the Triway. A rival for comparisons.
+The sum runs over the triples t = (a,i,j) seen in training. Relations have no gate, as in the RBM.
+Their context weights share the factors S, O, M and P, as in the Triway.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class ProductRBM(RBM):
         self.P = nn.Parameter(torch.zeros(spec.A, spec.H1))
 
     def context_weights(self) -> Tensor:
-        """U, (T, H1), formed anew from the factors."""
+        """Return U, (T, H1), computed from the factors."""
         relation, subject, object_ = self.triples.long().unbind(1)
         product = self.S[subject] * self.O[object_]
-        # The table is sorted by relation: one (T_a, K) by (K, H1) product for each.
+        # The table is sorted by relation, so each relation needs one (T_a, K) by (K, H1) product.
         sizes = torch.bincount(relation, minlength=self.spec.A).tolist()
         rows = [
             part @ M + P for part, M, P in zip(product.split(sizes), self.M, self.P, strict=True)
@@ -43,5 +43,5 @@ class ProductRBM(RBM):
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """As in the RBM; U scales with M and P."""
+        """Scale as in the RBM; U scales with M and P."""
         return scale(self, beta, base, keep=("b", "d"), fixed=("S", "O"))

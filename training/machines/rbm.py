@@ -2,8 +2,8 @@
 
     E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
 
-Only triples t = (a,i,j) seen in training have a unit; the other relations are off with probability
-one. Units are not gated: nothing but the context ties r_t to its two objects.
+Only triples t = (a,i,j) seen in training have a unit; all other relations are always off. Units
+have no gate: only the context connects r_t to its two objects.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ class RBM(BoltzmannMachine):
 
     @torch.no_grad()
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
-        """d is the log-odds of each unit."""
+        """Set d to the log-odds of each unit."""
         self.d.copy_(by_unit)
 
     def context_weights(self) -> Tensor:
-        """U, (T, H1)."""
+        """Return U, (T, H1)."""
         return self.U
 
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> Edges:
-        """All T units, whatever the scene holds."""
+        """Return all T units, independent of the classes."""
         return triple_edges(self.triples)
 
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """By a look-up in the table of triples."""
+        """Look up the pairs in the table of triples."""
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         return triple_edges(self.triples), *find_triples(self.triple_keys, keys)
 
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Relations without a unit are lost."""
+        """Lay out the relations; relations without a unit are dropped."""
         pairs = pair_edges(classes, holds.shape[1])
         edges, position, found = self.places(pairs)
         row, slot = (found & pairs.valid).nonzero(as_tuple=True)
@@ -71,34 +71,34 @@ class RBM(BoltzmannMachine):
     def open_units(
         self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
     ) -> tuple[Edges, Tensor, Tensor]:
-        """All of them."""
+        """Return all T units with the given values."""
         if given is not None:
             return given
         r = v.new_zeros(len(v), self.spec.T)
         return triple_edges(self.triples), r, torch.zeros_like(r, dtype=torch.bool)
 
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """No gate: every unit of the table may be on."""
+        """Return 1 for every unit of the table, because units have no gate."""
         return edges.valid.to(v.dtype).expand(*v.shape[:-1], -1)
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """d_t + U_t·h1."""
+        """Return d_t + U_t·h1."""
         return self.d + h1 @ self.context_weights().T
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """weight @ U."""
+        """Return weight @ U."""
         return weight @ self.context_weights()
 
     def relation_context(self, edges: Edges) -> Tensor:
-        """U itself."""
+        """Return U with a leading dimension."""
         return self.context_weights().unsqueeze(0)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Zero: given the context, relations do not touch objects."""
+        """Return zero, because relations do not act on objects given the context."""
         return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Each unit at its triple; most relations have none."""
+        """Return each unit's value at its triple; most relations have no unit."""
         pairs = pair_edges(classes, self.spec.A)
         _, position, found = self.places(pairs)
         if not self.spec.T:
@@ -107,21 +107,21 @@ class RBM(BoltzmannMachine):
         return pairs.unflatten(torch.where(found & pairs.valid, spread, -torch.inf))
 
     def acting_units(self, v: Tensor) -> Edges | None:
-        """All T units."""
+        """Return all T units; None in the local form."""
         return triple_edges(self.triples) if self.relations_act else None
 
     @torch.no_grad()
     def begin_independent(self, machine: BoltzmannMachine) -> None:
-        """Units keep their bias d."""
+        """Copy the bias d of the units."""
         self.d.copy_(machine.get_parameter("d"))
 
     def relation_log_partition(self) -> float:
-        """sum_t softplus(d_t) in the seed form."""
+        """Return sum_t softplus(d_t) in the seed form, else 0."""
         return float(softplus(self.d).sum()) if self.relations_act else 0.0
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """beta scales every weight; d and b come from `base` at beta = 0 where one is given."""
+        """Multiply every weight by beta; d and b interpolate to those of a given `base`."""
         return scale(self, beta, base, keep=("b", "d"))
 
 
@@ -135,9 +135,10 @@ def scale(
     keep: tuple[str, ...],
     fixed: tuple[str, ...] = (),
 ) -> Machine:
-    """A copy with parameters θ ← beta·θ, plus (1 - beta)·θ_base for those named in `keep`.
+    """Return a copy with parameters beta·θ, plus (1 - beta)·θ_base for the names in `keep`.
 
-    Parameters named in `fixed` stay: factors whose product with a scaled one must scale linearly.
+    Parameters in `fixed` are unchanged: they are factors, and only one factor of a product may
+        scale.
     """
     result = copy.copy(machine)
     result._parameters = {}

@@ -1,38 +1,38 @@
-"""The Triway machine: relations tie two present objects and the context, by shared weights.
+"""The Triway machine: shared weights connect each relation to two present objects and the context.
 
     E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_{e=(a,i,j)} r_e v_i v_j ℓ_e(h1)
     ℓ_e(h1) = d_a + w_e + U_e·h1
     w_e = s[a,i] + o[a,j] + sum_k S[i,k] R[a,k] O[j,k] + w_e' + n[a,0] log n_i + n[a,1] log n_j
     U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]
 
-What differs from the published code, which gates w by v_i v_j but not the relation–context weight:
-here the state space is {r_e ≤ v_i v_j}, so a relation can be on only between objects that are
-present, and the weights are shared through the factors S, O, R, M instead of one free weight per
-(a,i,j). The residual w' exists for triples seen in training; n lets relations see how many
-instances n_i, n_j of the two classes there are, since a class-level relation is the OR over
-instance pairs; where nobody counted, the class's usual log n_i stands in.
+The published code gates w by v_i v_j and does not gate the relation–context weight. Here the state
+space is {r_e ≤ v_i v_j}, so a relation can be on only between present objects. The factors S, O, R
+and M share the weights, which replaces one free weight for each (a,i,j). The residual w' exists for
+triples seen in training. n weighs the instance counts n_i and n_j of the two classes, because a
+class-level relation is the OR over instance pairs. If a count is unknown, the usual log n_i of the
+class is used.
 
-With G > 0 (local form) observed relations r_G also shift the logits of the others. What stands left
-of the chair that stands left of the bed stands left of the bed; units that are independent given h1
-cannot know it.
+With G > 0 (local form) observed relations r_G also shift the logits of other relations. For
+example, if A is left of B and B is left of C, then A is left of C. Units that are independent given
+h1 cannot represent such a rule.
 
     log-odds of r_e given r_G  =  ℓ_e(h1) + x_e(r_G),       e = (a, i, j)
     x_e = sum_f (gamma[0,a,f] + sum_q z_q gamma[q,a,f]) phi_f(i, j; r_G),    z = B E[h1 | v]
 
-This is a condition, as a room type is for h1: everything else stays in closed form, and x = 0 where
-no relation is observed. z lets the context say how strictly the rules hold: one source lists every
-pair in sight, another a few neighbours. phi_f reads the 2A relations b in both directions, and
-never r_e itself:
+r_G is a condition, as a room type is for h1. All other conditionals keep their closed form. Without
+observed relations, x = 0. z makes the strength of the rules depend on the context, because some
+sources list every visible pair and others only a few neighbours. phi_f reads the 2A relations b in
+both directions, and never r_e itself:
 
     pair      r_b(i, j)                                           2A features
     path      there is a class k with r_b(i, k) and r_c(k, j)     (2A)²
     degree    other classes k with r_b(i, k), with r_b(k, j)      4A, counted up to 3
 
-Forms: `seed` is the energy above (with a compensating offset κ_a per active unit, 0 in the paper);
-`local` adds softplus(ℓ_e) for every active unit.
+Forms: `seed` is the energy above, with a compensating offset κ_a for each active unit (0 in the
+paper). `local` adds softplus(ℓ_e) for every active unit.
 
 The implications follow Mnih, Larochelle and Hinton, "Conditional restricted Boltzmann machines for
-structured output prediction" (2011), who condition on observed units.
+structured output prediction" (2011), which conditions on observed units.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ from training.machines.edges import (
 from training.machines.machine import BoltzmannMachine
 from training.machines.rbm import scale
 
-# One more neighbour says less and less.
+# Degrees are capped, because each further neighbour adds less information.
 _MOST = 3.0
 
 
 class Triway(BoltzmannMachine):
-    """Gated, factorised relations on active pairs; seed or locally normalised form."""
+    """Gated, factorised relations on active pairs, in the seed form or the local form."""
 
     has_residuals = True
 
@@ -87,15 +87,15 @@ class Triway(BoltzmannMachine):
 
     @torch.no_grad()
     def start_relations(self, by_relation: Tensor, by_unit: Tensor, usual: Tensor) -> None:
-        """d is the log-odds of each relation."""
+        """Set d to the log-odds of each relation."""
         self.d.copy_(by_relation)
         self.usual.copy_(usual)
 
     def edges(self, classes: Tensor, counts: Tensor | None = None) -> PairEdges:
-        """The A·n² units between the given classes; all others are off.
+        """Return the A·n² units between the given classes; all other units are off.
 
         Args:
-            counts: 0 where nobody said how many there are: the usual number counts then.
+            counts: instances of each class; 0 means unknown and uses the usual count of the class.
         """
         if counts is None:
             return pair_edges(classes, self.spec.A)
@@ -104,22 +104,22 @@ class Triway(BoltzmannMachine):
         return pair_edges(classes, self.spec.A, log_subjects=logs)
 
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Every pair has a unit."""
+        """Return the pairs themselves, because every pair has a unit."""
         place = torch.arange(pairs.shape[-1]).expand(pairs.shape)
         return pairs, place, torch.ones_like(place, dtype=torch.bool)
 
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """As they are."""
+        """Return the relations flattened, without further changes."""
         return self.edges(classes, counts), holds.flatten(1), observed.flatten(1)
 
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """v_i v_j."""
+        """Return v_i v_j."""
         return edges.ends_present(v)
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """d_a + w_e + U_e·h1."""
+        """Return d_a + w_e + U_e·h1."""
         pairs = _pairs(edges)
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         left = embedding(pairs.subjects, self.S).unsqueeze(-3) * shared.unsqueeze(-2)
@@ -134,33 +134,33 @@ class Triway(BoltzmannMachine):
         return logits.flatten(-3)
 
     def _end_weights(self, pairs: PairEdges) -> tuple[Tensor, Tensor]:
-        """s[a,i] + n[a,0] log n_i, (B, A, n), and o[a,j] + n[a,1] log n_j, (B, A, m)."""
+        """Return s[a,i] + n[a,0] log n_i, (B, A, n), and o[a,j] + n[a,1] log n_j, (B, A, m)."""
         counts = self.n[:, 0, None] * pairs.log_subjects.unsqueeze(1)
         subject = self.s[:, pairs.subjects].transpose(0, 1) + counts
         counts = self.n[:, 1, None] * pairs.log_objects.unsqueeze(1)
         return subject, self.o[:, pairs.objects].transpose(0, 1) + counts
 
     def _residuals(self, pairs: PairEdges) -> Tensor:
-        """w_e', (B, A, n, m); 0 for triples not seen in training."""
+        """Return w_e', (B, A, n, m); 0 for triples not seen in training."""
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, found = find_triples(self.triple_keys, keys)
         return pairs.unflatten(self.residual[position] * found)
 
     def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """By gamma and B; zero without them."""
+        """Return the shifts by gamma and B; zero without them."""
         if not self.spec.G:
             return super().implied(edges, given, h1)
         grid = _pairs(edges).unflatten(given)
         return implied(self.gamma, self.B, grid, h1, apart=apart).flatten(-3)
 
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """sum_e weight_e U_e through the factors, without forming U."""
+        """Return sum_e weight_e U_e from the factors, without forming U."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(weight)
         return self._context_input(self._factors(pairs, grid), grid.sum((-1, -2)))
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """sum_e r_e ℓ_e(0) and sum_e r_e U_e through the factors, without forming ℓ or U."""
+        """Return sum_e r_e ℓ_e(0) and sum_e r_e U_e from the factors, without forming ℓ or U."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(r)
         factors, outgoing, incoming = self._factors(pairs, grid), grid.sum(-1), grid.sum(-2)
@@ -173,19 +173,19 @@ class Triway(BoltzmannMachine):
         return bare, self._context_input(factors, count)
 
     def _factors(self, pairs: PairEdges, weight: Tensor) -> Tensor:
-        """sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., B, A, K)."""
-        # One (A·n, m) by (m, K) product a scene: a broadcast over a would copy O for each.
+        """Return sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., B, A, K)."""
+        # One (A·n, m) by (m, K) product for each scene; a broadcast over a would copy O for each a.
         product: Tensor = weight.flatten(-3, -2) @ embedding(pairs.objects, self.O)
         product = product.unflatten(-2, weight.shape[-3:-1])
         subjects = embedding(pairs.subjects, self.S).unsqueeze(-3)
         return (product * subjects).sum(-2)
 
     def _context_input(self, factors: Tensor, count: Tensor) -> Tensor:
-        """sum_{a,k} factors[a,k] M[a,k] + sum_a count_a P[a], (..., B, H1)."""
+        """Return sum_{a,k} factors[a,k] M[a,k] + sum_a count_a P[a], (..., B, H1)."""
         return factors.flatten(-2) @ self.M.flatten(0, 1) + count @ self.P
 
     def held_objects(self, edges: Edges, r: Tensor) -> Tensor:
-        """(B, V) float: 1 for objects that a relation which is on holds present."""
+        """Return (B, V) floats: 1 for the objects of relations that are on."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(r).amax(-3)
         held = r.new_zeros(len(r), self.spec.V)
@@ -194,7 +194,7 @@ class Triway(BoltzmannMachine):
         return held
 
     def relation_context(self, edges: Edges) -> Tensor:
-        """U_e for each unit."""
+        """Return U_e for each unit."""
         pairs = _pairs(edges)
         subject, object_ = self.S[pairs.subjects], self.O[pairs.objects]
         product = subject.unsqueeze(-2) * object_.unsqueeze(-3)
@@ -202,14 +202,14 @@ class Triway(BoltzmannMachine):
         return (rows + self.P[:, None, None]).flatten(1, 3)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """sum over R_i of softplus(ℓ_e) + κ_a in the seed form; nothing in the local form."""
+        """Return the sum over R_i of softplus(ℓ_e) + κ_a in the seed form; 0 in the local form."""
         pairs = _pairs(edges)
         return self._attraction(
             v, h1, pairs.subjects, pairs.valid_subjects, pairs.log_subjects, candidates
         )
 
     def attraction_to_all(self, v: Tensor, h1: Tensor, candidates: Tensor) -> Tensor:
-        """`attraction` with every class an anchor, one instance each."""
+        """Return `attraction` with one instance of every class as an anchor."""
         anchors = torch.arange(self.spec.V).expand(len(h1), -1)
         valid = torch.ones_like(anchors, dtype=torch.bool)
         logs = torch.zeros(anchors.shape, dtype=h1.dtype)
@@ -228,7 +228,8 @@ class Triway(BoltzmannMachine):
             return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
         present = v.gather(-1, anchors.expand(*v.shape[:-1], -1)) * valid
         candidates = candidates.expand(len(anchors), -1)
-        # A candidate that is itself an anchor counts as absent there: its own loop comes below.
+        # A candidate that is also an anchor counts as absent here; its own unit (a,i,i) is added
+        # below.
         other = (anchors.unsqueeze(-2) != candidates.unsqueeze(-1)) * present.unsqueeze(-2)
         A = self.spec.A
         outgoing = pair_edges(candidates, A, objects=anchors, log_objects=logs)
@@ -242,7 +243,7 @@ class Triway(BoltzmannMachine):
         return total + (softplus(loop) + self.kappa).sum(-1)
 
     def _loop_logits(self, candidates: Tensor, h1: Tensor) -> Tensor:
-        """ℓ of the units (a,i,i), (..., B, N, A)."""
+        """Return ℓ of the units (a,i,i), (..., B, N, A)."""
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         product = (self.S * self.O)[candidates] @ shared.mT
         bias = (self.d + h1 @ self.P.T).unsqueeze(-2)
@@ -257,10 +258,10 @@ class Triway(BoltzmannMachine):
     def open_units(
         self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Those between present classes, the classes of the given units first.
+        """Return the units between present classes; the classes of the given units come first.
 
         Raises:
-            ValueError: the given units do not have one row for each of v.
+            ValueError: the given units do not have one row for each row of v.
         """
         frame = None if given is None else _pairs(given[0])
         if frame is not None and len(frame.subjects) != len(v):
@@ -269,7 +270,7 @@ class Triway(BoltzmannMachine):
         r = self.b.new_zeros(edges.shape)
         known = torch.zeros_like(r, dtype=torch.bool)
         if frame is not None and given is not None:
-            # Both are copied into views of r and known.
+            # Both assignments write into views of r and known.
             n = frame.subjects.shape[1]
             edges.unflatten(known)[..., :n, :n] = frame.unflatten(given[2])
             edges.unflatten(r)[..., :n, :n] = frame.unflatten(given[1] * given[2])
@@ -286,10 +287,10 @@ class Triway(BoltzmannMachine):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """In the seed form object after object, or with those present that a relation needs.
+        """Sample v; the seed form goes object by object, or keeps the objects of active relations.
 
         Raises:
-            ValueError: the seed form with κ, not collapsed.
+            ValueError: the seed form has κ and is not collapsed.
         """
         if not self.relations_act:
             return super().sample_objects(v, h1, r, edges, generator)
@@ -313,39 +314,39 @@ class Triway(BoltzmannMachine):
         return v
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """sum of κ_a over active units."""
+        """Return the sum of κ_a over active units."""
         if not bool(self.kappa.any()):
             return super().pair_offset(edges, v)
         gate = self.gate(edges, v)
         return _pairs(edges).unflatten(gate).sum((-1, -2)) @ self.kappa
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """The units as they are laid out."""
+        """Return the values in the layout of the units."""
         return _pairs(edges).unflatten(values)
 
     def acting_units(self, v: Tensor) -> Edges | None:
-        """The units between the classes present in v (B, V)."""
+        """Return the units between the classes present in v (B, V); None in the local form."""
         if not self.relations_act:
             return None
         value, index = v.topk(int(v.sum(1).max()), dim=1)
         return self.edges(torch.where(value > 0, index, -1))
 
     def context_units(self, edges: Edges) -> Edges | None:
-        """All of them in the seed form."""
+        """Return all units in the seed form; None in the local form."""
         return edges if self.relations_act else None
 
     @torch.no_grad()
     def begin_independent(self, machine: BoltzmannMachine) -> None:
-        """In the seed form κ is -log 2."""
+        """Set κ to -log 2 in the seed form."""
         if self.relations_act:
             self.kappa.fill_(-math.log(2))
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """beta scales every weight.
+        """Multiply every weight by beta.
 
-        With a base, b leads to b_base and κ to -log 2: at beta = 0 the two states of a relation
-        unit weigh 1/2 each, so that relations sum out to one and objects are independent.
+        With a base, b goes to b_base and κ to -log 2. At beta = 0 the two states of a relation unit
+        then weigh 1/2 each. So relations sum out to one, and objects are independent.
         """
         return scale(self, beta, base, keep=("b", "kappa"), fixed=("S", "O", "B", "usual"))
 
@@ -357,9 +358,9 @@ def _pairs(edges: Edges) -> PairEdges:
 
 
 def implication_features(given: Tensor) -> Tensor:
-    """phi, (B, F, n, n), of the relations that are given, (B, A, n, n), 1 where on.
+    """Return phi, (B, F, n, n), of the given relations (B, A, n, n), 1 where on.
 
-    The pair feature of a itself is r_e where e is given: `implied` gives it no weight.
+    The pair feature of a itself equals r_e where e is given, so `implied` gives it no weight.
     """
     n = given.shape[-1]
     between = given * ~torch.eye(n, dtype=torch.bool, device=given.device)
@@ -375,20 +376,20 @@ def implication_features(given: Tensor) -> Tensor:
 
 
 def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-    """x, (B, A, n, n).
+    """Return x, (B, A, n, n).
 
     Args:
         gamma: (1 + G, A, F).
         B: (G, H1).
         given: (B, A, n, n), 1 where a relation is given as holding, else 0.
         h1: (B, H1), means of the context given the objects.
-        apart: without what the relations of a pair imply for each other.
+        apart: leave out the implications between relations of the same pair.
     """
     A = given.shape[1]
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool, device=gamma.device)
     itself[:, :A].fill_diagonal_(True)
     if apart:
-        # Paths and neighbours are those of other classes as they are.
+        # Paths and neighbours of other classes remain.
         itself[:, : 2 * A] = True
     gamma = gamma.masked_fill(itself, 0.0)
     weight = gamma[0] + torch.einsum("bq,qaf->baf", h1 @ B.T, gamma[1:])

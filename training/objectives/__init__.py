@@ -1,8 +1,8 @@
-"""Training objectives, by name: one entry here is trained, tested and documented like the others.
+"""Training objectives by name.
 
-An objective is called with the machine, a batch and a generator, and returns a loss whose gradient
-is that of the objective (`Objective`). It may keep state between calls (persistent chains), which a
-checkpoint stores.
+An objective is called with the machine, a batch and a generator. It returns a loss whose gradient
+is the update direction (`Objective`). It may keep state between calls, such as persistent chains;
+checkpoints store this state.
 """
 
 from __future__ import annotations

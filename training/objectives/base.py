@@ -1,4 +1,4 @@
-"""What every objective offers to the trainer."""
+"""The interface between objectives and the trainer."""
 
 from __future__ import annotations
 
@@ -20,60 +20,60 @@ if TYPE_CHECKING:
 
 
 class Objective(ABC):
-    """A loss over batches, with whatever it carries from one update to the next."""
+    """A loss over batches, with the state that it keeps between updates."""
 
     def __init__(
         self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
     ) -> None:
-        """Args: structure: (V,) bool, classes such as walls; by default no class is structural."""
+        """Args: structure: (V,) bool, classes such as walls; default: no structure classes."""
         self.config = config
         nothing = torch.zeros(machine.spec.V, dtype=torch.bool)
         self.structure = nothing if structure is None else structure
 
-    # The best epoch is the last: a likelihood under a prior has no early optimum.
+    # If True, the last epoch counts as the best: a likelihood with a prior needs no early stopping.
     keeps_last = False
 
     @classmethod
     def of(cls, config: ObjectiveConfig, machine: BoltzmannMachine, data: TrainingData) -> Self:
-        """The objective over the scenes of a run."""
+        """Return the objective for the data of a run."""
         return cls(config, machine, data.structure)
 
     @abstractmethod
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """A scalar whose gradient is the update direction."""
+        """Return a scalar whose gradient is the update direction."""
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:  # noqa: B027
-        """Change the gradients before the update (centring); nothing by default."""
+        """Change the gradients before the update (centring); the default changes nothing."""
 
     def parameters(self) -> list[nn.Parameter]:
-        """What it learns beside the machine's weights, and leaves out of the machine."""
+        """Return trained parameters that are not weights of the machine."""
         return []
 
     def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
-        """The machine with its best weights, made ready to be stored.
+        """Return the machine with its best weights, ready for storage.
 
         Args:
-            train: the scenes that the objective was trained on.
+            train: the scenes on which the objective was trained.
         """
         del train
         return machine
 
     def state(self) -> dict[str, Tensor]:
-        """What a checkpoint must keep."""
+        """Return the state for a checkpoint."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:  # noqa: B027
-        """Restore `state()`."""
+        """Restore the state of a checkpoint."""
 
 
 def withhold_rooms(batch: Batch, share: float, generator: torch.Generator) -> Tensor:
-    """Room types of the batch with a share of them withheld, (B,)."""
+    """Return the room types of the batch, (B,), with a share of them hidden (-1)."""
     hidden = torch.rand(len(batch), generator=generator) < share
     return torch.where(hidden, -1, batch.room)
 
 
 def withhold_counts(batch: Batch, share: float, generator: torch.Generator) -> Batch:
-    """The batch with the numbers of instances unknown in a share of its scenes."""
+    """Return the batch with unknown instance counts in a share of its scenes."""
     if not share:
         return batch
     withheld = torch.rand(len(batch), 1, generator=generator) < share
@@ -90,10 +90,10 @@ def relation_nll(
     h1: Tensor,
     generator: torch.Generator,
 ) -> Tensor:
-    """-sum over units of weight_e log p(r_e | v, h1).
+    """Return -sum over units of weight_e log p(r_e | v, h1).
 
-    A machine with implications adds the same of the other units where a random share of the
-    observed relations, another one for each scene, is given.
+    A machine with implications adds a second term. For that term, a random share of the observed
+    relations of each scene is given, and the sum runs over the other units.
 
     Args:
         logits, r, observed, weight: (B, E) over `edges`.
@@ -109,5 +109,5 @@ def relation_nll(
 
 
 def bernoulli_nll(logits: Tensor, r: Tensor, weight: Tensor) -> Tensor:
-    """-weight log p(r) of each unit."""
+    """Return -weight log p(r) of each unit."""
     return (softplus(logits) - r * logits) * weight

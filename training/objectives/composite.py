@@ -1,25 +1,25 @@
-"""Composite conditional likelihood: masked objects, presence against absence, and relations.
+"""Composite conditional likelihood of masked objects, presence and relations.
 
-For each scene one present class i is taken out, with all its instances and relations:
+In each scene one present class i is removed, with all its instances and relations:
 
     ranking    - log softmax over absent candidates of the log-odds, at i
     presence   n·softplus(-log-odds_i) + sum over the other absent classes of softplus(log-odds)
 
-where n, the number of classes that could have been taken out, makes the second an unbiased estimate
-of the pseudo-likelihood's balance of present and absent units. The ranking alone leaves log-odds
-that are not comparable between objects.
+n is the number of removable classes. It makes the second term an unbiased estimate of the
+pseudo-likelihood, which balances present and absent units. With the ranking term alone, log-odds of
+different objects are not comparable.
 
 For scenes with annotated relations:
 
     relations  - sum over observed units of log p(r_e | v, E[h1 | v])
 
-a plug-in of the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)), with the mean
-in place of draws. Relations nobody annotated are summed out; scenes without any teach the object
-part only. A machine that knows what relations imply learns it from the same scenes with a random
-share of their relations given, by log p(r_e | r_given, v, E[h1 | v]) of the others.
+This term approximates the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)) by
+the mean of h1. Unannotated relations are summed out. Scenes without annotated relations train the
+object part only. A machine with implications is trained on the same scenes with a random share of
+their relations given, by log p(r_e | r_given, v, E[h1 | v]) of the other relations.
 
-A class that a source never mentions counts as absent from its scenes: a request does not say what
-source it is of, and all classes have to be ranked.
+A class that a source never mentions counts as absent from its scenes. The reason is that a request
+has no source, and all classes have to be ranked.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Varin, Reid and Firth, "An
 overview of composite likelihood methods" (2011).
@@ -45,14 +45,14 @@ from training.objectives.base import Objective, relation_nll, withhold_counts, w
 
 @dataclass(frozen=True)
 class Masked:
-    """Scenes with one class taken out.
+    """Scenes with one class removed.
 
     Attributes:
-        batch: the scenes (those that have a class to take out).
-        v: (B, V) without the class.
-        target: (B,) the class.
-        absent: (B, V) bool: the candidates, the target among them.
-        removable: (B,) how many classes could have been taken out.
+        batch: the scenes that have a removable class.
+        v: (B, V) presence without the removed class.
+        target: (B,) the removed class.
+        absent: (B, V) bool, the candidates, which include the target.
+        removable: (B,) number of removable classes.
     """
 
     batch: Batch
@@ -63,10 +63,10 @@ class Masked:
 
 
 def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) -> Masked | None:
-    """Take one class out of each scene of at least two; None where no scene has two.
+    """Remove one class from each scene with at least two; return None if no scene has two.
 
     Args:
-        structure: (V,) bool; such classes are neither taken out nor candidates.
+        structure: (V,) bool; structure classes are neither removed nor candidates.
     """
     removable = batch.v * ~structure
     enough = removable.sum(1) >= 2
@@ -82,18 +82,19 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
 class ObjectChains:
     """Persistent chains over objects and context: a generative gradient for the local form.
 
-    Relations sum to one there, so the chains run over (v, h1, h2), with h1 summed out:
+    In the local form relations sum to one. The chains therefore run over (v, h1, h2), with h1
+    summed out:
 
         mean F(data, h2) - mean F(chains, h2),   F = -b·v - c2·h2 - sum softplus(c1 + v'W + J h2)
 
-    Each chain keeps a room type (or none) drawn from the training scenes, so that both means run
-    over the same mixture of conditions.
+    Each chain keeps a room type (or none) drawn from the training scenes. Both means then have the
+    same mixture of conditions.
 
     Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
 
     Args:
         count: number of chains.
-        steps: Gibbs steps an update.
+        steps: Gibbs steps for each update.
     """
 
     def __init__(self, count: int, steps: int) -> None:
@@ -103,7 +104,7 @@ class ObjectChains:
     def loss(
         self, machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """mean F(data) - mean F(chains), after moving the chains.
+        """Run the chains, then return mean F(data) - mean F(chains).
 
         Args:
             v, room: (B, V) and (B,), the data.
@@ -131,8 +132,9 @@ class ObjectChains:
 class CompositeLikelihood(Objective):
     """Ranking + presence_weight · presence + relation_weight · relations.
 
-    With a generative_weight (local form), also that share of the persistent-chain gradient
-    (`ObjectChains`): conditionals alone leave a joint whose own samples drift from the data.
+    With a generative_weight (local form), the weighted persistent-chain gradient is added
+    (`ObjectChains`). Conditionals alone give a joint distribution whose samples differ from the
+    data.
     """
 
     def __init__(
@@ -142,15 +144,15 @@ class CompositeLikelihood(Objective):
         self.chains = ObjectChains(config.chains, config.k)
 
     def state(self) -> dict[str, Tensor]:
-        """The persistent chains."""
+        """Return the persistent chains."""
         return self.chains.blocks
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Put the chains back where they were."""
+        """Restore the persistent chains."""
         self.chains.blocks = dict(state)
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Mean over scenes of the weighted parts."""
+        """Return the mean over scenes of the weighted terms."""
         total = machine.b.sum() * 0.0
         if self.config.relation_weight:
             total = total + self.config.relation_weight * self.relation_part(
@@ -177,7 +179,7 @@ class CompositeLikelihood(Objective):
         masked: Masked,
         generator: torch.Generator,
     ) -> Tensor:
-        """Log-odds of each class given the other classes, relations unobserved, (B, V)."""
+        """Return log-odds of each class given the other classes, relations unobserved, (B, V)."""
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
             drop = torch.rand(v.shape, generator=generator) < self.config.structure_dropout
@@ -194,9 +196,9 @@ class CompositeLikelihood(Objective):
     def relation_part(
         self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
     ) -> Tensor:
-        """-log p(observed r | v, E[h1 | v]), summed over units, averaged over the batch.
+        """Return -log p(observed r | v, E[h1 | v]), summed over units, averaged over the batch.
 
-        Plus the same of what is left where some are given, in a machine that knows implications.
+        A machine with implications adds the second term of `relation_nll`.
         """
         annotated = batch.observed.flatten(1).any(1)
         if not bool(annotated.any()):
@@ -216,7 +218,7 @@ class CompositeLikelihood(Objective):
 
 
 def unlisted_off(batch: Batch, structure: Tensor) -> Batch:
-    """The batch with every relation between two classes of a scene observed, structure apart."""
+    """Return the batch with all relations between non-structure classes of a scene observed."""
     n = batch.classes.shape[1]
     thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
     pairs = thing[:, :, None] & thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)

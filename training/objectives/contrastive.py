@@ -1,11 +1,11 @@
 """Contrastive divergence, plain and persistent, by differences of the energy.
 
 The gradient of the negative log-likelihood is <dE>_data - <dE>_model. Both terms are energies of
-sampled states, so autograd turns any variant's energy into its update; in the seed form h1 is
-summed out (Rao–Blackwell), so the terms are free energies given v, r and h2.
+sampled states, so autograd derives the update of any variant. In the seed form h1 is summed out
+(Rao–Blackwell), and the terms are free energies given v, r and h2.
 
 In the local form relations sum to one given (v, h1), so their model term has mean zero and is left
-out: what remains is the machine of (v, h1, h2) and log p(r | v, h1) on the data.
+out. The machine of (v, h1, h2) and log p(r | v, h1) on the data remain.
 
 Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002);
 Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008); Montavon and
@@ -43,9 +43,9 @@ _OFFSETS = ("offset_v", "offset_h1", "offset_h2")
 def data_state(
     machine: BoltzmannMachine, batch: Batch, room: Tensor, generator: torch.Generator
 ) -> tuple[State, Tensor]:
-    """Hidden units and unobserved relations drawn given the data, and which relations are observed.
+    """Return hidden units and unobserved relations sampled given the data, and the observed mask.
 
-    The hidden layers are drawn from the mean-field fixed point given the observed relations.
+    The hidden layers are sampled from the mean-field fixed point given the observed relations.
     """
     edges, r, observed = relation_units(machine, batch)
     field = mean_field(machine, Evidence(batch.v, edges, r, observed, room), iterations=5)
@@ -60,7 +60,7 @@ def data_state(
 def relation_nll(
     machine: BoltzmannMachine, edges: Edges, v: Tensor, h1: Tensor, r: Tensor, observed: Tensor
 ) -> Tensor:
-    """-log p(observed r | v, h1), (B,)."""
+    """Return -log p(observed r | v, h1), (B,)."""
     logits = machine.relation_logits(edges, v, h1)
     return bernoulli_nll(logits, r, observed * machine.gate(edges, v)).sum(-1)
 
@@ -73,13 +73,13 @@ def energy_difference(
     data_room: Tensor,
     model_room: Tensor,
 ) -> Tensor:
-    """mean F(data) - mean F(model); in the local form mean E, plus -log p(r | v, h1)."""
+    """Return mean F(data) - mean F(model); in the local form mean E, plus -log p(r | v, h1)."""
     if not machine.relations_act:
         positive = machine.object_energy(data.v, data.h1, data.h2, data_room)
         positive = positive + relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
         negative = machine.object_energy(model.v, model.h1, model.h2, model_room)
         return positive.mean() - negative.mean()
-    # Both in one pass: the states are reachable, so the gate need not be looked at.
+    # Both terms in one pass. The states are reachable, so the gate need not be checked.
     bare, context = machine.linear_relations(data.edges, data.v, data.r)
     model_bare, model_context = machine.linear_relations(model.edges, model.v, model.r)
     free = machine.free_energy_given(
@@ -92,29 +92,29 @@ def energy_difference(
 
 
 class ContrastiveDivergence(Objective):
-    """CD-k: the model term from k Gibbs steps started at the data."""
+    """CD-k: the model term comes from k Gibbs steps started at the data."""
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """mean E(data) - mean E(after k steps)."""
+        """Return mean E(data) - mean E(after k steps)."""
         room = withhold_rooms(batch, self.config.room_dropout, generator)
         data, observed = data_state(machine, batch, room, generator)
         relations = machine.relations_act
         clamp = Clamp(room=room)
-        # The data's own h1 starts the first reconstruction.
+        # The h1 of the data starts the first reconstruction.
         model = reconstruct(machine, data, generator, clamp, collapsed=False, relations=relations)
         for _ in range(self.config.k - 1):
             model = gibbs_step(
                 machine, model, generator, clamp, collapsed=False, relations=relations
             )
         if not machine.relations_act:
-            # The energies there are of h1 as drawn. The h1 that v was drawn from is the data's own
-            # after one step: with it c1 and J would see no difference.
+            # The energies use sampled h1. After one step the model state still has the h1 of the
+            # data, from which c1 and J would learn nothing.
             model = replace(model, h1=sample_h1(machine, model, generator, clamp))
         return energy_difference(machine, data, observed, model, room, room)
 
 
 class PersistentCD(Objective):
-    """PCD-k with centred gradients: the model term from chains that go on between updates."""
+    """PCD-k with centred gradients: the model term uses chains that continue between updates."""
 
     def __init__(
         self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
@@ -123,11 +123,11 @@ class PersistentCD(Objective):
         spec = machine.spec
         self.chains: State | None = None
         self.saved: dict[str, Tensor] = {}
-        # Data means as running averages: the offsets of v, h1 and h2.
+        # Running averages of the data means: the offsets of v, h1 and h2.
         self.offsets = [torch.full((n,), 0.5) for n in (spec.V, spec.H1, spec.H2)]
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """mean E(data) - mean E(chains)."""
+        """Return mean E(data) - mean E(chains)."""
         free = torch.full((len(batch),), -1)
         data, observed = data_state(machine, batch, free, generator)
         chains = self._resume(machine, generator)
@@ -141,7 +141,7 @@ class PersistentCD(Objective):
         return energy_difference(machine, data, observed, chains, free, no_room)
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:
-        """The centred gradient: weights see (v - μ)(h - λ), biases make up for the offsets."""
+        """Centre the gradients: weights use (v - μ)(h - λ); biases compensate for the offsets."""
         centre_gradients(machine, *self.offsets)
 
     def _resume(self, machine: BoltzmannMachine, generator: torch.Generator) -> State:
@@ -154,7 +154,7 @@ class PersistentCD(Objective):
         return State(edges=edges, **{name: self.saved[name] for name in ("v", "h1", "h2", "r")})
 
     def state(self) -> dict[str, Tensor]:
-        """The offsets, and the chains with the classes that their relations are laid out over."""
+        """Return the offsets, the chains, and the classes in the layout of their relations."""
         state = dict(zip(_OFFSETS, self.offsets, strict=True))
         if self.chains is None:
             return state
@@ -162,7 +162,7 @@ class PersistentCD(Objective):
         return state | blocks | {"classes": self.chains.edges.classes}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the offsets and remember where the chains were."""
+        """Restore the offsets, and keep the chains for the next update."""
         self.offsets = [state[name] for name in _OFFSETS]
         self.saved = {name: value for name, value in state.items() if name not in _OFFSETS}
 
@@ -171,10 +171,11 @@ class PersistentCD(Objective):
 def centre_gradients(
     machine: BoltzmannMachine, mu: Tensor, lambda1: Tensor, lambda2: Tensor
 ) -> None:
-    """Turn gradients by (b, c1, c2, W, J) into centred ones, in place.
+    """Replace gradients by (b, c1, c2, W, J) with centred ones, in place.
 
-    With d<v>, d<h1>, d<vh1> the differences of data and model: the weight's centred gradient is
-    d<vh1> - μ d<h1>' - d<v> λ1', and a bias gives up what its weights' offsets already move.
+    d<v>, d<h1> and d<vh1> are differences of data and model. The centred gradient of W is
+    d<vh1> - μ d<h1>' - d<v> λ1'. Bias gradients are reduced by the shift that the weights cause
+    through the offsets.
     """
     b, c1, c2 = (getattr(machine, name).grad for name in ("b", "c1", "c2"))
     W, J = machine.W.grad, machine.J.grad

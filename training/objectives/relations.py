@@ -1,25 +1,26 @@
-"""The relation part by conditional likelihood: what sources say holds, or does not.
+"""Conditional likelihood of relations that sources state as true or false.
 
     - sum over scenes and known units of log p(r_e | v, E[h1 | v]),   logit_e = ℓ_e + δ[source, a]
 
-A unit is known where it holds or is known not to (`training.datasets.sources`); all others drop
-out. People mention what is worth mentioning, and a procedural room lists all there is: so each
-source has an offset δ of its own for each relation. Offsets are learned and left out when serving.
+A unit is known if its source states whether the relation holds (`training.datasets.sources`). Other
+units drop out. Sources differ in what they list: people mention notable relations, and a procedural
+room lists all. Each source therefore has its own offset δ for each relation. Offsets are trained,
+and left out when serving.
 
-Weights have a normal prior (`weight_prior`, its precision), offsets too (`offset_prior`). With word
-vectors X, the factors and end weights of a class are a learned map of its vector plus a deviation
-of its own, which the prior holds small,
+Weights and offsets have normal priors, with the precisions `weight_prior` and `offset_prior`. With
+word vectors X, the factors and end weights of a class are a trained map of its vector plus a small
+deviation of the class:
 
     S = X A_S + S',   O = X A_O + O',   s = (X B_s)' + s',   o = (X B_o)' + o'
 
-so that a rare class behaves like classes with similar word vectors.
+A rare class then behaves like classes with similar word vectors.
 
-A robot has seldom seen a whole scene, so the context sees a random share of the objects: of each
-scene a uniform one. What holds of a pair in rich scenes of one source would else be left to the
-context, and said of no other.
+A robot seldom sees a whole scene. In training the context therefore sees a random share of the
+objects, with a uniform share for each scene. Otherwise the context would learn relations that hold
+in complete scenes of one source, and the model would not predict them in other scenes.
 
-A machine with implications learns them from the same scenes with a random share of their relations
-given, by log p(r_e | r_given, v, E[h1 | v]) of the others. The object part stays as it is.
+A machine with implications is trained on the same scenes with a random share of their relations
+given, by log p(r_e | r_given, v, E[h1 | v]) of the other relations. The object part is unchanged.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Salakhutdinov,
 "Probabilistic matrix factorization" (2007), for normal priors on factors.
@@ -51,13 +52,13 @@ if TYPE_CHECKING:
     from training.trainer import TrainingData
 
 _OBJECT_PART = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B", "usual", "d"})
-# The map of word vectors is shared by all classes, and needs less of a prior than one class does.
+# All classes share the map of word vectors, so its prior is weaker than that of one class.
 _MAP_PRIOR = 0.1
 _ROWS = ("S", "O")
 _COLUMNS = ("s", "o")
-# τ: so many scenes at even odds would weigh four times as much.
+# τ: this prior weighs as much as four scenes at even odds.
 _PRECISION = 1.0
-# Scenes that must speak of a triple, and the least weight that is worth keeping.
+# Least number of scenes that observe a triple, and least residual that is stored.
 _SPEAKING_SCENES = 5
 _LEAST_RESIDUAL = 0.1
 _NEWTON_STEPS = 12
@@ -65,11 +66,11 @@ _BATCH = 64
 
 
 class WordPrior(nn.Module):
-    """Adds a learned map of word vectors to the weights of classes.
+    """Add a trained map of word vectors to the weights of classes.
 
     Args:
-        words: (V, D) vectors, scaled.
-        width: of the weights of a class.
+        words: (V, D) scaled word vectors.
+        width: number of weights of a class.
         columns: the weights are (width, V), not (V, width).
     """
 
@@ -79,7 +80,7 @@ class WordPrior(nn.Module):
         self.map = nn.Parameter(torch.zeros(words.shape[1], width))
 
     def forward(self, deviation: Tensor) -> Tensor:
-        """The weights of all classes."""
+        """Return the weights of all classes."""
         shared = self.words @ self.map
         return deviation + (shared.T if self.columns else shared)
 
@@ -89,8 +90,8 @@ class RelationLikelihood(Objective):
 
     Args:
         config: weights and priors.
-        machine: gets the word prior.
-        train: says which sources there are, and how many scenes.
+        machine: the machine that gets the word prior.
+        train: scenes that give the source names and the number of scenes.
         words: (V, D) unit vectors of the classes; None without a word prior.
     """
 
@@ -113,11 +114,11 @@ class RelationLikelihood(Objective):
 
     @classmethod
     def of(cls, config: ObjectiveConfig, machine: BoltzmannMachine, data: TrainingData) -> Self:
-        """The objective over the training scenes of a run."""
+        """Return the objective for the training scenes of a run."""
         return cls(config, machine, data.train, data.words)
 
     def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
-        """With the word prior in plain weights, and residuals unless they are held at zero."""
+        """Return the machine with the word prior in its weights, and with fitted residuals."""
         bake_word_prior(machine)
         if machine.has_residuals and machine.get_parameter("residual").requires_grad:
             return with_counted_residuals(
@@ -126,20 +127,20 @@ class RelationLikelihood(Objective):
         return machine
 
     def parameters(self) -> list[nn.Parameter]:
-        """The offsets."""
+        """Return the offsets."""
         return [self.offsets]
 
     def state(self) -> dict[str, Tensor]:
-        """The offsets."""
+        """Return the offsets."""
         return {"offsets": self.offsets.detach()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Put the offsets back."""
+        """Restore the offsets."""
         with torch.no_grad():
             self.offsets.copy_(state["offsets"])
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Mean over scenes of the negative log-likelihood, and the priors' share of a scene."""
+        """Return the mean negative log-likelihood of scenes, plus a scene's part of the prior."""
         with cached():
             return self._loss(machine, batch, generator)
 
@@ -159,7 +160,7 @@ class RelationLikelihood(Objective):
         return nll / len(batch) + self._prior(machine) / max(self.scenes, 1)
 
     def _prior(self, machine: BoltzmannMachine) -> Tensor:
-        """-log p(weights), without a constant."""
+        """Return -log p(weights), without a constant."""
         total = 0.5 * self.config.offset_prior * (self.offsets**2).sum()
         half = 0.5 * self.config.weight_prior
         for name, parameter in machine.named_parameters():
@@ -171,13 +172,13 @@ class RelationLikelihood(Objective):
 
 
 def partly_shown(v: Tensor, generator: torch.Generator) -> Tensor:
-    """Scenes (B, V) with each object kept at its scene's own chance, uniform in [0, 1]."""
+    """Hide objects of scenes (B, V) at random, each scene with its own uniform probability."""
     chance = torch.rand(len(v), 1, generator=generator)
     return v * (torch.rand(v.shape, generator=generator) < chance)
 
 
 def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:
-    """Give the class weights of a factorised machine a word prior; others stay as they are."""
+    """Add a word prior to the class weights of a factorised machine; others are unchanged."""
     for names, columns in ((_ROWS, False), (_COLUMNS, True)):
         for name in names:
             weight = dict(machine.named_parameters()).get(name)
@@ -187,7 +188,7 @@ def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:
 
 
 def bake_word_prior(machine: BoltzmannMachine) -> None:
-    """Make what a word prior adds part of the weights, as the machine is stored."""
+    """Add the word prior to the weights, for storage."""
     for name in (*_ROWS, *_COLUMNS):
         if is_parametrized(machine, name):
             remove_parametrizations(machine, name, leave_parametrized=True)
@@ -196,21 +197,22 @@ def bake_word_prior(machine: BoltzmannMachine) -> None:
 def with_counted_residuals(
     machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
 ) -> BoltzmannMachine:
-    """The machine with weights of single triples, smoothed towards counts.
+    """Return the machine with weights of single triples, smoothed towards counts.
 
-    Shared factors say what a relation means across classes, and say too much of pairs that many
-    scenes show not to stand so (a window on a stove). So after training each triple e = (a,i,j)
-    that enough scenes speak of gets a weight of its own: the maximum of
+    Shared factors state the meaning of a relation over all classes. For some pairs they give a high
+    probability although many scenes observe that the relation does not hold (a window on a stove).
+    After training, each triple e = (a,i,j) observed in enough scenes therefore gets its own weight
+    δ_e, which maximises
 
         sum over scenes of log p(r_e | v, E[h1 | v], w_e' + δ_e) - τ/2 δ_e²
 
-    by Newton's method, all other weights as they are and the context seeing a random share of the
-    objects, as in training. The fewer scenes speak of a triple, the nearer its δ stays to 0.
+    by Newton's method. All other weights are fixed, and the context sees a random share of the
+    objects, as in training. With few scenes, δ_e stays close to 0.
 
     Args:
-        train: scenes of which relations are known.
+        train: scenes with known relations.
         offsets: (sources, A), added to the logits of each source's scenes.
-        source_weights: (sources,) what a relation of each source counts for.
+        source_weights: (sources,) weight of a relation of each source.
     """
     keys, logits, holds, weights = _known_units(machine, train, offsets, source_weights)
     triples, which, counts = np.unique(keys, return_inverse=True, return_counts=True)
@@ -232,7 +234,7 @@ def with_counted_residuals(
 def _known_units(
     machine: BoltzmannMachine, train: SceneTensors, offsets: Tensor, source_weights: Tensor
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Keys (U,), logits, values and weights of all known units."""
+    """Return keys (U,), logits, values and weights of all known units."""
     columns: list[list[Tensor]] = [[], [], [], []]
     V = machine.spec.V
     generator = torch.Generator().manual_seed(0)

@@ -1,1 +1,1 @@
-"""What scenes are like under any machine, by weighted draws of the context: slow, and unbiased."""
+"""Reference posterior of scenes under any machine, by weighted draws of the context; slow."""

@@ -22,7 +22,7 @@ from training.oracle.units import NO_UNIT, Units, mean_log_p, units_between
 Floats = NDArray[np.floating[Any]]
 Places = NDArray[np.int64]
 
-# Rows and candidates are taken in blocks of about so many relation units times draws.
+# Rows and candidates are processed in blocks of about this many relation units times draws.
 _BLOCK = 1 << 22
 
 
@@ -30,10 +30,10 @@ class _Between(NamedTuple):
     """The units between the classes of a scene.
 
     Attributes:
-        units: E of them.
-        logits: (M, E), one row a draw.
-        said: (M, E) what takes an observation out of the log-weights of the draws; or 0.
-        holds: (1, E), 1 where observed as on; None where nothing is observed.
+        units: layout of the E units.
+        logits: (M, E), one row for each draw.
+        said: (M, E) log-weight change that removes an observation from the draws; or 0.
+        holds: (1, E), 1 where observed as on; None without observed relations.
     """
 
     units: Units
@@ -43,7 +43,7 @@ class _Between(NamedTuple):
 
 
 class DrawnPosterior:
-    """See `Posterior`. Without given relations objects are in closed form here too."""
+    """See `Posterior`. In the local form without observed relations, objects have a closed form."""
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
         self.observation = observe(machine_of(artifact.weights), scene)
@@ -53,18 +53,18 @@ class DrawnPosterior:
 
     @property
     def unit_count(self) -> int:
-        """Those of the evidence; in the seed form, of all that is present."""
+        """Number of relation units of the evidence; in the seed form, of all present classes."""
         return self.observation.unit_count
 
     @cached_property
     def draws(self) -> HiddenDraws:
-        """Of h1 given the evidence, for questions about relations."""
+        """Draws of h1 given the evidence, for questions about relations."""
         observation, pull = self.observation, self._pull.relations
         return draw_context(observation.machine, observation.evidence, pull=pull)
 
     @cached_property
     def object_draws(self) -> HiddenDraws:
-        """The same for questions about objects."""
+        """Draws of h1 given the evidence, for questions about objects."""
         observation, pull = self.observation, self._pull
         if pull.objects == pull.relations or observation.evidence.edges is None:
             return self.draws
@@ -72,7 +72,7 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def absent_log_odds(self, absent: Places) -> Floats:
-        """In closed form, prepared, in a local machine without given relations."""
+        """See `Posterior`; in closed form in a local machine without observed relations."""
         machine, evidence = self.observation.machine, self.observation.evidence
         where = torch.from_numpy(np.asarray(absent, dtype=np.int64))
         if not machine.relations_act and evidence.edges is None:
@@ -95,12 +95,12 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def relation_log_odds(self) -> Floats:
-        """Log-odds of every relation between the classes of a scene, each without itself.
+        """Return log-odds of every relation between the classes of a scene, given all other units.
 
             p(r_e = 1 | rest) = E[ sigmoid(ℓ_e(h1) + x_e) ],   h1 from p(h1 | rest)
 
-        with x_e what the observed relations imply for e. Samples of h1 are conditioned on the
-        observed objects and relations. Reweighting takes an observed unit out of the evidence:
+        x_e is the shift that the observed relations imply for e. Samples of h1 are conditioned on
+        the observed objects and relations. Reweighting removes an observed unit from the evidence:
         w ← w / p(r_e | v, h1). A relation without a unit has log-odds `NO_UNIT`.
         """
         between = self._between
@@ -110,7 +110,7 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
-        """Over the same draws, reweighted by all units of the pair at once, both ways."""
+        """See `Posterior`; the draws are reweighted by all units of the pair, in both ways."""
         units, said = self._between.units, self._between.said
         logits = self._between.logits + self._implied(apart=True)
         ends = torch.from_numpy(one), torch.from_numpy(other)
@@ -118,7 +118,7 @@ class DrawnPosterior:
         log_weight = self.draws.log_weight
         if said.dim():
             forward, backward = (way.grid(said, 0.0).sum(1) for way in ways)
-            # Of a class with itself the two ways are one.
+            # For a class with itself, both directions are the same units.
             log_weight = log_weight + forward + backward * (ends[0] != ends[1])
         weight = torch.softmax(log_weight, dim=0).unsqueeze(1)
         found = []
@@ -141,12 +141,12 @@ class DrawnPosterior:
         r = units.flat(observation.holds).to(logits.dtype)
         gate = machine.gate(units.edges, evidence.v)
         unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
-        # Where e is not observed, the difference is zero and the weights stay as they are.
+        # Where e is not observed, the difference is zero and the weights do not change.
         said = self._pull.relations * (unseen - machine.relation_term(logits, gate, r, observed))
         return _Between(units, logits, said, (r * observed).unsqueeze(0))
 
     def _implied(self, *, apart: bool) -> Tensor:
-        """What the observed relations imply for each unit, (E,)."""
+        """Return the logit shift that the observed relations imply for each unit, (E,)."""
         between = self._between
         if between.holds is None:
             return between.logits.new_zeros(())
@@ -154,12 +154,12 @@ class DrawnPosterior:
         return self.draws.implied(machine, edges, between.holds, apart=apart).squeeze(0)
 
     def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
-        """Among all of them."""
+        """See `Posterior`; selects from the log-odds of all relations."""
         return self.relation_log_odds()[relation, subject, object_]
 
     @torch.inference_mode()
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
-        """Over draws weighed as if the candidate were there."""
+        """See `Posterior`; the draws are weighted as if the candidate were present."""
         size = 2 * self.observation.machine.spec.A * max(1, len(anchors)) * len(self.draws.h1)
         places = torch.from_numpy(np.asarray(anchors, dtype=np.int64))
         found: tuple[list[Tensor], list[Tensor]] = ([], [])
@@ -174,7 +174,7 @@ class DrawnPosterior:
     def placed_log_p(
         self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
     ) -> Floats:
-        """Over draws weighed as if the candidate were there."""
+        """See `Posterior`; the draws are weighted as if the candidate were present."""
         where = torch.from_numpy(np.asarray(candidates, dtype=np.int64))
         on, _ = self._log_p(where, torch.tensor([anchor]), outgoing=outgoing)
         return _numpy(on[relation, :, 0].clamp(min=NO_UNIT))
@@ -182,11 +182,11 @@ class DrawnPosterior:
     def _log_p(
         self, candidates: Tensor, anchors: Tensor, *, outgoing: bool
     ) -> tuple[Tensor, Tensor]:
-        """log p and log (1 - p) of the units between candidates and anchors, (A, N, m)."""
+        """Return log p and log (1 - p) of the units between candidates and anchors, (A, N, m)."""
         observation, draws = self.observation, self.draws
         machine, evidence = observation.machine, observation.evidence
         classes, counts = observation.classes[anchors], observation.counts[anchors]
-        # Each unit is judged with its candidate present; no unit sees two candidates.
+        # Each unit is computed with its candidate present; a unit never involves two candidates.
         v = evidence.v.clone()
         v[:, candidates] = 1.0
         weight = weights_with(machine, evidence, draws, candidates)
@@ -202,7 +202,7 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def log_odds_given_rest(self) -> Floats:
-        """A row for each class, with draws of its own where relations are observed."""
+        """See `Posterior`; each class has its own draws if relations are observed."""
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
         alone = torch.eye(n, dtype=torch.bool)
@@ -218,9 +218,10 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def reasons(self, rows: Places) -> Floats:
-        """With the context at its mean field on both sides: the difference of two estimates from
-        draws would be lost in their noise. The scene without i and j judges i without j and j
-        without i.
+        """See `Posterior`; the context is at its mean field on both sides.
+
+        The difference of two estimates from draws would be smaller than their noise. The scene
+        without i and j gives the log-odds of i without j and of j without i.
         """
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
@@ -243,18 +244,19 @@ class DrawnPosterior:
         i, j = pairs.unbind(1)
         without[i, j], without[j, i] = log_odds.unbind(1)
         without = without[places]
-        # The diagonal takes out nothing but the class itself: it is judged by the whole rest.
+        # On the diagonal only the class itself is removed, so these are its log-odds given the
+        # rest.
         change = without.gather(1, places.unsqueeze(1)) - without
         change[torch.arange(len(places)), places] = 0.0
         return _numpy(change)
 
     @torch.inference_mode()
     def reasons_for_absent(self, candidates: Places) -> Floats:
-        """With the context at its mean field on both sides, as for `reasons`."""
+        """See `Posterior`; the context is at its mean field on both sides, as in `reasons`."""
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
         where = torch.from_numpy(np.asarray(candidates, dtype=np.int64)).unsqueeze(0)
-        # The first row is the scene as it is.
+        # The first row is the unchanged scene.
         removed = torch.eye(n + 1, dtype=torch.bool)[:, 1:]
         size = observation.unit_count + where.shape[1] * max(1, machine.spec.H1)
         log_odds = torch.cat(
@@ -272,11 +274,11 @@ class DrawnPosterior:
 
 
 def _rows(size: int) -> int:
-    """How many rows of that size to take at a time."""
+    """Return the number of rows of that size in a block."""
     return max(1, _BLOCK // max(1, size))
 
 
 def _numpy(values: Tensor) -> Floats:
-    """In the order that compiled loops are compiled for."""
+    """Return a contiguous array, as compiled functions expect."""
     found: Floats = values.contiguous().numpy()
     return found

@@ -1,12 +1,12 @@
-"""A scene as evidence for one machine: names and positions end here, tensors begin.
+"""Convert a scene to evidence in the tensor layout of a machine.
 
-Presence is soft: a class seen with confidence c < 1 enters as v = c. That is a first-order
-treatment: the energy is linear in v_i, so v = c stands for its mean over v_i ~ Bernoulli(c), but
-what the context makes of either value is not averaged. Classes that nobody saw enter as v = 0.
+Presence is soft: a class seen with confidence c < 1 enters as v = c. This is a first-order
+approximation. The energy is linear in v_i, so v = c is the mean over v_i ~ Bernoulli(c). The
+dependence of the context on either value is not averaged. Unseen classes enter as v = 0.
 
-Relations: what the scene states or shows is observed, everything else is unobserved. In the local
-form unobserved relations drop out, so only classes that an observed relation touches get units. A
-relation that has no unit in the machine carries no evidence.
+Relations that the scene states or shows are observed; all other relations are unobserved. In the
+local form unobserved relations drop out, so only classes with an observed relation get units. A
+relation without a unit in the machine is ignored.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from training.machines.mean_field import Evidence
 from training.oracle.units import Units, units_between
 
 DRAWS = 64
-"""Draws of the context behind an estimate; a power of two keeps the Sobol sequence balanced."""
+"""Number of draws of the context for an estimate; a power of two balances the Sobol sequence."""
 
-# Evidence of very many relations gets fewer draws, down to a few, so that a question stays bounded.
+# With very many relations the number of draws is reduced to this, to limit the time of a question.
 _FEWEST_DRAWS = 8
 _RELATION_DRAWS = 1 << 25
 
@@ -39,12 +39,12 @@ def draw_context(
     rows: int | None = None,
     pull: float = 1.0,
 ) -> HiddenDraws:
-    """The fixed, weighted draws of h1 that every estimate uses.
+    """Return the fixed, weighted draws of h1 for all estimates.
 
-    `DRAWS` of them, or fewer where rows × relation units × draws would exceed a bound.
+    The number is `DRAWS`, or less where rows × relation units × draws would exceed a bound.
 
     Args:
-        rows: how many rows the question has in all; those of the evidence by default.
+        rows: number of all rows of the question; default: the rows of the evidence.
         pull: weight of the observed relations, see `draw_hidden`.
     """
     units = 0 if evidence.edges is None else evidence.edges.shape[-1]
@@ -57,16 +57,16 @@ def draw_context(
 
 @dataclass(frozen=True)
 class Observation:
-    """One scene, for one machine.
+    """One scene in the layout of a machine.
 
     Attributes:
-        machine: whose units these are.
-        scene: its classes, in arrays.
+        machine: the machine.
+        scene: the classes of the scene, as arrays.
         classes, counts: (n,) int64, the distinct classes, ascending, and their instances.
         holds, observed: (A, n, n) bool.
-        evidence: the same in the machine's layout, one row.
-        units: layout of the evidence's relations; None where relations say nothing.
-        touched: (n,) bool, the classes that `units` speak of.
+        evidence: the scene in the machine's layout, one row.
+        units: layout of the evidence's relations; None if relations do not affect the context.
+        touched: (n,) bool, the classes with a unit in `units`.
     """
 
     machine: BoltzmannMachine
@@ -81,14 +81,14 @@ class Observation:
 
     @property
     def unit_count(self) -> int:
-        """E, the relation units of the evidence."""
+        """Number of relation units E of the evidence."""
         return 0 if self.units is None else self.units.edges.shape[-1]
 
     def without(self, removed: Tensor) -> Evidence:
-        """The scene with some classes, and every relation that touches them, taken out.
+        """Return the scene without some classes and without the relations of these classes.
 
         Args:
-            removed: (B, n) bool, one row for each way of taking out.
+            removed: (B, n) bool, the classes to remove in each row of the result.
         """
         evidence, size = self.evidence, len(removed)
         v = evidence.v.repeat(size, 1)
@@ -102,16 +102,16 @@ class Observation:
         observed = evidence.observed & self.units.flat(kept)
         edges = self.units.edges
         if self.machine.relations_act:
-            # Unobserved relations attract, and a candidate's anchors go row by row.
+            # Unobserved relations act in the seed form, and each row has its own anchors.
             edges = edges.expand(size)
         return Evidence(v, edges, evidence.r.expand(size, -1), observed, room)
 
 
 def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
-    """Read a scene.
+    """Return the observation of a scene.
 
     Raises:
-        ValueError: an object outside the machine's classes, or a room type it does not have.
+        ValueError: the machine does not have the class of an object, or the room type.
     """
     spec = machine.spec
     found = class_evidence(scene)
@@ -119,7 +119,7 @@ def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
     v = torch.zeros(1, spec.V, dtype=machine.b.dtype)
     v[0, classes] = torch.from_numpy(found.confidence).to(v.dtype)
     room = None if scene.room_type is None else torch.tensor([scene.room_type])
-    # A machine may know fewer relations than there are.
+    # A machine may have fewer relations than the vocabulary of canonical relations.
     holds = torch.from_numpy(found.holds[: spec.A])
     observed = torch.from_numpy(found.observed[: spec.A])
     observation = Observation(

@@ -1,13 +1,14 @@
-"""How likely a drawn scene is, up to a constant of the model.
+"""Score of a sampled scene: its log-likelihood up to a constant of the model.
 
-Of objects v and relations r, at temperature 1:
+Score of objects v and relations r, at temperature 1:
 
     local form   b·v + sum_k softplus(x_k) + log p(r | v, h1)
     seed form    b·v + sum_k softplus(x_k + sum_e r_e U_ek) + sum_e r_e ℓ⁰_e
 
-with x = c1 + v'W + J m. Up to log Z the second is log p(v, r); the first is log p(v) and how well
-the context h1 that drew the relations explains them. A second layer enters by its mean field m,
-with c2·m and the entropy of m added: a lower bound on the sum over h2.
+with x = c1 + v'W + J m. In the seed form the score is log p(v, r) up to log Z. In the local form it
+is log p(v) up to log Z, plus the log-likelihood of r given the h1 from which r was sampled. A
+second layer enters by its mean field m: c2·m and the entropy of m are added, which gives a lower
+bound on the sum over h2.
 """
 
 from __future__ import annotations
@@ -29,11 +30,12 @@ def log_score(
     h1: Tensor,
     room: Tensor | None,
 ) -> Tensor:
-    """The score of each scene, (B,).
+    """Return the score of each scene, (B,).
 
     Args:
-        v: (B, V); r: (B, E) over `edges`, off wherever the gate is.
-        h1: (B, H1), the context that drew the relations.
+        v: (B, V) presence.
+        r: (B, E) over `edges`, off wherever the gate is off.
+        h1: (B, H1), the context from which the relations were sampled.
     """
     known = torch.ones_like(r, dtype=torch.bool)
     local = not machine.relations_act

@@ -1,7 +1,7 @@
-"""Relation units between classes, whatever the layout of the machine.
+"""Relation units between classes, independent of the layout of the machine.
 
-A Triway machine has a unit for every pair of classes it is asked about; the RBM and the GBM have
-units for the triples seen in training, and all others are off with probability one.
+A Triway machine has a unit for every pair of classes. The RBM and the GBM have units only for the
+triples seen in training; all other relations are always off.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from app.inference import relations
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges, pair_edges
 
-# As a plain number: tensors do not take numpy's.
+# A plain number, because tensors do not accept numpy scalars.
 NO_UNIT = float(relations.NO_UNIT)
 
 
@@ -24,9 +24,9 @@ class Units:
     """The units between n subject classes and m object classes.
 
     Attributes:
-        edges: (1, E) the machine's layout.
+        edges: (1, E) units in the machine's layout.
         place: (A, n, m) int64, the place in `edges` of each unit; or (A, P), see `of_pairs`.
-        exists: (A, n, m) bool; place is arbitrary where False.
+        exists: (A, n, m) bool; where False, `place` is arbitrary.
     """
 
     edges: Edges
@@ -34,18 +34,18 @@ class Units:
     exists: Tensor
 
     def grid(self, values: Tensor, missing: float) -> Tensor:
-        """Values (..., E) of the units as (..., A, n, m); `missing` where there is no unit."""
+        """Return values (..., E) of the units as (..., A, n, m); `missing` without a unit."""
         if not values.shape[-1]:
             return values.new_full((*values.shape[:-1], *self.place.shape), missing)
         return torch.where(self.exists, values[..., self.place], missing)
 
     def of_pairs(self, subjects: Tensor, objects: Tensor) -> Units:
-        """Those of some pairs, by places (P,) among the classes: `grid` then gives (..., A, P)."""
+        """Return the units of pairs of class places (P,); `grid` then gives (..., A, P)."""
         place, exists = (grid[:, subjects, objects] for grid in (self.place, self.exists))
         return Units(self.edges, place, exists)
 
     def flat(self, grid: Tensor) -> Tensor:
-        """(..., A, n, m) as (..., E); what has no unit is lost, other units are 0."""
+        """Return (..., A, n, m) as (..., E); values without a unit are dropped, the rest is 0."""
         values = grid.new_zeros(*grid.shape[:-3], self.edges.shape[-1])
         values[..., self.place[self.exists]] = grid[..., self.exists]
         return values
@@ -58,10 +58,10 @@ def units_between(
     subject_counts: Tensor | None = None,
     object_counts: Tensor | None = None,
 ) -> Units:
-    """The units from subject classes (n,) to object classes (m,).
+    """Return the units from subject classes (n,) to object classes (m,).
 
     Args:
-        subject_counts, object_counts: instances of each class; one each where omitted.
+        subject_counts, object_counts: instances of each class; default: one each.
     """
     A = machine.spec.A
     pairs = pair_edges(
@@ -83,9 +83,9 @@ def _logs(machine: BoltzmannMachine, classes: Tensor, counts: Tensor | None) -> 
 
 
 def mean_log_p(weight: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-    """log E[sigmoid(ℓ)] and log E[sigmoid(-ℓ)] over draws.
+    """Return log E[sigmoid(ℓ)] and log E[sigmoid(-ℓ)] over draws.
 
-    Both tails are summed by themselves: 1 - p would lose a p near one in single precision.
+    Both tails are summed separately, because 1 - p loses precision for p near one.
 
     Args:
         weight: (M, ...) normalised over M, broadcastable to the logits.

@@ -1,4 +1,4 @@
-"""Clients of the scene-reasoning service: plain httpx and pydantic; see docs/clients.md."""
+"""Clients of the scene-reasoning service, based on httpx and pydantic; see docs/clients.md."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ __all__ = [
     "UnreachableError",
 ]
 
-# Imported when first asked for: the service needs the schemas alone, and starts faster without
-# httpx and websockets.
+# Imported on first use: the service needs only the schemas, and starts faster without httpx and
+# websockets.
 _MODULES = {
     "AsyncClient": "asynchronous",
     "Client": "sync",

@@ -1,4 +1,4 @@
-"""``python -m scene_client``: the command `scene`."""
+"""``python -m scene_client`` runs the command `scene`."""
 
 from __future__ import annotations
 

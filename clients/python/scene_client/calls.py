@@ -1,4 +1,4 @@
-"""From a caller's arguments to the request that is sent, and from the response to the answer."""
+"""Build the request of a call from its arguments, and the answer from the response."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from scene_client.validation import field_errors
 
 FIRST_PAUSE: Final = 0.05
 LONGEST_PAUSE: Final = 2.0
-"""Seconds between attempts where the service names none; they double from the first on."""
+"""Seconds between attempts without a Retry-After header; the pause doubles each time."""
 
 Objects: TypeAlias = Iterable[str | Detection | Body]
-"""Labels, detections, or detections as in the HTTP contract."""
+"""Labels, `Detection` objects, or detections as in the HTTP contract."""
 
 
 # ------------------------------------------------------------------------------------ one call
@@ -52,11 +52,12 @@ class Call(Generic[T]):
     """One call of the HTTP contract.
 
     Attributes:
-        method, path: with the path as it is sent.
+        method: HTTP method.
+        path: URL-encoded path.
         answer: class of the answer.
-        body: JSON, if anything is sent.
-        administers: it needs the admin key.
-        repeatable: a second call changes nothing more than the first.
+        body: JSON text; None without a body.
+        administers: the call needs the admin key.
+        repeatable: repeating the call has no further effect.
     """
 
     method: str
@@ -67,10 +68,10 @@ class Call(Generic[T]):
     repeatable: bool = True
 
     def read(self, status: int, headers: Mapping[str, str], body: bytes) -> T:
-        """The answer in a response.
+        """Return the answer in a response.
 
         Raises:
-            ProblemError, DeadlineError, AnswerError: the response holds none.
+            ProblemError, DeadlineError, AnswerError: the response has no answer.
         """
         if status != HTTPStatus.OK:
             problem = problem_of(status, headers, body)
@@ -78,37 +79,39 @@ class Call(Generic[T]):
                 raise DeadlineError(problem.detail or problem.title, problem.request_id)
             raise problem
         try:
-            # A newer service may say more than this client knows.
+            # A newer service may send fields that this client does not have.
             return self.answer.model_validate_json(body, extra="ignore")
         except ValidationError as error:
             raise AnswerError(
                 f"The answer of {self.path} is not {self.answer.__name__}: "
-                f"{error.error_count()} faults. Is this the service's address?"
+                f"{error.error_count()} errors. Is this the address of the service?"
             ) from None
 
     def retry_pause(self, error: ProblemError | UnreachableError, attempt: int) -> float | None:
-        """Seconds before a further attempt; None where it cannot help, or may do harm.
+        """Return the seconds before a retry; None if a retry is useless or may do harm.
 
         Args:
-            attempt: 0 for the first.
+            attempt: number of the attempt, 0 for the first.
         """
         pause = min(LONGEST_PAUSE, FIRST_PAUSE * 2**attempt) * random()  # noqa: S311 # nosec B311
         if isinstance(error, ProblemError):
-            # Never earlier than asked for, and not all clients at once.
+            # Wait at least for Retry-After, plus a random pause so that clients spread out.
             return pause + (error.retry_after or 0.0) if error.status in (429, 503) else None
         sent = not isinstance(error.__cause__, httpx.ConnectError)
         return pause if self.repeatable or not sent else None
 
 
 def segment(name: str) -> str:
-    """A name as one segment of a path.
+    """Return a name as one segment of a path.
 
     Raises:
-        InvalidRequestError: no name is spelt so.
+        InvalidRequestError: the name is empty or has only dots.
     """
-    # Dots alone would be taken for a way up the path.
+    # A segment of dots only would be read as a parent folder.
     if not name or set(name) <= {"."}:
-        raise InvalidRequestError([FieldError(pointer="#", message="this is no name")])
+        raise InvalidRequestError(
+            [FieldError(pointer="#", message="a name must have a character other than a dot")]
+        )
     return quote(name, safe="")
 
 
@@ -123,17 +126,17 @@ def ask(
     fields: Mapping[str, Any],
     model: str | None = None,
 ) -> Call[AnswerT]:
-    """One question about one scene.
+    """Build one question about one scene.
 
     Args:
         path: the address of the question.
         form, answer: its schemas.
         scene: objects, a whole request, or its body as in the HTTP contract.
-        fields: further fields, where ``scene`` is objects.
-        model: asked where the request names none.
+        fields: further fields, if ``scene`` holds objects.
+        model: model of requests that name none.
 
     Raises:
-        InvalidRequestError: the service would refuse it.
+        InvalidRequestError: the request is malformed.
     """
     return Call("POST", path, answer, _json(_request(form, scene, fields, model)))
 
@@ -145,10 +148,10 @@ def ask_each(
     scenes: Iterable[Any],
     model: str | None = None,
 ) -> Call[T]:
-    """One question about many scenes, each as in `ask`; the answer is that of the batch.
+    """Build one question about many scenes, each as in `ask`; the answer is that of the batch.
 
     Raises:
-        InvalidRequestError: the service would refuse one of them.
+        InvalidRequestError: one of the requests is malformed.
     """
     requests = [
         _json(_request(form, scene, {}, model, ("scenes", place)))
@@ -162,10 +165,10 @@ def ask_each(
 
 
 def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
-    """Let an alias lead elsewhere.
+    """Build the call that points an alias at another target.
 
     Raises:
-        InvalidRequestError: the service would refuse it.
+        InvalidRequestError: the request is malformed.
     """
     return Call(
         "PUT",
@@ -173,13 +176,13 @@ def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
         AliasAnswer,
         _json(_validated(AliasRequest, dict(fields))),
         administers=True,
-        # A repeated move would fail on its own `expected`.
+        # A repeated call would fail on its own `expected`.
         repeatable=False,
     )
 
 
 def _json(request: BaseModel) -> str:
-    # Fields that were not set are left out: an older service may not know them.
+    # Unset fields are left out, because an older service may reject them.
     return request.model_dump_json(exclude_unset=True)
 
 
@@ -193,7 +196,7 @@ def _request(
     if isinstance(scene, SceneRequest | Mapping):
         if fields:
             names = ", ".join(fields)
-            message = f"stands beside a whole request, which has its own place for it: {names}"
+            message = f"fields beside a whole request must be in the request: {names}"
             raise InvalidRequestError([FieldError(pointer="#", message=message)])
         given = _plain(scene)
     else:
@@ -204,7 +207,7 @@ def _request(
     return _validated(kind, spelt_out, at)
 
 
-# The short forms: which members a tuple stands for.
+# Short forms: the members for which a tuple stands.
 _TUPLES: Final = {
     "relations": ("subject", "relation", "object"),
     "pairs": ("subject", "object"),
@@ -213,7 +216,7 @@ _TUPLES: Final = {
 
 
 def _spelt_out(name: str, value: Any) -> Any:
-    """A field's value as in the HTTP contract, as far as it can be read so."""
+    """Return a field's value as in the HTTP contract, if it has a known short form."""
     members = _TUPLES.get(name, ())
     if name == "at":
         return _member(value, members)

@@ -1,8 +1,8 @@
-"""``scene``: the questions on the command line, for people and for scripts.
+"""The command ``scene``: the questions on the command line, for people and scripts.
 
-Exit status: 0, answered; 1, the service refused the request; 2, the command makes no sense; 3, no
-service there; 4, no answer in time; 5, the service is busy or not ready; 6, anything else. What is
-wrong goes to standard error.
+Exit status: 0, answered; 1, the service refused the request; 2, wrong usage; 3, the service cannot
+be reached; 4, no answer in time; 5, the service is busy or not ready; 6, any other error. Error
+messages go to standard error.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from scene_client.vision_msgs import from_message, is_message
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
 
 MAX_FILE: Final = 64 * 2**20
-"""Bytes of a scene file; no service takes more."""
+"""Maximum size of a scene file in bytes; larger ones exceed the limit of every service."""
 
 _FLAGS: Final = ("--json",)
 _VALUED: Final = ("--url", "--model", "--offline", "--timeout")
@@ -48,10 +48,10 @@ _RELATIONS: Final = get_args(RelationName)
 
 
 class _Group(TyperGroup):
-    """A command whose own options may stand after the question, too."""
+    """A command whose own options may also follow the subcommand."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Bring them to the front."""
+        """Move the command's own options to the front."""
         own, others = [], []
         given = iter(args)
         for word in given:
@@ -73,15 +73,15 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Ask what is missing from a scene, what does not belong, and how things stand.",
-    epilog="The options above may stand anywhere. Exit status: 1 refused, 2 wrong usage, 3 no "
-    "service, 4 too late, 5 busy or not ready, 6 anything else.",
+    help="Ask which objects are missing from a scene, which do not belong, and how they relate.",
+    epilog="The options above may also follow the subcommand. Exit status: 1 refused, 2 wrong "
+    "usage, 3 no service, 4 too late, 5 busy or not ready, 6 any other error.",
 )
 
 
 @dataclass(frozen=True)
 class Asked:
-    """The options that hold for every question."""
+    """The options of every question."""
 
     url: str
     model: str | None
@@ -90,7 +90,7 @@ class Asked:
     as_json: bool
 
     def ask(self, question: Callable[[Client], T]) -> T:
-        """The answer of the service, or of the store; an error ends the program."""
+        """Return the answer of the service or the store; an error ends the program."""
         with _failing(), self._client() as client:
             return question(client)
 
@@ -104,14 +104,14 @@ class Asked:
     def show(
         self, question: Callable[[Client], AnswerT], table: Callable[[AnswerT], RenderableType]
     ) -> AnswerT:
-        """Ask, and print the answer: as JSON, or as a table with colours on a terminal."""
+        """Ask, and print the answer as JSON or as a table; terminals get colours."""
         answer = self.ask(question)
         if self.as_json:
             print(answer.model_dump_json(exclude_none=True))
             return answer
         console = Console(markup=False, highlight=False, emoji=False)
         if not console.is_terminal:
-            # A program reads on: nothing is cut or wrapped.
+            # For programs, the table is neither cut nor wrapped.
             console.width = 10_000
         console.print(table(answer))
         for note in tables.notes(answer):
@@ -129,23 +129,23 @@ def _version(wanted: bool) -> None:
 def main(
     context: typer.Context,
     url: Annotated[
-        str, typer.Option(envvar="SCENE_URL", help="Where the service is.")
+        str, typer.Option(envvar="SCENE_URL", help="Address of the service.")
     ] = "http://127.0.0.1:8000",
     model: Annotated[
         str | None, typer.Option(help="An alias, a name, or name@version.", show_default="default")
     ] = None,
     offline: Annotated[
         Path | None,
-        typer.Option(metavar="STORE", help="Answer here, from this model store, with no service."),
+        typer.Option(metavar="STORE", help="Answer from this model store, without a service."),
     ] = None,
-    timeout: Annotated[float, typer.Option(help="Seconds for all of it.")] = 10.0,
+    timeout: Annotated[float, typer.Option(help="Seconds for the whole call.")] = 10.0,
     json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")] = False,
-    version: Annotated[  # noqa: ARG001 — its callback has done all there is to do
+    version: Annotated[  # noqa: ARG001 — the callback handles it
         bool,
         typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
-    """Keep the options that hold for every question."""
+    """Store the options of every question."""
     context.obj = Asked(url, model, offline, timeout, json)
 
 
@@ -155,24 +155,26 @@ Things = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="LABEL... | SCENE.json | -",
-        help="Labels; or a file with a request as in the HTTP contract, or with detections as "
-        "rosbridge writes them; or - to read it.",
+        help="Labels, or a file, or - for standard input. A file holds a request as in the HTTP "
+        "contract, or detections as rosbridge writes them.",
         show_default=False,
     ),
 ]
 Stated = Annotated[
     list[str] | None,
-    typer.Option("--relation", help='What holds, as in "lamp on-top desk"; repeatable.'),
+    typer.Option(
+        "--relation", help='A relation that holds, such as "lamp on-top desk"; repeatable.'
+    ),
 ]
-Room = Annotated[str | None, typer.Option("--room", help="The type of the room.")]
-TopK = Annotated[int | None, typer.Option("--top-k", help="How many at most.")]
+Room = Annotated[str | None, typer.Option("--room", help="Type of the room.")]
+TopK = Annotated[int | None, typer.Option("--top-k", help="Maximum number of results.")]
 Unknown = Annotated[
-    bool, typer.Option("--ignore-unknown", help="Answer without labels the model does not know.")
+    bool, typer.Option("--ignore-unknown", help="Leave out labels that the model does not know.")
 ]
 UnknownChoice = Annotated[
     UnknownLabels | None,
     typer.Option(
-        "--unknown-labels", help="Refuse them, ignore them, or take the nearest class of each."
+        "--unknown-labels", help="Unknown labels: refuse, ignore, or use the nearest class."
     ),
 ]
 
@@ -185,15 +187,15 @@ def relations(
     room: Room = None,
     top_k: TopK = None,
     min_probability: Annotated[
-        float | None, typer.Option(help="Leave out what is less likely.")
+        float | None, typer.Option(help="Leave out relations with a lower probability.")
     ] = None,
     opposites: Annotated[
-        bool, typer.Option("--opposites", help="Also right, behind, under and below.")
+        bool, typer.Option("--opposites", help="Also list right, behind, under and below.")
     ] = False,
     ignore_unknown: Unknown = False,
     unknown_labels: UnknownChoice = None,
 ) -> None:
-    """How do these objects stand to each other?"""
+    """List the likely spatial relations between the objects."""
     scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
     request = scene | _named(
         top_k=top_k,
@@ -209,11 +211,13 @@ def missing(
     context: typer.Context,
     things: Things = None,
     coverage: Annotated[
-        float | None, typer.Option(help="Share of what is there that is listed, 0 to 1.")
+        float | None, typer.Option(help="Probability that a present object is listed, 0 to 1.")
     ] = None,
-    at: Annotated[str | None, typer.Option(help='At this place, as in "on-top desk".')] = None,
+    at: Annotated[
+        str | None, typer.Option(help='Only objects at this place, such as "on-top desk".')
+    ] = None,
     candidate: Annotated[
-        list[str] | None, typer.Option(help="Only this label; repeatable.")
+        list[str] | None, typer.Option(help="Only the class with this label; repeatable.")
     ] = None,
     relation: Stated = None,
     room: Room = None,
@@ -221,7 +225,7 @@ def missing(
     ignore_unknown: Unknown = False,
     unknown_labels: UnknownChoice = None,
 ) -> None:
-    """What else should be here, and where?"""
+    """List objects that the scene probably lacks, and their likely places."""
     scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
     request = scene | _named(
         top_k=top_k,
@@ -238,17 +242,17 @@ def outliers(
     context: typer.Context,
     things: Things = None,
     sensitivity: Annotated[
-        Sensitivity | None, typer.Option(help="How readily an alarm is raised.")
+        Sensitivity | None, typer.Option(help="Alarm rate: low, medium or high.")
     ] = None,
     threshold: Annotated[
-        float | None, typer.Option(help="An outlier from this probability on.")
+        float | None, typer.Option(help="Probability from which an object is an outlier.")
     ] = None,
     relation: Stated = None,
     room: Room = None,
     ignore_unknown: Unknown = False,
     unknown_labels: UnknownChoice = None,
 ) -> None:
-    """What does not belong here, or stands in the wrong place?"""
+    """List objects that do not fit the scene, and relations that are probably false."""
     scene = _scene(things, relation, room, ignore_unknown, unknown_labels)
     request = scene | _named(
         sensitivity=sensitivity,
@@ -262,10 +266,12 @@ def outliers(
 def generate(
     context: typer.Context,
     things: Things = None,
-    count: Annotated[int | None, typer.Option(help="How many scenes.")] = None,
-    seed: Annotated[int | None, typer.Option(help="The same draws the same.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Gibbs sweeps.")] = None,
-    temperature: Annotated[float | None, typer.Option(help="Above 1: more varied.")] = None,
+    count: Annotated[int | None, typer.Option(help="Number of scenes.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Random seed; an equal seed gives equal scenes.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Number of Gibbs sweeps.")] = None,
+    temperature: Annotated[float | None, typer.Option(help="Above 1: more varied scenes.")] = None,
     plot: Annotated[
         Path | None,
         typer.Option(help="Draw the scenes into this file (.png, .svg, .pdf).", dir_okay=False),
@@ -275,7 +281,7 @@ def generate(
     ignore_unknown: Unknown = False,
     unknown_labels: UnknownChoice = None,
 ) -> None:
-    """What would a scene like this look like?"""
+    """Sample scenes that contain the given objects."""
     asked: Asked = context.obj
     if plot is not None and find_spec("matplotlib") is None:
         _fail("--plot needs matplotlib: pip install matplotlib", MEANINGLESS)
@@ -288,7 +294,7 @@ def generate(
         try:
             draw(answer, plot)
         except (OSError, ValueError) as error:
-            _fail(f"no picture: {error}", MEANINGLESS)
+            _fail(f"the picture cannot be drawn: {error}", MEANINGLESS)
 
 
 # ------------------------------------------------------------------------------------- models
@@ -296,28 +302,28 @@ def generate(
 
 @app.command()
 def models(context: typer.Context) -> None:
-    """Which models there are."""
+    """List the models of the service."""
     asked: Asked = context.obj
     asked.show(Client.models, tables.models)
 
 
 @app.command()
 def vocabulary(context: typer.Context) -> None:
-    """The words of the model."""
+    """List the object classes and room types of the model."""
     asked: Asked = context.obj
     asked.show(Client.vocabulary, tables.vocabulary)
 
 
 @app.command()
 def contexts(context: typer.Context) -> None:
-    """What the hidden units of the model stand for."""
+    """List the hidden units of the model with their strongest classes."""
     asked: Asked = context.obj
     asked.show(Client.contexts, tables.contexts)
 
 
 @app.command()
 def ready(context: typer.Context) -> None:
-    """Whether the service answers; says nothing but by its exit status."""
+    """Check that the service is ready; the exit status is the only output."""
     asked: Asked = context.obj
     asked.ask(Client.check_ready)
 
@@ -332,14 +338,14 @@ def _scene(
     ignore_unknown: bool,
     unknown_labels: UnknownLabels | None,
 ) -> dict[str, Any]:
-    """The fields of a scene; options override the fields of a file."""
+    """Return the fields of a scene; options override the fields of a file."""
     if ignore_unknown and unknown_labels not in (None, "ignore"):
-        _fail("--ignore-unknown and --unknown-labels disagree", MEANINGLESS)
+        _fail("--ignore-unknown contradicts --unknown-labels", MEANINGLESS)
     if things is None:
-        _fail("name what is there: labels, a file that ends in .json, or - to read it", MEANINGLESS)
+        _fail("name the objects: labels, a file that ends in .json, or - for stdin", MEANINGLESS)
     files = [thing for thing in things if _is_file(thing)]
     if files and things != files[:1]:
-        _fail(f"{files[0]} must stand alone: it is a whole scene", MEANINGLESS)
+        _fail(f"{files[0]} must stand alone, because it is a whole scene", MEANINGLESS)
     scene = _read(files[0]) if files else {"objects": things}
     return scene | _named(
         relations=[_relation(text) for text in stated] if stated else None,
@@ -349,12 +355,12 @@ def _scene(
 
 
 def _named(**options: Any) -> dict[str, Any]:
-    """The options that the command line names."""
+    """Return the options that the command line gives."""
     return {name: value for name, value in options.items() if value is not None}
 
 
 def _is_file(thing: str) -> bool:
-    """Whether this names a scene, and no label: no label ends so, or holds a slash."""
+    """Return whether an argument is a file: labels never end in .json and never hold a slash."""
     return thing == "-" or thing.endswith(".json") or os.sep in thing
 
 
@@ -368,22 +374,22 @@ def _read(name: str) -> dict[str, Any]:
     except OSError as error:
         _fail(f"{name}: {error.strerror}", MEANINGLESS)
     if len(text) > MAX_FILE:
-        _fail(f"{name}: over {MAX_FILE} bytes", MEANINGLESS)
+        _fail(f"{name}: the file has more than {MAX_FILE} bytes", MEANINGLESS)
     try:
         scene = json.loads(text)
     except (ValueError, RecursionError) as error:
-        _fail(f"{name}: no JSON: {error}", MEANINGLESS)
+        _fail(f"{name}: not JSON: {error}", MEANINGLESS)
     if is_message(scene):
         return _detected(name, scene)
     if isinstance(scene, list):
         return {"objects": scene}
     if not isinstance(scene, dict):
-        _fail(f"{name}: neither a request nor a list of objects", MEANINGLESS)
+        _fail(f"{name}: the file is neither a request nor a list of objects", MEANINGLESS)
     return scene
 
 
 def _detected(name: str, message: Any) -> dict[str, Any]:
-    """The request of a message of detections, as rosbridge writes it."""
+    """Return the request for a message of detections from rosbridge."""
     try:
         fields = from_message(message)
     except MessageError as error:

@@ -1,9 +1,8 @@
-"""Where the service is, and connections on which a time limit holds for a whole call.
+"""Options of a client, and connections with a deadline for a whole call.
 
-httpx limits each wait on the socket: a server that sends a byte now and then could keep a client
-for any multiple of that. anyio cancels coroutines at a deadline; for blocking calls, every wait
-gets the rest of the call's time. (Only the system's resolution of names cannot be limited, for
-blocking calls.)
+httpx limits each wait on the socket. A server that sends single bytes could exceed that limit many
+times. For coroutines, anyio cancels the call at its deadline. For blocking calls, every wait gets
+the remaining time of the call. The name resolution of blocking calls has no limit.
 """
 
 from __future__ import annotations
@@ -26,25 +25,26 @@ from scene_client.errors import InvalidRequestError, UnreachableError
 from scene_client.schemas import FieldError
 
 MAX_TIMEOUT: Final = 600.0
-"""Seconds; the service takes no more."""
+"""Seconds; the limit of the service."""
 
 RETRIES: Final = 5
-"""Further attempts at most, as far as there is time for them."""
+"""Default for the maximum number of retries within the timeout."""
 
 MAX_CONNECTIONS: Final = 100
-"""At once; further calls wait for a free connection, within their own time."""
+"""Open connections at once; further calls wait for a free connection within their timeout."""
 
 KEEP_ALIVE: Final = 4.0
-"""Seconds that an idle connection is kept: uvicorn closes it after five, and a request that crosses
-with the closing is lost."""
+"""Seconds that an idle connection stays open.
+
+uvicorn closes it after five seconds. A request sent at that moment would be lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Arguments of `AsyncClient`, checked; ``url`` with the path that a proxy strips, if any.
+    """Checked arguments of `AsyncClient`; ``url`` includes a path prefix that a proxy strips.
 
     Raises:
-        InvalidRequestError: there is no service at such a URL, or no call takes so long.
+        InvalidRequestError: the URL, the timeout or the number of retries is invalid.
     """
 
     url: str
@@ -59,16 +59,16 @@ class Options:
         if parts.scheme not in {"http", "https"} or not parts.hostname:
             raise _refused("the URL must begin with http:// or https:// and name a host")
         if parts.query or parts.fragment:
-            raise _refused("the URL must end with its path")
+            raise _refused("the URL must not have a query or a fragment")
         if self.retries < 0:
             raise _refused("retries must not be negative")
         self.limit(self.timeout)
 
     def limit(self, timeout: float | None) -> float:
-        """The seconds that a call may take.
+        """Return the timeout of a call in seconds.
 
         Raises:
-            InvalidRequestError: no call takes so long, or so little.
+            InvalidRequestError: the timeout is out of range.
         """
         seconds = self.timeout if timeout is None else timeout
         if not 1e-3 <= seconds <= MAX_TIMEOUT:
@@ -76,27 +76,27 @@ class Options:
         return seconds
 
     def ssl_context(self) -> ssl.SSLContext:
-        """Trusted certificates: the system's bundle; none without encryption."""
+        """Return a context with the system's CA bundle for https, without certificates for http."""
         if urlsplit(self.url).scheme == "https":
             return httpx.create_ssl_context()
-        # Reading the bundle takes longer than a question.
+        # Loading the bundle takes longer than a question.
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 
     def address(self, call: Call[T]) -> str:
-        """The URL of a call."""
+        """Return the URL of a call."""
         return self.url.rstrip("/") + call.path
 
     def headers(self, call: Call[T], left: float) -> dict[str, str]:
-        """The headers of a call that has so many seconds left."""
+        """Return the headers of a call with `left` seconds remaining."""
         headers = {
             "Accept": "application/json",
-            # Not compressed: a small compressed body could unpack to any size.
+            # Uncompressed, because a small compressed body could unpack to any size.
             "Accept-Encoding": "identity",
             "X-Request-Timeout-Ms": str(max(1, int(left * 1e3))),
         }
         if call.body is not None:
             headers["Content-Type"] = "application/json"
-        # The admin key is sent to administrative routes only.
+        # Only administrative routes get the admin key.
         if call.administers and self.admin_key is not None:
             headers["X-Admin-Key"] = self.admin_key
         elif self.api_key is not None:
@@ -104,9 +104,9 @@ class Options:
         return headers
 
     def unreachable(self, error: Exception) -> UnreachableError:
-        """The error of a call whose connection failed so."""
+        """Return the error of a call whose connection failed with `error`."""
         parts = urlsplit(self.url)
-        # A name and a password may stand before the host.
+        # The URL may hold a user name and a password, which are left out.
         host = parts.netloc.rpartition("@")[2]
         return UnreachableError(f"{parts.scheme}://{host}: {str(error) or type(error).__name__}")
 
@@ -121,7 +121,7 @@ async_deadline = anyio.fail_after
 
 
 def async_transport(ssl_context: ssl.SSLContext) -> httpx.AsyncHTTPTransport:
-    """Pooled connections."""
+    """Return a transport with pooled connections."""
     limits = httpx.Limits(max_connections=MAX_CONNECTIONS, keepalive_expiry=KEEP_ALIVE)
     return httpx.AsyncHTTPTransport(verify=ssl_context, limits=limits)
 
@@ -130,7 +130,7 @@ def async_transport(ssl_context: ssl.SSLContext) -> httpx.AsyncHTTPTransport:
 
 
 class _Deadline(threading.local):
-    """Until when this thread may wait."""
+    """The end of this thread's waits, on the monotonic clock."""
 
     ends = float("inf")
 
@@ -140,7 +140,7 @@ _DEADLINE: Final = _Deadline()
 
 @contextmanager
 def deadline(seconds: float) -> Iterator[None]:
-    """Limit the waits of this thread on connections of `DeadlineTransport`, all together."""
+    """Limit the total time that this thread waits on connections of `DeadlineTransport`."""
     _DEADLINE.ends = monotonic() + seconds
     try:
         yield
@@ -149,15 +149,15 @@ def deadline(seconds: float) -> Iterator[None]:
 
 
 def _left(timeout: float | None) -> float:
-    """Seconds for the next wait.
+    """Return the seconds for the next wait.
 
     Raises:
-        httpcore.TimeoutException: nothing is left. (A wait for data that are there already would
-            succeed however short it was, and so for ever.)
+        httpcore.TimeoutException: the time is over. Without this error, waits for data that have
+            already arrived would always succeed.
     """
     left = _DEADLINE.ends - monotonic()
     if left <= 0:
-        raise httpcore.TimeoutException("the time of the whole call is over")
+        raise httpcore.TimeoutException("the timeout of the call has expired")
     return left if timeout is None else min(timeout, left)
 
 
@@ -224,7 +224,7 @@ class _Body(httpx.SyncByteStream):
 
 
 class DeadlineTransport(httpx.BaseTransport):
-    """Pooled connections whose waits end with `deadline`."""
+    """Pooled connections whose waits end at the `deadline`."""
 
     def __init__(self, ssl_context: ssl.SSLContext) -> None:
         self._pool = httpcore.ConnectionPool(
@@ -251,5 +251,5 @@ class DeadlineTransport(httpx.BaseTransport):
         return httpx.Response(response.status, headers=response.headers, stream=_Body(response))
 
     def close(self) -> None:
-        """Close every connection."""
+        """Close all connections."""
         self._pool.close()

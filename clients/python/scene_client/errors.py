@@ -1,4 +1,4 @@
-"""The errors of a call, and the error of a response."""
+"""The errors that a call raises."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from scene_client.schemas import Failure, FieldError, Problem
 
 
 class ClientError(Exception):
-    """A call that has no answer."""
+    """The call failed."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # As it is, not by calling its class again: pools of processes hand errors on.
+        # Restores the attributes without calling the class, so that process pools can pass errors
+        # on.
         return _restored, (type(self), self.args, self.__dict__)
 
 
 class InvalidRequestError(ClientError, ValueError):
-    """The service would refuse the request as malformed, so it was not sent.
+    """The request is malformed, so it was not sent.
 
     Attributes:
-        errors: what is wrong, and where in the request's body.
+        errors: the errors, with their places in the body of the request.
     """
 
     def __init__(self, errors: Sequence[FieldError]) -> None:
@@ -38,20 +39,20 @@ class ProblemError(ClientError):
     """The service answered with a problem (RFC 9457).
 
     Attributes:
-        type: stable path of the problem's page (``/problems/unknown-labels``); branch on it. What
-            is no problem document of the service, as of a proxy, is ``about:blank``.
-        status: HTTP status.
-        title: the same for every problem of a type.
-        detail: about this one.
-        errors: what is wrong with the request and where, with the nearest known names.
-        failures: what a refresh refused, and why.
-        request_id: to find it in the service's log; empty where none was sent.
-        retry_after: seconds after which the service wants to be asked again.
+            type: stable path of the problem's page (``/problems/unknown-labels``); branch on it.
+                ``about:blank`` if the answer is not from the service, for example from a proxy.
+            status: HTTP status.
+            title: text that all problems of a type share.
+            detail: text about this problem.
+            errors: the errors in the request, with their places and similar known names.
+            failures: entries of the store that a refresh refused, with reasons.
+            request_id: id of the request in the service's log; empty if the service sent none.
+            retry_after: seconds to wait before the next request.
     """
 
     def __init__(
         self,
-        type: str,  # noqa: A002 — the name that RFC 9457 gives it
+        type: str,  # noqa: A002 — the name in RFC 9457
         status: int,
         title: str,
         detail: str,
@@ -74,14 +75,14 @@ class ProblemError(ClientError):
 
 
 class UnreachableError(ClientError):
-    """No connection to the service, or one that broke; nothing of an answer came."""
+    """The connection failed or broke before an answer arrived."""
 
 
 class DeadlineError(ClientError):
-    """The call's time was over before its answer was there.
+    """The timeout expired before the answer arrived.
 
     Attributes:
-        request_id: where the service itself gave up; else empty.
+        request_id: id of the request if the service stopped it; else empty.
     """
 
     def __init__(self, message: str, request_id: str = "") -> None:
@@ -90,14 +91,14 @@ class DeadlineError(ClientError):
 
 
 class AnswerError(ClientError):
-    """The service succeeded, and its answer is none that this client can read."""
+    """The service succeeded, and the client cannot read its answer."""
 
 
 def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemError:
-    """The problem of a response other than 200.
+    """Return the problem of a response whose status is not 200.
 
     Args:
-        headers: by their names in lower case.
+        headers: headers with lower-case names.
     """
     retry_after = _seconds(headers.get("retry-after"))
     with suppress(ValidationError):
@@ -112,7 +113,7 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
             request_id=problem.request_id,
             retry_after=retry_after,
         )
-    # Of a proxy or another server: the wording of such an answer may change at any time.
+    # From a proxy or another server. Its text may change at any time, so it is left out.
     try:
         title = HTTPStatus(status).phrase
     except ValueError:
@@ -121,14 +122,14 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
         "about:blank",
         status,
         title,
-        "The answer is no problem document of the service.",
+        "The answer is not a problem document of the service.",
         request_id=headers.get("x-request-id", ""),
         retry_after=retry_after,
     )
 
 
 def _seconds(retry_after: str | None) -> float | None:
-    """Retry-After (RFC 9110, section 10.2.3) in seconds from now."""
+    """Return Retry-After (RFC 9110, section 10.2.3) in seconds from now."""
     if retry_after is None:
         return None
     if retry_after.isascii() and retry_after.isdigit():
@@ -148,7 +149,7 @@ def _restored(kind: type[ClientError], args: tuple[Any, ...], state: dict[str, A
 
 
 def _placed(error: FieldError) -> str:
-    # "#" is all of it: the place where a fault is that lies in no field, or not in the request.
+    # "#" means the whole body: the error has no field, or is not in the body.
     where = "" if error.pointer == "#" else f"{error.pointer}: "
     return where + _worded(error)
 

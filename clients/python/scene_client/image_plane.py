@@ -1,12 +1,14 @@
-"""Two boxes in an image: which one is left of the other, or above it, as the camera sees them.
+"""Relations of two boxes in an image: left of, or above, as the camera sees them.
 
-One rule for training on images and for detections without depth. Without depth there is no front,
-and no telling what rests on what; *above* in the image may be farther away on the floor. Offsets
-count in units of the boxes, as an image has no metres: boxes are neighbours if the gap between them
-is at most the mean of their diagonals, the larger offset between the centres decides (sideways if
-they are equal), and offsets under 10 % of that mean decide nothing.
+Training on images and detections without depth use the same rule. Without depth, front and support
+are unknown, and an object that is *above* in the image may be farther away on the floor.
 
-Plain Python: a client has no arrays.
+An image has no metres, so the unit is the mean of the two boxes' diagonals. Boxes are neighbours if
+the gap between them is at most one unit. The larger offset between the centres decides the
+relation; at equal offsets the sideways one decides. Offsets under 10 % of the unit give no
+relation.
+
+Plain Python, because a client has no arrays.
 """
 
 from __future__ import annotations
@@ -16,36 +18,36 @@ from collections.abc import Sequence
 from typing import Final, Literal, TypeAlias
 
 Box: TypeAlias = tuple[float, float, float, float]
-"""(xmin, ymin, xmax, ymax), y downwards; one with NaN is unseen and has no neighbour."""
+"""(xmin, ymin, xmax, ymax), y downwards; a box with NaN is unseen and has no neighbour."""
 
 MIN_OFFSET: Final = 0.10  # of the mean diagonal
 
 
 def are_neighbours(box: Box, other: Box) -> bool:
-    """Whether two boxes are near enough for their relation to mean something."""
+    """Return whether two boxes are close enough for a relation."""
     across = max(box[0] - other[2], other[0] - box[2], 0.0)
     down = max(box[1] - other[3], other[1] - box[3], 0.0)
     return math.hypot(across, down) <= _unit(box, other)
 
 
 def relation_between(box: Box, other: Box) -> Literal["left", "right", "above", "below"] | None:
-    """How a box stands to its neighbour; None where their centres are too near each other."""
+    """Return the relation of a box to its neighbour; None if the centres are too close."""
     across = (box[0] + box[2]) / 2 - (other[0] + other[2]) / 2
     down = (box[1] + box[3]) / 2 - (other[1] + other[3]) / 2
     if not max(abs(across), abs(down)) >= MIN_OFFSET * _unit(box, other):
         return None
-    # Boxes without extent have no unit, and a centre of their own need not differ from another's.
+    # Boxes without extent have a unit of 0, and their centres may be equal.
     if abs(across) >= abs(down):
         return "left" if across < 0 else "right" if across > 0 else None
     return "above" if down < 0 else "below"
 
 
 def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[int, int]]:
-    """Pairs of neighbours, the left one first, those of boxes that come early in ``order`` first.
+    """Return pairs of neighbours, left one first; boxes early in ``order`` give the first pairs.
 
     Args:
-        boxes: None for things without a box.
-        order: places in ``boxes``.
+        boxes: boxes of the objects; None for objects without a box.
+        order: positions in ``boxes``.
     """
     found = []
     for rank, i in enumerate(order):
@@ -62,7 +64,7 @@ def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[
 
 
 def upright_box(centre: tuple[float, float], size: tuple[float, float], theta: float) -> Box:
-    """The upright box around a box that is turned by ``theta`` radians."""
+    """Return the upright box around a box that is rotated by ``theta`` radians."""
     cos, sin = abs(math.cos(theta)), abs(math.sin(theta))
     across = (cos * size[0] + sin * size[1]) / 2
     down = (sin * size[0] + cos * size[1]) / 2
@@ -70,7 +72,7 @@ def upright_box(centre: tuple[float, float], size: tuple[float, float], theta: f
 
 
 def _unit(box: Box, other: Box) -> float:
-    """The mean of the diagonals."""
+    """Return the mean of the diagonals."""
     return (_diagonal(box) + _diagonal(other)) / 2
 
 

@@ -1,4 +1,4 @@
-"""The client of programs that have a model store and no service."""
+"""A client that answers from a model store, without a running service."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from scene_client.sync import Client
 
 
 class OfflineClient(Client):
-    """Answers in this process, from a model store; the same answers and problems as a service's.
+    """Answer in this process from a model store, with the same answers and problems as a service.
 
-    It needs the service's packages (`pip install '.[service]'` in the repository) and loads them,
-    and every model of the store, when it is made.
+    It needs the service's packages (`pip install '.[service]'` in the repository). The constructor
+    loads the packages and every model of the store.
 
     Args:
         store: directory of published models.
         timeout: seconds for a whole call.
-        model: asked where a request names none; left out, the store's default.
+        model: model of requests that name none; default: the store's default model.
 
     Raises:
         ImportError: the service's packages are not installed.
@@ -26,12 +26,12 @@ class OfflineClient(Client):
     def __init__(
         self, store: str | Path = "model_store", *, timeout: float = 10.0, model: str | None = None
     ) -> None:
-        # Not before somebody asks for it: a robot that asks a service has no such packages.
+        # Imported here, because clients of a running service do not have these packages.
         try:
             from app.in_process import InProcess
         except ImportError as error:
             raise ImportError(
-                f"answers without a service need its packages ({error}): "
+                f"offline answers need the service's packages ({error}): "
                 "pip install '.[service]' in the repository"
             ) from error
 

@@ -1,8 +1,8 @@
-"""Pictures of generated scenes, in which relations can be seen and no two objects overlap.
+"""Pictures of generated scenes, which show relations and have no overlapping objects.
 
-Seen from the robot: left is left, near is below, and what lies on something is drawn above it. Of
-relations that cannot all be drawn the first ones are. Needs matplotlib, which comes with the group
-`training`.
+The view is that of the robot: left is left, near is below, and supported objects are drawn above
+their support. If relations contradict each other, the first ones are drawn. The module needs
+matplotlib, which comes with the group `training`.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from scene_client.schemas import GenerateAnswer, GeneratedScene, Relation
 
 HEIGHT: Final = 1.0
 GAP: Final = 0.6
-"""Between objects side by side, and between a hovering object and the one below it."""
+"""Gap between objects side by side, and between a hovering object and the object below it."""
 
-# Told apart by more than their colour: each has its own dashes. On-top is drawn as lying on top.
+# Each relation has its own dashes besides its colour. On-top has no line: the boxes touch.
 _STYLES: Final = {
     "left": ("#1f5fa8", "-"),
     "front": ("#b34700", "--"),
     "above": ("#2d7a2d", ":"),
 }
-# Of a unit of the layout, in inches: labels in this size of type fit their boxes.
+# Inches per unit of the layout; labels of `_POINTS` points then fit their boxes.
 _UNIT: Final = 0.32
 _POINTS: Final = 7
-# Around each scene, in units: its title above, its legend below.
+# Units around each scene, for its title above and its legend below.
 _MARGIN: Final = 4.0
 _MAX_PIXELS: Final = 6000
 
 
 def draw(answer: GenerateAnswer, path: Path) -> None:
-    """Write a picture of every scene; the ending of ``path`` says in which format.
+    """Write a picture of every scene; the suffix of ``path`` selects the format.
 
     Raises:
-        ValueError: matplotlib knows no such format.
+        ValueError: matplotlib does not support the format.
         OSError: the file cannot be written.
     """
     boxes = [arrange(scene.objects, scene.relations) for scene in answer.scenes]
@@ -79,7 +79,7 @@ def _draw(axes: Axes, scene: GeneratedScene, boxes: list[Box]) -> None:
             )
         )
         middle = (box.x + box.width / 2, box.y + box.height / 2)
-        # A dollar sign would begin mathematics.
+        # A dollar sign would start a formula.
         text = box.label.replace("$", r"\$")
         axes.text(*middle, text, ha="center", va="center", fontsize=_POINTS, zorder=3)
     named = {box.label: box for box in boxes}
@@ -116,13 +116,13 @@ def _join(axes: Axes, subject: Box, object: Box, relation: str) -> None:
 
 # ------------------------------------------------------------------------------------ layout
 
-# Each opposite as the relation that is drawn, whose subject and object change places.
+# Each opposite relation, and the drawn relation with subject and object exchanged.
 _OPPOSITES: Final = {"right": "left", "behind": "front", "under": "on-top", "below": "above"}
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Where one object is drawn: its lower left corner and its extents."""
+    """The drawing of one object: its label, its lower left corner and its extents."""
 
     label: str
     x: float
@@ -132,7 +132,7 @@ class Box:
 
 
 def extent(boxes: Sequence[Box]) -> tuple[float, float]:
-    """How far boxes reach to the right and up."""
+    """Return the right and the upper end of all boxes."""
     right = max((box.x + box.width for box in boxes), default=0.0)
     return right, max((box.y + box.height for box in boxes), default=0.0)
 
@@ -144,7 +144,7 @@ class _Order:
         self._before: dict[str, set[str]] = {name: set() for name in names}
 
     def add(self, first: str, second: str) -> None:
-        """``first`` comes before ``second``, unless that closes a cycle."""
+        """Put ``first`` before ``second``, unless this closes a cycle."""
         if second == first or second in self._before[first]:
             return
         earlier = {first} | self._before[first]
@@ -153,7 +153,7 @@ class _Order:
                 before |= earlier
 
     def ranks(self) -> dict[str, int]:
-        """How many must come before each, one after the other."""
+        """Return the length of the longest chain of predecessors of each object."""
         ranks: dict[str, int] = {}
         for name in sorted(self._before, key=lambda name: len(self._before[name])):
             ranks[name] = max((ranks[other] + 1 for other in self._before[name]), default=0)
@@ -161,11 +161,11 @@ class _Order:
 
 
 def arrange(objects: Sequence[str], relations: Iterable[Relation]) -> list[Box]:
-    """A box for each object, in no particular order; the lower left corner of all is (0, 0).
+    """Return a box for each object, in any order; the lower left corner of all is (0, 0).
 
     Args:
-        objects: names, each once.
-        relations: between them.
+        objects: names, without duplicates.
+        relations: relations between the objects.
     """
     stated = [_drawn(relation) for relation in relations]
     stated = [(a, name, b) for a, name, b in stated if a != b and a in objects and b in objects]
@@ -202,7 +202,7 @@ def _drawn(relation: Relation) -> tuple[str, str, str]:
 
 
 def _supporters(stated: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
-    """The object that each object stands on or hovers above; none stands on itself."""
+    """Return the object below each object that stands or hovers; cycles are left out."""
     below: dict[str, tuple[str, str]] = {}
     for wanted in ("on-top", "above"):
         for subject, relation, object in stated:
@@ -218,7 +218,7 @@ def _root(name: str, below: dict[str, tuple[str, str]]) -> str:
 
 
 def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
-    """An object from (0, 0) on, and above it, side by side, everything that is on it."""
+    """Return the boxes of an object at (0, 0) and of all objects above it, side by side."""
     boxes: list[Box] = []
     x = 0.0
     for other, (supporter, relation) in below.items():
@@ -231,7 +231,7 @@ def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
 
 
 def _shelved(piles: Sequence[list[Box]]) -> list[Box]:
-    """Piles that nothing sets apart, on shelves of about as many as there are shelves."""
+    """Arrange piles without an order on shelves; the number per shelf equals that of shelves."""
     boxes: list[Box] = []
     length = ceil(sqrt(len(piles)))
     y = 0.0
@@ -249,7 +249,7 @@ def _shelved(piles: Sequence[list[Box]]) -> list[Box]:
 def _widest(
     cells: dict[tuple[int, int], list[Box]], axis: int
 ) -> list[tuple[tuple[int, int], list[Box]]]:
-    """The cells from narrow to wide (or low to high), so that the last of a column decides."""
+    """Return the cells from narrow to wide (or low to high), so that the widest comes last."""
     return sorted(cells.items(), key=lambda cell: extent(cell[1])[axis])
 
 
@@ -258,7 +258,7 @@ def _moved(boxes: Iterable[Box], x: float, y: float) -> list[Box]:
 
 
 def _offsets(extents: dict[int, float]) -> dict[int, float]:
-    """Where each column (or row) begins."""
+    """Return the start of each column (or row)."""
     offsets: dict[int, float] = {}
     at = 0.0
     for rank in sorted(extents):

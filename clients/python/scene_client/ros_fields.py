@@ -1,11 +1,11 @@
-"""Reading ROS messages in either form: as JSON by rosbridge, or as Python objects.
+"""Read ROS messages in two forms: JSON from rosbridge, or Python objects.
 
-rclpy and the readers of bags give objects with attributes, rosbridge gives dictionaries in which
-NaN and infinity are null. A field that is not there, or not of its kind, is None here: what
-follows from that is the reader's decision.
+rclpy and bag readers give objects with attributes. rosbridge gives dictionaries in which NaN and
+infinity are null. A field that is missing or has the wrong type is None here, and the caller
+decides what follows.
 
-Detectors report classes as text, and many of them as numbers in text ("56"). A label map says what
-a number means: a mapping, a list in the order of the numbers, a vision_msgs/LabelInfo message, or
+Detectors report classes as text, and often as numbers in text ("56"). A label map gives the label
+of each number: a mapping, a list in the order of the numbers, a vision_msgs/LabelInfo message, or
 the name of a well-known list.
 """
 
@@ -18,15 +18,16 @@ from typing import Any, Final, TypeAlias
 
 
 class MessageError(ValueError):
-    """A message, or what was said about it, that no scene can be made of."""
+    """No scene can be made of a message, or an argument is wrong."""
 
 
 def take(message: Any, *path: str) -> Any:
-    """The field at the end of a path of names; None where the path breaks off."""
+    """Return the field at the end of a path of names; None if a part of the path is missing."""
     for name in path:
         if message is None:
             return None
-        # A message has hundreds of fields, and to ask an abstract class takes longer than a field.
+        # A message has hundreds of fields. The check of the abstract class takes longer than a
+        # field.
         if type(message) is dict or isinstance(message, Mapping):
             message = message.get(name)
         else:
@@ -35,15 +36,15 @@ def take(message: Any, *path: str) -> Any:
 
 
 def has(message: Any, name: str) -> bool:
-    """Whether a message has a field, be it null."""
+    """Return whether a message has a field, which may be null."""
     return name in message if isinstance(message, Mapping) else hasattr(message, name)
 
 
 def items(field: Any, name: str) -> Sequence[Any]:
-    """The entries of a list of messages; none where the list was left out.
+    """Return the entries of a list of messages; empty if the list is missing.
 
     Raises:
-        MessageError: it is not a list.
+        MessageError: the field is not a list.
     """
     if field is None:
         return ()
@@ -53,7 +54,7 @@ def items(field: Any, name: str) -> Sequence[Any]:
 
 
 def number(field: Any) -> float | None:
-    """A finite number, or None."""
+    """Return a finite number, or None."""
     if type(field) is not float:
         if isinstance(field, bool) or not isinstance(field, Real):
             return None
@@ -65,19 +66,19 @@ def number(field: Any) -> float | None:
 
 
 def integer(field: Any) -> int | None:
-    """A whole number, or None."""
+    """Return a whole number, or None."""
     value = number(field)
     return int(value) if value is not None and value.is_integer() else None
 
 
 def numbers(message: Any, names: str) -> tuple[float, ...] | None:
-    """The fields called by the letters of ``names``, all finite; else None."""
+    """Return the fields named by the letters of ``names``; None unless all are finite."""
     values = [number(take(message, name)) for name in names]
     return None if None in values else tuple(value for value in values if value is not None)
 
 
 def text(field: Any) -> str:
-    """Text without surrounding blanks; numbers as they are written; other values are empty."""
+    """Return text without surrounding blanks, a whole number as text, or "" for other values."""
     if isinstance(field, str):
         return field.strip()
     whole = integer(field)
@@ -85,19 +86,19 @@ def text(field: Any) -> str:
 
 
 def is_plain(value: str, longest: int) -> bool:
-    """Whether the service takes a text as a name or a label."""
+    """Return whether the service accepts a text as a name or a label."""
     return 0 < len(value) <= longest and value.isprintable()
 
 
 def frame_of(header: Any) -> str:
-    """The frame of a header; empty where it names none."""
+    """Return the frame of a header; empty without a frame."""
     frame = take(header, "frame_id")
-    # tf2 knows no leading slash; older drivers still send one.
+    # tf2 has no leading slashes, but older drivers still send them.
     return frame.strip().lstrip("/") if isinstance(frame, str) else ""
 
 
 def time_of(stamp: Any) -> dict[str, int] | None:
-    """A time of ROS 2, or of ROS 1, as the service takes it; None where it is no valid time."""
+    """Return a time of ROS 2 or ROS 1 as in a request; None if it is invalid."""
     seconds = integer(take(stamp, "sec"))
     seconds = integer(take(stamp, "secs")) if seconds is None else seconds
     rest = integer(take(stamp, "nanosec"))
@@ -126,20 +127,20 @@ COCO: Final = (
     *("refrigerator", "book", "clock", "vase", "scissors", "teddy bear", "hair drier"),
     "toothbrush",
 )
-"""The 80 classes of COCO's boxes as most detectors number them: without gaps, from 0."""
+"""The 80 box classes of COCO in the usual numbering of detectors: from 0, without gaps."""
 
 _WELL_KNOWN: Final = {"coco": COCO}
 
 
 def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
-    """Class id, as text, to label; a class that is mapped to None is left out of scenes.
+    """Return labels by class id (as text); classes mapped to None are left out of scenes.
 
     Args:
         label_map: a mapping from class ids (text or numbers); labels in the order of the numbers;
             a vision_msgs/LabelInfo, as a message or as JSON; "coco"; or None, an empty map.
 
     Raises:
-        MessageError: none of these.
+        MessageError: `label_map` has another form.
     """
     if label_map is None:
         return {}

@@ -35,18 +35,19 @@ Objects = Sequence[str | dict[str, Any] | Detection]
 
 _PATH: Final = "/stream"
 _MAX_EVENT: Final = 64 * 2**20
-# Of connections that broke, and of services that end or fail; others would close it again.
+# Codes of broken connections and of services that stop or fail. After other codes, a new connection
+# would be closed again.
 _TRANSIENT: Final = frozenset({1001, 1006, 1011, 1012, 1013})
 _FIRST_PAUSE: Final = 0.1
 _LONGEST_PAUSE: Final = 5.0
 
 
 class StreamProblemError(ClientError):
-    """The service refused a message; the stream goes on.
+    """The service refused a message; the stream stays open.
 
     Attributes:
-        problem: branch on its `type`.
-        seq: of the message, where it has one.
+        problem: the problem; branch on its `type`.
+        seq: number of the refused message, if it has one.
     """
 
     def __init__(self, message: ProblemMessage) -> None:
@@ -59,8 +60,8 @@ class StreamClosedError(ClientError):
     """The stream has ended.
 
     Attributes:
-        code: of the close (RFC 6455, section 7.4); 1006 where the connection broke.
-        reason: a word, where the service gave one: `draining`, `stream-idle`.
+        code: close code (RFC 6455, section 7.4); 1006 if the connection broke.
+        reason: reason of the service in one word, if given: `draining`, `stream-idle`.
     """
 
     def __init__(self, code: int, reason: str) -> None:
@@ -70,27 +71,27 @@ class StreamClosedError(ClientError):
 
 
 class StreamClient:
-    """One stream: send changes of the scene, iterate over the newest answers.
+    """A stream: send changes of the scene, and iterate over the newest answers.
 
         async with StreamClient("http://127.0.0.1:8000", room_type="bedroom") as scene:
             await scene.update(objects=["bed", {"id": "lamp_1", "label": "lamp"}])
             async for answer in scene:
                 print(answer.missing.missing[0].label)
 
-    The client keeps the scene. Where the connection breaks, the iteration connects again and sends
-    the whole scene. `StreamProblemError` can be caught, and the iteration begun again.
+    The client keeps the scene. If the connection breaks, the iteration reconnects and sends the
+    whole scene. After a `StreamProblemError`, the iteration can be started again.
 
     Args:
-        url: of the service, with http, https, ws or wss.
-        api_key: of a service that asks for one.
-        timeout: seconds for connecting, and for closing.
+        url: address of the service, with http, https, ws or wss.
+        api_key: API key, if the service requires one.
+        timeout: seconds for connecting and for closing.
         reconnect: seconds without an answer after which the client gives up a broken stream.
-        **fields: of the opening message: `model`, `ask`, `room_type`, `frame_id` and so on.
+        **fields: fields of the opening message: `model`, `ask`, `room_type`, `frame_id` and so on.
 
     Attributes:
-        seq: of the newest message.
-        limits: of the service.
-        answer: the newest; None before the first.
+        seq: number of the newest sent message.
+        limits: limits of the service.
+        answer: the newest answer; None before the first.
     """
 
     limits: StreamLimits
@@ -122,13 +123,13 @@ class StreamClient:
         self.answer: AnswerMessage | None = None
 
     async def __aenter__(self) -> Self:
-        """Connect and open.
+        """Connect and open the stream.
 
         Raises:
             UnreachableError: the service cannot be reached.
-            ProblemError: it refused the handshake.
-            StreamProblemError: it refused the opening.
-            StreamClosedError: it closed the stream.
+            ProblemError: the service refused the handshake.
+            StreamProblemError: the service refused the opening message.
+            StreamClosedError: the service closed the stream.
         """
         await self._connect()
         return self
@@ -147,12 +148,12 @@ class StreamClient:
     async def update(
         self, objects: Objects = (), *, remove: Sequence[str] = (), **fields: Any
     ) -> int:
-        """Send objects that were added, moved or changed, and removed; the message's number.
+        """Send added, changed and removed objects; return the number of the message.
 
         Args:
-            objects: each with an id, or its label for one.
-            remove: ids.
-            **fields: of the scene: `relations`, `room_type`, `stamp` and so on.
+            objects: objects with an id; without one, the label is the id.
+            remove: ids of removed objects.
+            **fields: fields of the scene: `relations`, `room_type`, `stamp` and so on.
 
         Raises:
             pydantic.ValidationError: the message is malformed and was not sent.
@@ -164,7 +165,7 @@ class StreamClient:
         return await self._next(Update(type="update", seq=self.seq + 1, objects=things, **fields))
 
     async def replace(self, objects: Objects, **fields: Any) -> int:
-        """Send a whole scene in place of the one before; the message's number.
+        """Send a whole scene that replaces the previous one; return the number of the message.
 
         Raises:
             pydantic.ValidationError, StreamClosedError: see `update`.
@@ -173,7 +174,7 @@ class StreamClient:
         return await self._next(Whole(type="scene", seq=self.seq + 1, objects=things, **fields))
 
     async def ping(self) -> None:
-        """Keep a quiet stream open.
+        """Keep an idle stream open.
 
         Raises:
             StreamClosedError: the stream has ended.
@@ -181,7 +182,7 @@ class StreamClient:
         await self._send(Ping(type="ping"))
 
     async def close(self) -> None:
-        """End the stream, and with it the iteration."""
+        """End the stream and the iteration."""
         self._ended = self._ended or StreamClosedError(1000, "")
         if self._connection is not None:
             await self._connection.close()
@@ -196,7 +197,7 @@ class StreamClient:
         return message.seq
 
     async def _send(self, message: BaseModel) -> bool:
-        """Send a message; False where the connection is broken."""
+        """Send a message; return False if the connection is broken."""
         if self._ended is not None:
             raise self._ended
         if self._connection is None:
@@ -215,17 +216,17 @@ class StreamClient:
     # -- receiving ------------------------------------------------------------------------------
 
     def __aiter__(self) -> Self:
-        """The answers as they come."""
+        """Iterate over the answers as they arrive."""
         return self
 
     async def __anext__(self) -> AnswerMessage:
-        """The next answer.
+        """Wait for the next answer.
 
         Raises:
             StreamProblemError: the service refused a message.
             StreamClosedError: the service ended the stream, or cannot be reached any more.
             ProblemError: the service refused a new connection.
-            StopAsyncIteration: the stream was closed from here.
+            StopAsyncIteration: `close` ended the stream.
         """
         if self._connection is None:
             raise RuntimeError("the stream is not open: use it with `async with`")
@@ -251,7 +252,7 @@ class StreamClient:
             if late or closed.code not in _TRANSIENT:
                 self._ended = closed
                 raise closed
-            # Many robots that lose one service do not come back at once.
+            # Random, so that many robots do not reconnect to one service at the same time.
             await asyncio.sleep(self._pause * random.uniform(0.5, 1.0))  # noqa: S311 # nosec B311
             self._pause = min(2 * self._pause, _LONGEST_PAUSE)
             try:
@@ -275,9 +276,9 @@ class StreamClient:
             if isinstance(opened, ProblemMessage):
                 raise StreamProblemError(opened)
             if not isinstance(opened, Opened):
-                raise TypeError(f"the stream was opened with {opened.type}")
+                raise TypeError(f"the service answered the opening with {opened.type}")
             sent = 0
-            while sent != self.seq:  # messages come while the scene is sent
+            while sent != self.seq:  # further messages may arrive while the scene is sent
                 sent = self.seq
                 self._merge(sent)
                 objects = list(self._scene.objects.values())
@@ -290,7 +291,7 @@ class StreamClient:
             raise
         self.limits = opened.limits
         self._connection = connection
-        if self._ended is not None:  # closed meanwhile
+        if self._ended is not None:  # `close` was called meanwhile
             await connection.close()
 
     async def _connected(self) -> ClientConnection:

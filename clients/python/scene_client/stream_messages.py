@@ -1,6 +1,6 @@
-"""Messages of ``GET /stream``: plain pydantic, shared by the service and its clients.
+"""Messages of ``GET /stream`` as pydantic models, which the service and its clients share.
 
-A client's messages are read as strictly as a request; docs/stream.md is the contract.
+A client's messages are validated as strictly as a request; docs/stream.md is the contract.
 """
 
 from __future__ import annotations
@@ -29,9 +29,12 @@ from scene_client.schemas import (
 )
 
 MAX_SEQ: Final = 2**53 - 1
-"""Every JSON reader keeps such a number as it is: a double holds it exactly."""
+"""A double holds this number exactly, so every JSON reader keeps it."""
 
-Seq = Annotated[int, Field(ge=1, le=MAX_SEQ, description="greater than in any message before")]
+Seq = Annotated[
+    int,
+    Field(ge=1, le=MAX_SEQ, description="number of the message, greater than in all earlier ones"),
+]
 
 # --------------------------------------------------------------------------------- from clients
 
@@ -51,41 +54,45 @@ class Ask(Request):
 
 
 class SceneMessage(SceneRequest):
-    """Fields of a scene; an object without an id has its label for one."""
+    """Fields of a scene; an object without an id has its label as id."""
 
     objects: list[SceneObject] = Field(default_factory=list, max_length=256)
-    ask: Annotated[Ask | None, Field(description="null: missing and outliers")] = None
+    ask: Annotated[Ask | None, Field(description="the questions; null: missing and outliers")] = (
+        None
+    )
     timeout_ms: Annotated[
         int | None,
-        Field(ge=1, le=600_000, description="an answer that has not begun by then is dropped"),
+        Field(ge=1, le=600_000, description="an answer that starts later is dropped"),
     ] = None
 
 
 class Open(SceneMessage):
-    """The first message; it may hold the scene."""
+    """The first message of a stream; it may contain the scene."""
 
     type: Literal["open"]
 
 
 class Whole(SceneMessage):
-    """A whole scene in place of the one before."""
+    """A whole scene that replaces the previous one."""
 
     type: Literal["scene"]
     seq: Seq
 
 
 class Update(SceneMessage):
-    """Objects added or replaced by id, and removed; fields that are given replace those before."""
+    """Objects that are added, replaced by id, or removed; given fields replace earlier values."""
 
     type: Literal["update"]
     seq: Seq
     remove: list[Name] = Field(
-        default_factory=list, max_length=256, description="ids; their relations go with them"
+        default_factory=list,
+        max_length=256,
+        description="ids of removed objects; their relations are removed too",
     )
 
 
 class Ping(Request):
-    """Asks for a pong, and keeps a quiet stream open."""
+    """A request for a pong, which keeps an idle stream open."""
 
     type: Literal["ping"]
 
@@ -98,25 +105,25 @@ COMMANDS: Final[dict[str, type[Command]]] = {
     "ping": Ping,
 }
 
-# A whole scene leaves these as they are unless it names them.
+# A whole scene keeps these fields unless it names them.
 _KEPT: Final = frozenset({"model", "unknown_labels", "ask", "timeout_ms"})
 _FIELDS: Final = frozenset(SceneMessage.model_fields) - {"objects", "seed"}
 
 
 @dataclass(frozen=True, slots=True)
 class MergedScene:
-    """A scene after some messages; the service and the client keep one each.
+    """A scene after several messages; the service and the client each keep one.
 
     Attributes:
-        objects: by id, in the order in which they came.
-        fields: the other fields of `SceneMessage`, as far as they were given.
+        objects: objects by id, in the order of their arrival.
+        fields: the other given fields of `SceneMessage`.
     """
 
     objects: Mapping[str, str | Detection] = field(default_factory=dict)
     fields: Mapping[str, Any] = field(default_factory=dict)
 
     def after(self, message: SceneMessage) -> MergedScene:
-        """The scene with a message merged into it; ids to remove may be unknown."""
+        """Return the scene with a message merged into it; unknown ids in `remove` are allowed."""
         objects, fields = dict(self.objects), dict(self.fields)
         if isinstance(message, Whole):
             objects = {}
@@ -136,7 +143,7 @@ class MergedScene:
 
 
 def object_id(thing: str | Detection) -> str:
-    """Its own id, or its label."""
+    """Return the id of an object, or its label without an id."""
     return thing if isinstance(thing, str) else thing.id or thing.label
 
 
@@ -149,38 +156,44 @@ class StreamLimits(Reply):
     max_message_bytes: int
     max_objects: int
     max_relations: int
-    timeout_ms: Annotated[int, Field(description="where the client names none")]
-    idle_seconds: Annotated[float, Field(description="without a message the stream is closed")]
+    timeout_ms: Annotated[int, Field(description="default timeout in milliseconds")]
+    idle_seconds: Annotated[
+        float, Field(description="seconds without a message until the stream closes")
+    ]
 
 
 class Opened(Reply):
     """The stream is open."""
 
     type: Literal["opened"] = "opened"
-    seq: Annotated[int, Field(description="0: no message is taken yet")] = 0
+    seq: Annotated[int, Field(description="0: no message has been accepted yet")] = 0
     request_id: str
     limits: StreamLimits
 
 
 class AnswerMessage(Reply):
-    """The answers about the newest scene, each as its route gives it."""
+    """The answers about the newest scene; each has the form of its route's answer."""
 
     type: Literal["answer"] = "answer"
-    seq: Annotated[int, Field(description="the newest message that it covers; 0: the opening")]
-    superseded: Annotated[int, Field(description="earlier messages without an answer of their own")]
+    seq: Annotated[int, Field(description="newest message covered by the answer; 0: the opening")]
+    superseded: Annotated[
+        int, Field(description="number of earlier messages without their own answer")
+    ]
     missing: MissingAnswer | None = None
     outliers: OutliersAnswer | None = None
     relations: RelationsAnswer | None = None
     problems: dict[str, Problem] = Field(
-        default_factory=dict, description="by question: why it has no answer"
+        default_factory=dict, description="problem of each question without an answer"
     )
 
 
 class ProblemMessage(Reply):
-    """A message was refused; the scene is as before."""
+    """A message was refused; the scene is unchanged."""
 
     type: Literal["problem"] = "problem"
-    seq: Annotated[int | None, Field(description="of the message, where it has one")] = None
+    seq: Annotated[
+        int | None, Field(description="number of the refused message, if it has one")
+    ] = None
     problem: Problem
 
 

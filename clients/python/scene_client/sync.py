@@ -1,5 +1,5 @@
 # Written by `make format` from asynchronous.py; do not edit.
-"""The client: `AsyncClient`, and `Client`, which is generated from it by `make format`."""
+"""The clients: `AsyncClient`, and `Client`, which `make format` generates from it."""
 
 from __future__ import annotations
 
@@ -41,34 +41,34 @@ from scene_client.schemas import (
 )
 
 MAX_ANSWER: Final = 256 * 2**20
-"""Bytes; a batch of 256 scenes with 4,096 relations each stays below."""
+"""Maximum size in bytes; the answer to 256 scenes with 4,096 relations each is smaller."""
 
 
 class Client:
-    """Asks a service.
+    """A client of the service.
 
-    `Client` waits for each answer, and threads may share one. The same methods of `AsyncClient`
-    are coroutines.
+    The methods of `Client` block until the answer arrives, and several threads may share one
+    client. The methods of `AsyncClient` are the same as coroutines.
 
     Args:
-        url: of the service.
-        timeout: seconds for a whole call, further attempts and the pauses between them included.
-        api_key: where the service asks for one.
-        admin_key: for `refresh` and `promote`.
-        model: asked where a request names none; left out, the service's default.
-        retries: further attempts at most, as far as there is time: after 429, 503 and broken
-            connections.
-        transport: what carries requests; by default pooled connections.
+        url: address of the service.
+        timeout: seconds for a whole call, including retries and the pauses between them.
+        api_key: API key, if the service requires one.
+        admin_key: key for `refresh` and `promote`.
+        model: model of requests that name none; default: the service's default model.
+        retries: maximum number of retries within the timeout, after status 429 or 503 and after
+            connection errors.
+        transport: transport of the requests; default: pooled connections.
 
-    Every question takes objects and the request's own fields, or a whole request alone, and
-    ``timeout`` for this one call.
+    The first argument of a question is the objects, and further fields follow by name. It may also
+    be a whole request without further fields. The argument ``timeout`` applies to one call.
 
     Raises:
-        InvalidRequestError: the service would refuse the request as malformed.
+        InvalidRequestError: the request is malformed, so it was not sent.
         ProblemError: the service answered with a problem.
-        DeadlineError: the time was over.
-        UnreachableError: there is no connection.
-        AnswerError: the answer cannot be read.
+        DeadlineError: the timeout has expired.
+        UnreachableError: the connection failed.
+        AnswerError: the client cannot read the answer.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Client:
         timeout: float | None = None,
         **fields: Unpack[RelationsFields],
     ) -> RelationsAnswer:
-        """How do these objects stand to each other?"""
+        """Return the likely spatial relations between the objects."""
         call = ask(
             "/relations", RelationsRequest, RelationsAnswer, objects, fields, self.options.model
         )
@@ -109,7 +109,7 @@ class Client:
         timeout: float | None = None,
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
-        """What else should be here, and where?"""
+        """Return classes that the scene probably lacks, and their likely places."""
         form, answer = MissingRequest, MissingAnswer
         call = ask("/missing", form, answer, objects, fields, self.options.model)
         return self._call(call, timeout)
@@ -121,7 +121,7 @@ class Client:
         timeout: float | None = None,
         **fields: Unpack[OutliersFields],
     ) -> OutliersAnswer:
-        """What does not belong here, or stands in the wrong place?"""
+        """Return how well each object fits the scene, and the relations that are probably false."""
         call = ask(
             "/outliers", OutliersRequest, OutliersAnswer, objects, fields, self.options.model
         )
@@ -134,7 +134,7 @@ class Client:
         timeout: float | None = None,
         **fields: Unpack[GenerateFields],
     ) -> GenerateAnswer:
-        """What would a scene like this look like?"""
+        """Return scenes sampled from the model that contain the given objects."""
         call = ask(
             "/generate", GenerateRequest, GenerateAnswer, objects, fields, self.options.model
         )
@@ -148,7 +148,7 @@ class Client:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
-        """As `relations`, for up to 256 scenes; what the model refuses spoils one entry only."""
+        """Like `relations`, for up to 256 scenes; a refused scene affects only its own entry."""
         form, answer = RelationsRequest, BatchAnswer[RelationsAnswer]
         call = ask_each("/relations", form, answer, scenes, self.options.model)
         return self._call(call, timeout)
@@ -159,7 +159,7 @@ class Client:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
-        """As `missing`, for up to 256 scenes; what the model refuses spoils one entry only."""
+        """Like `missing`, for up to 256 scenes; a refused scene affects only its own entry."""
         form, answer = MissingRequest, BatchAnswer[MissingAnswer]
         call = ask_each("/missing", form, answer, scenes, self.options.model)
         return self._call(call, timeout)
@@ -170,7 +170,7 @@ class Client:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
-        """As `outliers`, for up to 256 scenes; what the model refuses spoils one entry only."""
+        """Like `outliers`, for up to 256 scenes; a refused scene affects only its own entry."""
         form, answer = OutliersRequest, BatchAnswer[OutliersAnswer]
         call = ask_each("/outliers", form, answer, scenes, self.options.model)
         return self._call(call, timeout)
@@ -178,7 +178,7 @@ class Client:
     # --------------------------------------------------------------------------------- models
 
     def models(self, *, timeout: float | None = None) -> ModelList:
-        """Models, versions and aliases."""
+        """Return the models, their versions and the aliases."""
         return self._call(Call("GET", "/models", ModelList), timeout)
 
     @overload
@@ -190,7 +190,7 @@ class Client:
     def model(
         self, name: str, version: str | None = None, *, timeout: float | None = None
     ) -> ModelSummary | VersionDetails:
-        """The versions of a model, or all there is to know about one of them."""
+        """Return the versions of a model, or the details of one version."""
         path = f"/models/{segment(name)}"
         if version is None:
             return self._call(Call("GET", path, ModelSummary), timeout)
@@ -200,17 +200,17 @@ class Client:
     def vocabulary(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> VocabularyAnswer:
-        """The words of a model."""
+        """Return the object classes, relations and room types of a model."""
         path = f"/models/{segment(name or self.options.model or 'default')}/vocabulary"
         return self._call(Call("GET", path, VocabularyAnswer), timeout)
 
     def contexts(self, name: str | None = None, *, timeout: float | None = None) -> ContextsAnswer:
-        """The hidden units of a model by their strongest objects."""
+        """Return the hidden units of a model with their strongest objects."""
         path = f"/models/{segment(name or self.options.model or 'default')}/contexts"
         return self._call(Call("GET", path, ContextsAnswer), timeout)
 
     def refresh(self, *, timeout: float | None = None) -> RefreshAnswer:
-        """Let the service take over what its store holds now; needs the admin key."""
+        """Reload the model store in the service; requires the admin key."""
         call = Call("POST", "/models/refresh", RefreshAnswer, administers=True)
         return self._call(call, timeout)
 
@@ -222,32 +222,32 @@ class Client:
         timeout: float | None = None,
         **fields: Unpack[AliasFields],
     ) -> AliasAnswer:
-        """Let an alias lead to a model or a version of it; needs the admin key.
+        """Point an alias at a model or at one version of it; requires the admin key.
 
-        Not asked again after a broken connection, which may have broken after the alias moved.
+        The call is not repeated after a connection error, because the alias may have moved already.
 
         Args:
-            alias: ``default``, or any other.
-            model: ``name@version``, or ``name`` for its newest.
-            **fields: ``expected``: where it must lead now; None: it must not exist yet.
+            alias: ``default``, or any other alias.
+            model: ``name@version``, or ``name`` for the newest version.
+            **fields: ``expected``: the current target of the alias; None if the alias must be new.
         """
         return self._call(promote(alias, {"model": model, **fields}), timeout)
 
     # --------------------------------------------------------------------------------- health
 
     def is_live(self, *, timeout: float | None = None) -> bool:
-        """Whether the service answers at all; asked once."""
+        """Return whether the service answers; without retries."""
         return self._is("live", timeout)
 
     def is_ready(self, *, timeout: float | None = None) -> bool:
-        """Whether the service's default model answers; asked once."""
+        """Return whether the default model of the service is ready; without retries."""
         return self._is("ready", timeout)
 
     def check_ready(self, *, timeout: float | None = None) -> None:
-        """Return if the service's default model answers; asked once.
+        """Return if the default model of the service is ready, else raise; without retries.
 
         Raises:
-            UnreachableError, DeadlineError, ProblemError: it does not, and so.
+            UnreachableError, DeadlineError, ProblemError: the default model is not ready.
         """
         self._call(Call("GET", "/health/ready", Health), timeout, retries=0)
 
@@ -265,7 +265,7 @@ class Client:
     # ----------------------------------------------------------------------------------- a call
 
     def _call(self, call: Call[T], timeout: float | None, retries: int | None = None) -> T:
-        """The answer of a call, after as many attempts as its time allows."""
+        """Return the answer of a call, with retries as long as its time allows."""
         retries = self.options.retries if retries is None else retries
         limit = self.options.limit(timeout)
         ends = monotonic() + limit
@@ -282,13 +282,13 @@ class Client:
                 attempt += 1
                 time.sleep(pause)
             else:
-                # Reading takes time, too. The caller does not wait for a later answer.
+                # Reading takes time too; an answer after the deadline counts as late.
                 if monotonic() < ends:
                     return answer
         raise DeadlineError(f"No answer within {limit:g} s.")
 
     def _attempt(self, call: Call[T], left: float) -> T:
-        """The answer of a call that is sent once, and may take so many seconds."""
+        """Send a call once and return its answer; it may take `left` seconds."""
         options, body = self.options, bytearray()
         with deadline(left):
             try:
@@ -302,7 +302,7 @@ class Client:
                     for part in response.iter_bytes():
                         body += part
                         if len(body) > MAX_ANSWER:
-                            raise AnswerError("The answer is too long.")
+                            raise AnswerError("The answer is too long for this client.")
             except httpx.TimeoutException:
                 raise
             except httpx.TransportError as error:
@@ -312,7 +312,7 @@ class Client:
     # ------------------------------------------------------------------------------- lifetime
 
     def close(self) -> None:
-        """Close every connection."""
+        """Close all connections."""
         self._http.close()
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Answers as tables for people; programs ask for JSON."""
+"""Tables of answers for people; programs use the JSON output."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from scene_client.schemas import (
 )
 
 MOST_MISPLACED: Final = 10
-"""Rows at most: a dozen positions tell of a hundred relations."""
+"""Maximum number of rows: a dozen positions give a hundred relations."""
 
 
 def relations(answer: RelationsAnswer) -> RenderableType:
-    """Relations, best first, and stated relations that the model does not expect."""
+    """Return relations, best first, and observed relations that the model does not expect."""
     rows = [
         (
             entry.subject,
@@ -58,7 +58,7 @@ def relations(answer: RelationsAnswer) -> RenderableType:
 
 
 def missing(answer: MissingAnswer) -> RenderableType:
-    """Absent objects, likeliest first, with where they would stand and why."""
+    """Return absent objects, likeliest first, with likely places and reasons."""
     rows = [
         (
             entry.label,
@@ -73,7 +73,7 @@ def missing(answer: MissingAnswer) -> RenderableType:
 
 
 def outliers(answer: OutliersAnswer) -> RenderableType:
-    """Every object, least fitting first, with reasons, and the likely wrong relations."""
+    """Return objects, least fitting first, with reasons, and the relations likely to be false."""
     rows = [
         (
             entry.object,
@@ -108,7 +108,7 @@ def outliers(answer: OutliersAnswer) -> RenderableType:
 
 
 def notes(answer: BaseModel) -> list[str]:
-    """What an answer says of its scene: labels that were mapped, and warnings."""
+    """Return notes on the scene: mapped labels and warnings."""
     if not isinstance(answer, Answer):
         return []
     mapped = [
@@ -122,7 +122,7 @@ def notes(answer: BaseModel) -> list[str]:
 
 
 def generate(answer: GenerateAnswer) -> RenderableType:
-    """Drawn scenes."""
+    """Return the sampled scenes."""
     rows = [
         (
             str(number),
@@ -137,7 +137,7 @@ def generate(answer: GenerateAnswer) -> RenderableType:
 
 
 def models(answer: ModelList) -> RenderableType:
-    """Versions, the aliases that lead to them, and what cannot be used."""
+    """Return versions with their aliases, and entries of the store that cannot be used."""
     rows = [
         (
             f"{model.name}@{version.version}",
@@ -156,7 +156,7 @@ def models(answer: ModelList) -> RenderableType:
 
 
 def contexts(answer: ContextsAnswer) -> RenderableType:
-    """Hidden units by the classes that they favour."""
+    """Return hidden units with their strongest classes."""
     rows = [
         (layer, str(unit.unit), _weighted(unit.objects), _weighted(unit.room_types))
         for layer, units in answer.layers.items()
@@ -166,7 +166,7 @@ def contexts(answer: ContextsAnswer) -> RenderableType:
 
 
 def vocabulary(answer: VocabularyAnswer) -> RenderableType:
-    """Object classes and what else they are called."""
+    """Return object classes with their aliases."""
     rows = [
         (entry.label, ", ".join(entry.aliases), "structure" if entry.structure else "")
         for entry in answer.objects
@@ -179,7 +179,8 @@ def _table(*columns: str, rows: Iterable[Sequence[str]], title: str | None = Non
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     for column in columns:
         numbers = column.startswith("probability") or column in {"log-odds", "log score"}
-        # A drawn scene's objects fill lines; everything else is short, or has lines of its own.
+        # The objects of a sampled scene need wrapping; all other cells are short or have line
+        # breaks.
         width = 60 if column == "objects" else None
         table.add_column(column, justify="right" if numbers else "left", max_width=width)
     for row in rows:
@@ -193,7 +194,7 @@ def _share(probability: float) -> str:
 
 def _placement(placement: Placement) -> str:
     told = f"{placement.relation} {placement.object} {_share(placement.probability)}"
-    # A model that was trained without positions cannot say how far.
+    # A model without positions in training has no offset.
     offset = placement.offset
     if offset is None:
         return told

@@ -1,4 +1,4 @@
-"""Validation errors of a request, in words and with JSON pointers; for the service and its clients.
+"""Convert pydantic's errors to messages with JSON pointers, for the service and its clients.
 
 Pointers are URI fragments (RFC 6901, section 6).
 """
@@ -17,7 +17,7 @@ from scene_client import schemas
 from scene_client.schemas import OBJECT_TAGS, FieldError
 
 MAX_ERRORS: Final = 100
-"""Errors that are listed per request."""
+"""Maximum number of errors listed for a request."""
 
 _FIELDS: Final = sorted(
     {
@@ -27,7 +27,7 @@ _FIELDS: Final = sorted(
         for name in value.model_fields
     }
 )
-# Where pydantic's own words would puzzle a reader who does not write Python.
+# Plain messages in place of pydantic's messages about Python types.
 _MESSAGES: Final = {
     "extra_forbidden": "unknown field",
     "missing": "required",
@@ -36,8 +36,8 @@ _MESSAGES: Final = {
     "dict_type": "must be an object",
     "list_type": "must be an array",
 }
-# A pointer repeats member names of the request. Only short plain ones are repeated, so that a
-# request cannot choose the words of an error; a pointer to anything else stops at its parent.
+# A pointer repeats member names of the request only if they are short and plain, so that a request
+# cannot choose the text of an error. At any other name, the pointer stops at the parent.
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MARKS: Final = frozenset({*OBJECT_TAGS, "[key]"})
 
@@ -49,16 +49,16 @@ def field_errors(
     at: tuple[str | int, ...] = (),
     skip: int = 0,
 ) -> list[FieldError]:
-    """The first `MAX_ERRORS` of pydantic's errors.
+    """Return the first `MAX_ERRORS` of pydantic's errors.
 
     Args:
-        errors: of the validation.
+        errors: errors of the validation.
         body: the validated value.
-        at: where in the request ``body`` stands.
-        skip: leading steps of every location that lead to ``body``.
+        at: location of ``body`` in the request.
+        skip: number of leading steps in every location that lead to ``body``.
     """
     found = []
-    # Only of those that are listed: suggestions for 100,000 members take a minute.
+    # Only for the listed errors: suggestions for 100,000 members take a minute.
     for error in errors[:MAX_ERRORS]:
         location = error["loc"][skip:]
         unknown = str(location[-1]) if error["type"] == "extra_forbidden" else ""
@@ -73,18 +73,18 @@ def field_errors(
 
 
 def _like(unknown: str) -> list[str]:
-    """Fields of requests with such a name; one that is a field elsewhere does not mean itself."""
+    """Return similar field names; the unknown name itself is left out."""
     return [name for name in get_close_matches(unknown[:64], _FIELDS) if name != unknown]
 
 
 def pointer(location: tuple[str | int, ...], body: Any = None) -> str:
-    """The JSON pointer of a location, ``#`` for the whole body.
+    """Return the JSON pointer of a location; ``#`` is the whole body.
 
     Args:
         location: field names and list positions from the root, with pydantic's marks for members
             of unions and for keys.
-        body: the parsed request, if at hand: a bare label has no members, so a location inside it
-            points at the label itself.
+        body: the parsed request, if available. A bare label has no members, so a location inside
+            it points at the label.
     """
     steps: list[str] = []
     value = body

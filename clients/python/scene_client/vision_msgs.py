@@ -1,12 +1,12 @@
-"""Detections of ROS (vision_msgs) to the fields of a request.
+"""Convert detections of ROS (vision_msgs) to the fields of a request.
 
     fields = from_detection3d_array(message, label_map="coco")
     answer = client.missing(**fields, top_k=5)
 
-A message may come as JSON (rosbridge, with or without its envelope) or as an object (rclpy, bags),
-in the layout since Galactic (``results[].hypothesis.class_id``, ``id``) or the one before it
-(``results[].id``, ``tracking_id``). What a detector cannot know or did not fill in is left out of
-the request, and `SceneFields.notes` says so; nothing is guessed.
+A message may be JSON (rosbridge, with or without its envelope) or an object (rclpy, bags). It may
+have the layout since Galactic (``results[].hypothesis.class_id``, ``id``) or the earlier one
+(``results[].id``, ``tracking_id``). Values that a detector does not know or did not fill in are
+left out of the request, and `SceneFields.notes` lists them. Values are never guessed.
 """
 
 from __future__ import annotations
@@ -35,34 +35,34 @@ from scene_client.schemas import UnknownLabels
 
 MAX_OBJECTS: Final = 256
 MAX_RELATIONS: Final = 4096
-"""What the service accepts of one scene, unless its operator chose otherwise."""
+"""Limits of the service for one scene, unless its operator chose others."""
 
 _MAX_LABEL, _MAX_ID, _MAX_FRAME = 100, 128, 256
 _MAX_METRES, _MAX_EXTENT, _MAX_YAW = 1e8, 1e4, 1e3
-# A rotation this short is an unset message: its direction would be rounding.
+# A shorter quaternion is an unset message: its direction would come from rounding.
 _MIN_NORM: Final = 1e-6
 
 Reason = Literal[
-    "no-hypothesis",  # the detection names no class, or no class with a score
-    "low-score",  # not above 0, or under min_score
-    "high-score",  # above 1: taken as 1
-    "no-label",  # a number without a label, or no plain text
-    "unwanted",  # the label map maps its class to None
-    "too-many",  # more than a request holds: the least confident were left out
-    "no-position",  # not finite, never filled in, or in another frame: known to be there only
-    "no-box",  # the same in an image: no left and right
-    "renamed",  # its id is another detection's, or no plain text
-    "no-stamp",  # no valid time
+    "no-hypothesis",  # the detection has no class with a score
+    "low-score",  # the score is not above 0, or is under min_score
+    "high-score",  # the score is above 1 and counts as 1
+    "no-label",  # the class is a number without a label, or not plain text
+    "unwanted",  # the label map maps the class to None
+    "too-many",  # the request is full; the least confident ones are left out
+    "no-position",  # the position is not finite, unset, or in another frame
+    "no-box",  # the same for a box in an image: no left and right
+    "renamed",  # the id is a duplicate or not plain text
+    "no-stamp",  # the stamp is not a valid time
 ]
 
 
 class Note(NamedTuple):
-    """A detection that was left out or changed, and why.
+    """A detection that was left out or changed, and the reason.
 
     Attributes:
-        detection: its place in the message; None for what is said of the whole.
+        detection: position of the detection in the message; None for the whole message.
         reason: a stable code.
-        detail: the same in words.
+        detail: the reason in words.
     """
 
     detection: int | None
@@ -74,7 +74,7 @@ class SceneFields(dict[str, Any]):
     """The fields of a request, for `Client.missing(**fields)` or `SceneRequest(**fields)`.
 
     Attributes:
-        notes: what was left out or changed, in the order of the message.
+        notes: omissions and changes, in the order of the message.
     """
 
     def __init__(self, fields: Mapping[str, Any], notes: tuple[Note, ...] = ()) -> None:
@@ -94,24 +94,25 @@ def from_detection3d_array(
     viewpoint: Viewpoint | None = None,
     unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
-    """Objects with poses; the service derives their relations in the axes of ``frame_id``.
+    """Convert objects with poses; the service derives their relations in the axes of ``frame_id``.
 
-    A box that was never filled in is replaced by the pose of the best hypothesis. Extents that are
-    not positive are unknown, an all-zero quaternion is no turn, and a thing whose position is not
-    finite is only known to be there.
+    An unset box is replaced by the pose of the best hypothesis. Extents that are not positive are
+    unknown. An all-zero quaternion means no rotation. An object without a finite position has no
+    position in the request.
 
     Args:
         message: a vision_msgs/Detection3DArray.
-        label_map: what the class ids mean, see `read_label_map`; text that it lacks is a label.
-        min_score: detections of a lower score are left out.
-        boxes: False for detectors whose boxes are pixels, not boxes in space: positions are then
-            those of the hypotheses, and extents unknown.
-        viewpoint: where the robot stands in the frame of the detections, (x, y, yaw). Needed for
-            left and front in map, odom or world; else the origin of the frame, looking along x.
-        unknown_labels: as in a request. A detector's classes are rarely all the model's.
+        label_map: labels of the class ids, see `read_label_map`; other text is itself a label.
+        min_score: detections with a lower score are left out.
+        boxes: False for detectors whose boxes are in pixels, not in space. Positions then come from
+            the hypotheses, and extents are unknown.
+        viewpoint: position and direction of the robot in the frame of the detections, (x, y, yaw).
+            Needed for left and front in map, odom or world. Default: the origin of the frame,
+            looking along x.
+        unknown_labels: as in a request; detectors often have classes that the model lacks.
 
     Raises:
-        MessageError: no scene can be made of it, or an argument is wrong.
+        MessageError: no scene can be made of the message, or an argument is wrong.
     """
     reader = _Reader(message, label_map, min_score)
     objects = [reader.object(seen) | reader.pose(seen, boxes) for seen in reader.sightings]
@@ -128,16 +129,16 @@ def from_detection2d_array(
     min_score: float = 0.0,
     unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
-    """Objects without poses, and which of two neighbours in the image is left of the other.
+    """Convert objects without poses; left follows from neighbours in the image.
 
     An image shows neither depth nor support: front, on-top and above stay unobserved.
 
     Args:
         message: a vision_msgs/Detection2DArray.
-        label_map, min_score, unknown_labels: as of `from_detection3d_array`.
+        label_map, min_score, unknown_labels: as in `from_detection3d_array`.
 
     Raises:
-        MessageError: no scene can be made of it, or an argument is wrong.
+        MessageError: no scene can be made of the message, or an argument is wrong.
     """
     reader = _Reader(message, label_map, min_score)
     fields = {"objects": [reader.object(seen) for seen in reader.sightings]}
@@ -154,10 +155,10 @@ def from_message(
     viewpoint: Viewpoint | None = None,
     unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
-    """The fields of either message, told apart by its boxes.
+    """Convert either kind of message; the boxes show which kind it is.
 
     Raises:
-        MessageError: it is neither, or see `from_detection3d_array`.
+        MessageError: the message is of neither kind, or see `from_detection3d_array`.
     """
     if _is_flat(message):
         return from_detection2d_array(
@@ -174,7 +175,7 @@ def from_message(
 
 
 def is_message(value: Any) -> bool:
-    """Whether a value is an array of detections rather than, say, a request."""
+    """Return whether a value is a message with detections rather than, for example, a request."""
     return take(_unwrapped(value), "detections") is not None
 
 
@@ -183,21 +184,21 @@ def is_message(value: Any) -> bool:
 
 @dataclass(slots=True)
 class _Sighting:
-    """A detection that goes into the request."""
+    """A detection that becomes an object of the request."""
 
     place: int
     detection: Any
     label: str
     confidence: float
-    pose: Any  # of the best hypothesis
+    pose: Any  # pose of the best hypothesis
 
 
 class _Reader:
-    """One message being read: its sightings, and notes on the way."""
+    """A reader of one message: it keeps the sightings and the notes."""
 
     def __init__(self, message: Any, label_map: LabelMap | None, min_score: float) -> None:
         if not is_message(message):
-            raise MessageError("not a message with detections")
+            raise MessageError("this is not a message with detections")
         message = _unwrapped(message)
         self.notes: list[Note] = []
         self.header = take(message, "header")
@@ -212,7 +213,7 @@ class _Reader:
         ]
         if not sightings and label_map is None and self._only_numbers():
             raise MessageError(
-                "the class ids are numbers: say what they mean with label_map (a mapping, a list "
+                "the class ids are numbers: give their labels with label_map (a mapping, a list "
                 "of labels in their order, a vision_msgs/LabelInfo, or 'coco')"
             )
         self.sightings = self._surest(sightings)
@@ -244,7 +245,7 @@ class _Reader:
             self.note(place, "no-label", f"class {class_id[:_MAX_LABEL]!r} has no label")
             return None
         if score > 1:
-            self.note(place, "high-score", f"its score is {score:g}, and was taken as 1")
+            self.note(place, "high-score", f"its score is {score:g}; it counts as 1")
         pose = take(best, "pose")
         return _Sighting(
             place, detection, label.strip(), min(score, 1.0), take(pose, "pose") or pose
@@ -258,7 +259,7 @@ class _Reader:
         )
 
     def _surest(self, sightings: list[_Sighting]) -> list[_Sighting]:
-        """As many as a request holds, in the order of the message."""
+        """Return the most confident sightings that fit a request, in the order of the message."""
         if len(sightings) <= MAX_OBJECTS:
             return sightings
         ranked = sorted(sightings, key=lambda seen: -seen.confidence)
@@ -267,7 +268,7 @@ class _Reader:
         return sorted(ranked[:MAX_OBJECTS], key=lambda seen: seen.place)
 
     def _ids(self) -> dict[int, str]:
-        """By place: the detector's own id where it names one thing, else the label, numbered."""
+        """Return ids by place: the detector's own id if it is unique, else the numbered label."""
         own: dict[str, int] = {}
         ids: dict[int, str] = {}
         for seen in self.sightings:
@@ -275,7 +276,7 @@ class _Reader:
             if not name:
                 continue
             if not is_plain(name, _MAX_ID):
-                self.note(seen.place, "renamed", "its id is no plain text")
+                self.note(seen.place, "renamed", "its id is not plain text")
             elif name in own:
                 self.note(seen.place, "renamed", f"detection {own[name]} has the same id")
             else:
@@ -294,11 +295,11 @@ class _Reader:
         return ids
 
     def _frame(self) -> str | None:
-        """The frame of the message, or of its first detection that names one."""
+        """Return the frame of the message, or of the first detection with a frame."""
         for header in (self.header, *(take(seen.detection, "header") for seen in self.sightings)):
             if frame := frame_of(header):
                 if not is_plain(frame, _MAX_FRAME):
-                    raise MessageError("frame_id is no plain text")
+                    raise MessageError("frame_id is not plain text")
                 return frame
         return None
 
@@ -313,9 +314,9 @@ class _Reader:
         }
 
     def pose(self, seen: _Sighting, boxes: bool) -> dict[str, Any]:
-        """Position, size and orientation, as far as they are known."""
+        """Return the known parts of position, size and orientation."""
         if self._is_elsewhere(seen):
-            self.note(seen.place, "no-position", "its frame is not that of the message")
+            self.note(seen.place, "no-position", "its frame differs from that of the message")
             return {}
         box = take(seen.detection, "bbox") if boxes else None
         pose, size = take(box, "center"), numbers(take(box, "size"), "xyz")
@@ -323,7 +324,7 @@ class _Reader:
         if not sized and _is_unset(pose):
             pose = seen.pose
             if _is_unset(pose):
-                self.note(seen.place, "no-position", "neither box nor pose was filled in")
+                self.note(seen.place, "no-position", "its box and its pose are unset")
                 return {}
         position = numbers(take(pose, "position"), "xyz")
         if position is None or any(abs(value) > _MAX_METRES for value in position):
@@ -341,9 +342,9 @@ class _Reader:
         return found
 
     def image_relations(self, ids: list[str]) -> list[dict[str, str]]:
-        """Left and right between neighbours in the image."""
+        """Return left and right between neighbours in the image."""
         boxes = [self._image_box(seen) for seen in self.sightings]
-        # Where there are more than a request holds, those of the surest things.
+        # If a request cannot hold all relations, those of the most confident objects are kept.
         order = sorted(range(len(ids)), key=lambda i: -self.sightings[i].confidence)
         found = left_pairs(boxes, order)
         if len(found) > MAX_RELATIONS:
@@ -354,9 +355,9 @@ class _Reader:
         ]
 
     def _image_box(self, seen: _Sighting) -> Box | None:
-        """The upright box around a box that may be turned."""
+        """Return the upright box around a box that may be rotated."""
         if self._is_elsewhere(seen):
-            self.note(seen.place, "no-box", "its frame is not that of the message")
+            self.note(seen.place, "no-box", "its frame differs from that of the message")
             return None
         box = take(seen.detection, "bbox")
         centre = take(box, "center")
@@ -382,7 +383,7 @@ class _Reader:
         if (time := time_of(stamp)) is not None:
             fields["stamp"] = time
         elif stamp is not None:
-            self.note(None, "no-stamp", "its stamp is no valid time")
+            self.note(None, "no-stamp", "its stamp is not a valid time")
         order = sorted(
             self.notes, key=lambda note: -1 if note.detection is None else note.detection
         )
@@ -390,14 +391,14 @@ class _Reader:
 
 
 def _unwrapped(message: Any) -> Any:
-    """The message in rosbridge's envelope, or the message itself."""
+    """Return the message in rosbridge's envelope, or the message itself."""
     if isinstance(message, Mapping) and "detections" not in message:
         return message.get("msg", message)
     return message
 
 
 def _is_flat(message: Any) -> bool:
-    """Whether the boxes are those of an image."""
+    """Return whether the boxes are boxes in an image."""
     detections = take(_unwrapped(message), "detections")
     return any(
         has(take(detection, "bbox"), "size_x") for detection in items(detections, "detections")
@@ -409,7 +410,7 @@ def _is_number(label: str) -> bool:
 
 
 def _is_unset(pose: Any) -> bool:
-    """Whether a pose is missing or was never filled in."""
+    """Return whether a pose is missing or unset."""
     position = take(pose, "position")
     return position is None or numbers(position, "xyz") == (0.0, 0.0, 0.0)
 

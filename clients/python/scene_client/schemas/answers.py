@@ -20,21 +20,21 @@ class Reply(BaseModel):
 
 
 class FieldError(Reply):
-    """One thing that is wrong with a request."""
+    """One error in a request."""
 
     pointer: Annotated[
         str,
         Field(description="JSON pointer into the body, as a URI fragment (RFC 6901, section 6)"),
     ]
     message: str
-    suggestions: Annotated[list[str], Field(description="nearest known names, best first")] = []
+    suggestions: Annotated[list[str], Field(description="similar known names, best first")] = []
 
 
 class Failure(Reply):
-    """Something in the store that cannot be used, and why."""
+    """An entry of the model store that cannot be used, and the reason."""
 
     subject: Annotated[str, Field(description="`name@version`, an alias, or `store`")]
-    reason: Annotated[str, Field(description="a stable code")]
+    reason: Annotated[str, Field(description="a stable code of the reason")]
     detail: str
 
 
@@ -45,13 +45,16 @@ class Problem(Reply):
     title: str
     status: int
     detail: str
-    instance: Annotated[str, Field(description="the problem's page, the request id as fragment")]
+    instance: Annotated[
+        str, Field(description="path of the problem's page with the request id as fragment")
+    ]
     request_id: str
     errors: Annotated[
-        list[FieldError] | None, Field(description="what is wrong, and where; at most 100 entries")
+        list[FieldError] | None, Field(description="errors with their places, at most 100")
     ] = None
     failures: Annotated[
-        list[Failure] | None, Field(description="what a refresh refused, and why")
+        list[Failure] | None,
+        Field(description="entries of the store that a refresh refused, with reasons"),
     ] = None
 
 
@@ -59,7 +62,7 @@ class Problem(Reply):
 
 
 class ModelReference(Reply):
-    """Which model answered."""
+    """The model that answered."""
 
     name: str
     version: str
@@ -69,60 +72,67 @@ class ModelReference(Reply):
 
 @dataclass(slots=True)
 class ObservedRelation:
-    """A relation between two objects (by id) that their positions show."""
+    """A relation between two objects (by id), derived from their positions."""
 
-    # No model: a scene of a dozen objects shows some fifty, and a model takes ten times as long.
+    # A dataclass: a scene of a dozen objects has some fifty of these, and a pydantic model takes
+    # ten times as long.
     subject: str
     relation: RelationName
     object: str
 
 
 class Mapped(Reply):
-    """A label that the model does not know, and the class that stands for it."""
+    """A label that the model does not know, and the class that replaces it."""
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
 
-    label: Annotated[str, Field(description="as given: of an object, a candidate, or the room")]
-    class_: Annotated[str, Field(alias="class", description="the canonical label")]
+    label: Annotated[
+        str, Field(description="the label in the request: of an object, a candidate or the room")
+    ]
+    class_: Annotated[str, Field(alias="class", description="canonical label of the class")]
     similarity: Annotated[
-        float, Field(ge=0, le=1, description="of the names, by spelling and common words")
+        float,
+        Field(ge=0, le=1, description="similarity of the names, by spelling and common words"),
     ]
 
 
 class SceneWarning(Reply):
-    """Something in the scene that is probably a mistake. The scene is answered all the same."""
+    """A probable mistake in the scene. The scene is answered nevertheless."""
 
     code: Annotated[
         Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"],
         Field(
-            description="a position beyond 100 m (are these millimetres?); a side below 1 mm or "
-            "above 20 m; one depth for all objects in an optical frame; vertical relations that "
-            "are unobserved because sizes are unknown"
+            description="implausible-position: beyond 100 m, perhaps in millimetres. "
+            "implausible-size: a side below 1 mm or above 20 m. flat-scene: equal depth of all "
+            "objects in an optical frame. unknown-sizes: vertical relations are unobserved "
+            "because sizes are unknown"
         ),
     ]
     message: str
-    objects: Annotated[list[str], Field(description="ids of the objects concerned")]
+    objects: Annotated[list[str], Field(description="ids of the objects of the warning")]
 
 
 class Answer(Reply):
-    """What every answer carries."""
+    """Fields that every answer has."""
 
     model: ModelReference
-    request_id: Annotated[str, Field(description="of the X-Request-Id header, or drawn")]
-    frame_id: Annotated[str | None, Field(description="as given")] = None
-    stamp: Annotated[Stamp | None, Field(description="as given")] = None
+    request_id: Annotated[
+        str, Field(description="value of the X-Request-Id header, or a random id")
+    ]
+    frame_id: Annotated[str | None, Field(description="as in the request")] = None
+    stamp: Annotated[Stamp | None, Field(description="as in the request")] = None
     ignored: Annotated[
         list[str],
         Field(
-            description="with `unknown_labels: ignore`: ids of the objects, and the candidates and "
-            "room type, that this model does not know and the answer left out"
+            description="with `unknown_labels: ignore`: ids of objects, candidates and the room "
+            "type that the model does not know; the answer leaves them out"
         ),
     ] = []
     mapped: Annotated[
         list[Mapped],
         Field(
-            description="with `unknown_labels: nearest`: labels this model does not know, and the "
-            "class that each was taken for"
+            description="with `unknown_labels: nearest`: labels that the model does not know, "
+            "with the class that replaces each"
         ),
     ] = []
     warnings: Annotated[
@@ -130,7 +140,7 @@ class Answer(Reply):
     ] = []
     observed_relations: Annotated[
         list[ObservedRelation] | None,
-        Field(description="derived from positions; absent if none were given"),
+        Field(description="relations derived from positions; absent without positions"),
     ] = None
 
 
@@ -143,14 +153,14 @@ class ScoredRelation(Reply):
     probability: Probability
 
 
-# No models: an answer holds thirty of them, and a model takes ten times as long.
+# Dataclasses: an answer has thirty of these, and a pydantic model takes ten times as long.
 
 
 @dataclass(slots=True)
 class Because:
-    """How much the presence of one object (by id) changes the log-odds of another."""
+    """The change of an object's log-odds by the presence of another object (by id)."""
 
-    # No model here either: an answer holds some thirty.
+    # A dataclass too: an answer has some thirty of these.
     object: str
     log_odds_change: Finite
 
@@ -159,7 +169,7 @@ AnswerT = TypeVar("AnswerT", bound=Answer)
 
 
 class BatchEntry(Reply, Generic[AnswerT]):
-    """The outcome of one scene: a `result`, or the `problem` it would have met alone."""
+    """The outcome of one scene: a `result`, or the `problem` of the scene."""
 
     status: int
     result: AnswerT | None = None
@@ -167,7 +177,7 @@ class BatchEntry(Reply, Generic[AnswerT]):
 
 
 class BatchAnswer(Reply, Generic[AnswerT]):
-    """One entry a scene, in order."""
+    """One entry for each scene, in the order of the request."""
 
     request_id: str
     results: list[BatchEntry[AnswerT]]

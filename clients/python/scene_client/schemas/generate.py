@@ -23,35 +23,43 @@ class GenerateRequest(SceneRequest):
     """What would a scene like this look like?"""
 
     objects: Annotated[
-        list[SceneObject], Field(max_length=256, description="evidence; may be empty")
+        list[SceneObject],
+        Field(max_length=256, description="objects that every scene contains; may be empty"),
     ] = []
-    count: Annotated[int, Field(ge=1, le=64, description="how many scenes")] = 1
+    count: Annotated[int, Field(ge=1, le=64, description="number of scenes")] = 1
     steps: Annotated[
-        int | None, Field(ge=1, le=2000, description="Gibbs sweeps; left out: the model's own")
+        int | None,
+        Field(ge=1, le=2000, description="number of Gibbs sweeps; default: the model's own"),
     ] = None
     temperature: Annotated[
         float,
-        Field(ge=0.05, le=20, allow_inf_nan=False, description="above 1: more varied scenes"),
+        Field(
+            ge=0.05,
+            le=20,
+            allow_inf_nan=False,
+            description="sampling temperature; above 1: more varied scenes",
+        ),
     ] = 1.0
     context: Annotated[
         dict[Name, Annotated[list[UnitNumber], Field(max_length=4096)]] | None,
-        Field(max_length=8, description="layer name to the numbers of its units that are on"),
+        Field(max_length=8, description="numbers of the active units, by the name of the layer"),
     ] = None
 
 
 class GeneratedScene(Reply):
-    """A drawn scene: labels, relations between labels, and the context that was active."""
+    """A sampled scene: labels, relations between labels, and the active context units."""
 
     objects: list[str]
     relations: list[Relation]
     log_score: Finite
     context: Annotated[
-        dict[str, list[int]], Field(description="layer name to the numbers of its active units")
+        dict[str, list[int]],
+        Field(description="numbers of the active units, by the name of the layer"),
     ]
 
 
 class GenerateAnswer(Answer):
-    """Scenes that contain the evidence; the same `seed` draws the same ones again."""
+    """Scenes that contain the given objects; an equal `seed` gives equal scenes."""
 
     seed: int
     scenes: list[GeneratedScene]

@@ -24,31 +24,33 @@ from scene_client.schemas.requests import (
 
 
 class Anchor(Request):
-    """A place: in ``relation`` to ``object`` ("on-top" of the "desk")."""
+    """A place in a ``relation`` to an ``object``, such as "on-top" of the "desk"."""
 
     relation: RelationName
     object: Name
 
 
 class MissingOptions(Request):
-    """What `/missing` is asked beside the scene."""
+    """Options of `/missing`, besides the scene."""
 
     coverage: Annotated[
         Probability | None,
         Field(
-            description="probability that an object which is there is listed: 1 where the whole "
-            "scene is seen, so that an unlisted class counts as absent; 0 where unlisted classes "
-            "say nothing; left out: the model's own",
+            description="probability that a present object is listed. 1: the whole scene is seen, "
+            "so unlisted classes count as absent. 0: unlisted classes give no evidence. Default: "
+            "the model's own value",
         ),
     ] = None
     top_k: Annotated[
-        int, Field(ge=1, description="how many objects at most; not above the vocabulary")
+        int, Field(ge=1, description="maximum number of objects, up to the vocabulary's size")
     ] = 10
     candidates: Annotated[
         list[Label] | None,
-        Field(min_length=1, max_length=4096, description="only these labels"),
+        Field(min_length=1, max_length=4096, description="only classes with these labels"),
     ] = None
-    at: Annotated[Anchor | None, Field(description="what is missing at this place?")] = None
+    at: Annotated[
+        Anchor | None, Field(description="only objects that are missing at this place")
+    ] = None
 
 
 class MissingRequest(MissingOptions, SceneRequest):
@@ -68,12 +70,13 @@ class Vector:
 
 @dataclass(slots=True)
 class Offset:
-    """From the centre of a placement's object to that of the missing one: add it to a position.
+    """Offset from the centre of a placement's object to the centre of the missing object.
 
-    Along the axes of `frame_id`; where the request names none, away from the viewer, to the left
-    and up. `std`: a robot that looks within 1.8 of them in the plane, or 2.15 in space, finds four
-    of five. `scenes`: training scenes that showed the two classes so; 0: the offset is what is
-    usual for the relation and for either class.
+    Add it to the position of the placement's object. The axes are those of `frame_id`. Without a
+    frame they point away from the viewer, to the left and up. `std`: standard deviations. Four of
+    five objects are within 1.8 of them in the plane, or 2.15 in space. `scenes`: number of training
+    scenes with this relation of the two classes. 0: the offset is the usual one of the relation and
+    of either class.
     """
 
     mean: Vector
@@ -82,7 +85,7 @@ class Offset:
 
 
 class Placement(Reply):
-    """Where a missing object would stand: in `relation` to the object with this id."""
+    """A likely place of a missing object: in `relation` to the object with this id."""
 
     relation: RelationName
     object: str
@@ -90,8 +93,9 @@ class Placement(Reply):
     offset: Annotated[
         Offset | None,
         Field(
-            description="how far from it, in metres; absent where training saw no poses, and for "
-            "left, right, front and behind in a map, odom or world frame without a viewpoint"
+            description="offset from the object in metres; absent if the training scenes have no "
+            "poses. Also absent for left, right, front and behind in a map, odom or world frame "
+            "without a viewpoint"
         ),
     ] = None
 
@@ -99,8 +103,8 @@ class Placement(Reply):
 class MissingObject(Reply):
     """A class that is not listed.
 
-    `probability`: the object is there although it was not listed, given `coverage`. `log_odds`: of
-    its presence, before calibration.
+    `probability`: an unlisted object of the class is present, given `coverage`. `log_odds`:
+    log-odds of its presence, before calibration.
     """
 
     label: str
@@ -110,18 +114,18 @@ class MissingObject(Reply):
     because: Annotated[
         list[Because],
         Field(
-            description="objects that change its log-odds most, strongest first, at most 3; the "
-            "first 32 entries have them"
+            description="objects that change the log-odds most, strongest first, at most 3. Only "
+            "the first 32 entries have them"
         ),
     ]
 
 
 class MissingAnswer(Answer):
-    """Unlisted classes, likeliest first; their probabilities do not sum to one."""
+    """Unlisted classes, likeliest first. Their probabilities do not sum to one."""
 
     coverage: Annotated[
         Probability | None,
-        Field(description="probability that a present object is listed, as it was in force"),
+        Field(description="applied probability that a present object is listed"),
     ] = None
     missing: list[MissingObject]
 

@@ -14,7 +14,7 @@ from scene_client.schemas.requests import Finite, RelationName, Size
 
 
 class Metric(Reply):
-    """One figure measured on held-out scenes, with its 95 % interval over n units."""
+    """A metric measured on held-out scenes, with its 95 % interval over n units."""
 
     task: str
     source: str
@@ -26,7 +26,7 @@ class Metric(Reply):
 
 
 class TrainingSource(Reply):
-    """Scenes that a model was trained on, and their terms."""
+    """Scenes on which a model was trained, and their terms of use."""
 
     source: str
     scenes: int
@@ -36,15 +36,17 @@ class TrainingSource(Reply):
 
 
 class VersionSummary(Reply):
-    """One version of a model: usable, or refused with the reason."""
+    """One version of a model; it is ready, or refused for a reason."""
 
     version: str
     status: Literal["ready", "refused"]
-    aliases: Annotated[list[str], Field(description="aliases that lead to this version")]
+    aliases: Annotated[list[str], Field(description="aliases that point at this version")]
     variant: str | None = None
     digest: str | None = None
-    reason: Annotated[str | None, Field(description="why it was refused: a stable code")] = None
-    detail: Annotated[str | None, Field(description="the same in words")] = None
+    reason: Annotated[
+        str | None, Field(description="stable code of the reason for the refusal")
+    ] = None
+    detail: Annotated[str | None, Field(description="the reason in words")] = None
 
 
 class ModelSummary(Reply):
@@ -55,47 +57,48 @@ class ModelSummary(Reply):
 
 
 class ModelList(Reply):
-    """What the service has, and the aliases that lead to it."""
+    """The models of the service, and its aliases."""
 
     models: list[ModelSummary]
     aliases: Annotated[
-        dict[str, str], Field(description="alias to `name@version`, or to `name` for its newest")
+        dict[str, str],
+        Field(description="target of each alias: `name@version`, or `name` (newest)"),
     ]
     failures: Annotated[
-        list[Failure], Field(description="what of the store cannot be used, and why")
+        list[Failure], Field(description="entries of the store that cannot be used, with reasons")
     ] = []
     generation: Annotated[
         str,
-        Field(description="the same in all replicas that serve the same versions and aliases"),
+        Field(description="equal in all replicas with the same versions and aliases"),
     ] = ""
 
 
 class VersionDetails(VersionSummary):
-    """All there is to know about one version; a refused one has no more than its summary."""
+    """The details of one version; a refused version has only its summary."""
 
     name: str
     created: datetime | None = None
-    parameters: Annotated[int | None, Field(description="how many weights it has")] = None
+    parameters: Annotated[int | None, Field(description="number of weights")] = None
     metrics: list[Metric] = []
-    data: Annotated[list[TrainingSource], Field(description="what it was trained on")] = []
+    data: Annotated[list[TrainingSource], Field(description="sources of the training scenes")] = []
     terms: Annotated[str | None, Field(description="licence of the weights")] = None
     card: Annotated[str | None, Field(description="the model card, in Markdown")] = None
 
 
 class VocabularyEntry(Reply):
-    """One class of objects. Structure (walls, floors, vague names) is accepted, never proposed."""
+    """One class of objects. Structure classes (walls, floors, vague names) are never proposed."""
 
     label: str
     aliases: list[str]
     structure: bool
     size: Annotated[
         Size | None,
-        Field(description="typical extents in metres, taken where a detection brings none"),
+        Field(description="typical extents in metres, used if a detection has no size"),
     ] = None
 
 
 class VocabularyAnswer(Reply):
-    """The words of a model. Case, separators and plurals never matter."""
+    """The vocabulary of a model. Case, separators and plurals never matter."""
 
     model: ModelReference
     objects: list[VocabularyEntry]
@@ -104,7 +107,7 @@ class VocabularyAnswer(Reply):
 
 
 class WeightedLabel(Reply):
-    """An object or room type and its weight to a hidden unit."""
+    """An object class or room type, and its weight to a hidden unit."""
 
     label: str
     weight: Finite
@@ -120,16 +123,16 @@ class WeightedRelation(Reply):
 
 
 class ContextUnit(Reply):
-    """A hidden unit by the objects, relations and room types it goes with, strongest first."""
+    """A hidden unit with its objects, relations and room types, strongest first."""
 
     unit: int
-    name: Annotated[str, Field(description="its first objects and relation, for people to read")]
+    name: Annotated[str, Field(description="readable name: its strongest objects and relation")]
     objects: list[WeightedLabel]
     relations: Annotated[
         list[WeightedRelation],
         Field(
-            description="of those that the model saw in training; their weights are beyond the "
-            "mean over the layer"
+            description="relations seen in training; each weight is the difference from the mean "
+            "over the layer"
         ),
     ]
     room_types: list[WeightedLabel]
@@ -143,19 +146,21 @@ class ContextsAnswer(Reply):
 
 
 class RefreshAnswer(Reply):
-    """What a refresh changed."""
+    """The changes made by a refresh."""
 
     request_id: str
-    default: Annotated[ModelReference, Field(description="the model that `default` leads to")]
-    added: Annotated[list[str], Field(description="`name@version` that now answer and did not")]
-    removed: Annotated[list[str], Field(description="`name@version` that no longer answer")]
+    default: Annotated[ModelReference, Field(description="the model at which `default` points")]
+    added: Annotated[list[str], Field(description="versions that are new, as `name@version`")]
+    removed: Annotated[
+        list[str], Field(description="versions that no longer answer, as `name@version`")
+    ]
     failures: Annotated[
-        list[Failure], Field(description="what could not be used before, and still cannot")
+        list[Failure], Field(description="entries of the store that failed before and still fail")
     ] = []
 
 
 class AliasAnswer(Reply):
-    """Where an alias leads now, and where it led before."""
+    """The new and the previous target of an alias."""
 
     request_id: str
     alias: str
@@ -167,13 +172,13 @@ class AliasAnswer(Reply):
 
 
 class Health(Reply):
-    """The service's own spelling of health."""
+    """The status of the service."""
 
     status: Literal["live", "ready"]
 
 
 class ServerMetadata(Reply):
-    """Open Inference Protocol: the server."""
+    """Open Inference Protocol: metadata of the server."""
 
     name: str
     version: str
@@ -187,20 +192,20 @@ class ServerLive(Reply):
 
 
 class ServerReady(Reply):
-    """Open Inference Protocol: the default model answers."""
+    """Open Inference Protocol: the default model is ready."""
 
     ready: bool
 
 
 class ModelReady(Reply):
-    """Open Inference Protocol: this model answers."""
+    """Open Inference Protocol: this model is ready."""
 
     name: str
     ready: bool
 
 
 class TensorMetadata(Reply):
-    """Open Inference Protocol: a tensor. The questions of this service are not put in tensors."""
+    """Open Inference Protocol: metadata of a tensor; the questions of this service use none."""
 
     name: str
     datatype: str
@@ -208,7 +213,7 @@ class TensorMetadata(Reply):
 
 
 class ModelMetadata(Reply):
-    """Open Inference Protocol: a model. It is asked through `/relations` and its siblings."""
+    """Open Inference Protocol: metadata of a model. Its questions are `/relations` and similar."""
 
     name: str
     versions: list[str]

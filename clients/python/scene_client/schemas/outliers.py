@@ -20,19 +20,19 @@ Sensitivity = Literal["low", "medium", "high"]
 
 
 class OutliersOptions(Request):
-    """What `/outliers` is asked beside the scene."""
+    """Options of `/outliers`, besides the scene."""
 
     sensitivity: Annotated[
         Sensitivity,
         Field(
-            description="how readily an alarm is raised: in about 2, 10 or 20 % of untouched "
-            "scenes of the hardest large source, and of lists of few classes"
+            description="alarm rate: about 2, 10 or 20 % of untouched scenes of the hardest large "
+            "source raise an alarm. The same rates hold for lists of few classes"
         ),
     ] = "medium"
     threshold: Annotated[
         Probability | None,
         Field(
-            description="an object is an outlier from this probability on; left out: the model's "
+            description="an object is an outlier from this probability on; default: the model's "
             "threshold for `sensitivity`",
         ),
     ] = None
@@ -45,10 +45,10 @@ class OutliersRequest(OutliersOptions, SceneRequest):
 
 
 class Outlier(Reply):
-    """How badly one object fits.
+    """How well one object fits the scene.
 
-    `probability`: it does not belong, where half of the scenes hold an intruder. `log_odds`: of its
-    class being present, given the rest of the scene.
+    `probability`: the object does not belong, if half of all scenes contain an intruder.
+    `log_odds`: log-odds that its class is present, given the rest of the scene.
     """
 
     object: str
@@ -59,33 +59,33 @@ class Outlier(Reply):
     because: Annotated[
         list[Because],
         Field(
-            description="objects that support the verdict, strongest first, at most 3: of an "
-            "outlier those that make it unlikely, of any other those that make it likely"
+            description="objects that support the verdict, strongest first, at most 3. For an "
+            "outlier, they make the object unlikely; for any other object, they make it likely"
         ),
     ]
     usually_with: Annotated[
         list[str],
-        Field(description="of an outlier: absent classes that would make it likely, at most 3"),
+        Field(description="for an outlier: absent classes that would make it likely, at most 3"),
     ] = []
 
 
 class MisplacedRelation(ScoredRelation):
-    """A relation as the request spelled it, and the probability that it is false."""
+    """A relation as the request spells it, and the probability that it is false."""
 
     is_misplaced: Annotated[
-        bool, Field(description="the probability reaches the threshold for `sensitivity`")
+        bool, Field(description="true if `probability` reaches the threshold of `sensitivity`")
     ] = False
 
 
 class OutliersAnswer(Answer):
-    """Every object, least fitting first, and every relation given or observed, least likely first.
+    """Objects, least fitting first, and stated or derived relations, least likely first.
 
-    In `misplaced`, `probability`: the relation is false.
+    In `misplaced`, `probability` means that the relation is false.
     """
 
     threshold: Annotated[
         Probability | None,
-        Field(description="probability from which an object is an outlier, as it was in force"),
+        Field(description="applied probability from which an object is an outlier"),
     ] = None
     outliers: list[Outlier]
     misplaced: list[MisplacedRelation]

@@ -22,27 +22,30 @@ from scene_client.schemas.requests import (
 
 
 class Pair(Request):
-    """Two objects, each by its id or an unambiguous label."""
+    """Two objects, each named by its id or an unambiguous label."""
 
     subject: Name
     object: Name
 
 
 class RelationsOptions(Request):
-    """What `/relations` is asked beside the scene."""
+    """Options of `/relations`, besides the scene."""
 
-    top_k: Annotated[int, Field(ge=1, le=4096, description="how many relations at most")] = 20
-    min_probability: Annotated[Probability, Field(description="leave out what is less likely")] = (
-        0.0
-    )
+    top_k: Annotated[int, Field(ge=1, le=4096, description="maximum number of relations")] = 20
+    min_probability: Annotated[
+        Probability, Field(description="leave out relations with a lower probability")
+    ] = 0.0
     pairs: Annotated[
         list[Pair] | None,
         Field(
-            min_length=1, max_length=4096, fail_fast=True, description="only these ordered pairs"
+            min_length=1,
+            max_length=4096,
+            fail_fast=True,
+            description="only relations of these ordered pairs",
         ),
     ] = None
     include_opposites: Annotated[
-        bool, Field(description="also report right, behind, under and below")
+        bool, Field(description="also list right, behind, under and below")
     ] = False
 
 
@@ -54,14 +57,15 @@ class RelationsRequest(RelationsOptions, SceneRequest):
 
 @dataclass(slots=True)
 class Disagreement:
-    """Two objects (by id) that stand otherwise than the rest of the scene makes one expect.
+    """Two objects (by id) whose observed relation differs from the expected one.
 
-    `observed`: relations of `subject` to `object` that were stated or derived. `expected`: the
-    likeliest relation without all that is known of how the two stand, with its `probability`;
-    `observed_probability`: of the likeliest observed one.
+    `observed`: stated or derived relations of `subject` to `object`. `expected`: the likeliest
+    relation given the rest of the scene, without any observed relation of the two objects.
+    `probability`: probability of `expected`. `observed_probability`: probability of the likeliest
+    observed relation.
     """
 
-    # No model either: half of the observed relations may be in it.
+    # A dataclass too, because half of the observed relations may appear here.
     subject: str
     object: str
     observed: list[RelationName]
@@ -73,24 +77,24 @@ class Disagreement:
 class ExpectedRelation(ScoredRelation):
     """A relation and the probability that it holds, given that both objects are in the scene."""
 
-    observed: Annotated[bool, Field(description="the request states it, or positions show it")] = (
-        False
-    )
+    observed: Annotated[
+        bool, Field(description="the request states the relation, or positions show it")
+    ] = False
 
 
 class RelationsAnswer(Answer):
     """Relations, best first.
 
-    `probability`: the relation holds between the two, given that both are in the scene.
+    `probability`: the relation holds between the two objects, given that both are in the scene.
     """
 
     relations: list[ExpectedRelation]
     disagreements: Annotated[
         list[Disagreement],
         Field(
-            description="where another relation than what was stated or observed is expected: "
-            "from the rest of the scene alone it has a probability of at least one half; largest "
-            "ratio of the probabilities first, at most `top_k`"
+            description="pairs whose stated or derived relation differs from the expected one. The "
+            "expected relation has a probability of at least one half given the rest of the scene. "
+            "Largest ratio of the probabilities first, at most `top_k`"
         ),
     ]
 

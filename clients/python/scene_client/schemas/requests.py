@@ -1,8 +1,8 @@
 """Requests of the HTTP contract.
 
-Requests are strict: no coercion ("1" is not 1, true is not 1), no unknown fields, no NaN, no
-infinity, every text and list bounded. What needs a model's vocabulary or the whole scene to judge
-(unknown labels, ambiguous names, contradictions) is judged where the scene is read.
+Requests are strict: no coercion ("1" is not 1, true is not 1), no unknown fields, no NaN and no
+infinity. Every text and list has a maximum length. Checks that need a model's vocabulary or the
+whole scene happen where the scene is read: unknown labels, ambiguous names and contradictions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pydantic_core import PydanticCustomError
 MAX_BATCH = 256
 MAX_SEED = 2**63 - 1
 MAX_RELATIONS = 65536
-"""No setting allows more, and a million wrong ones would take seconds to name."""
+"""Upper bound of the service's setting; listing a million invalid ones would take seconds."""
 
 UnknownLabels = Literal["error", "ignore", "nearest"]
 RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "above", "below"]
@@ -53,7 +53,7 @@ Body: TypeAlias = Mapping[str, Any]
 
 
 class Request(BaseModel):
-    """Part of a request: strict, and closed to fields it does not know."""
+    """Part of a request; unknown fields and type coercion are not allowed."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -70,7 +70,7 @@ class Position(Request):
 
 
 class Size(Request):
-    """Extents of a box in metres along its own axes, before ``orientation`` turns it."""
+    """Extents of a box in metres along its own axes, before the rotation by ``orientation``."""
 
     x: Extent
     y: Extent
@@ -78,7 +78,7 @@ class Size(Request):
 
 
 class Quaternion(Request):
-    """A rotation as a unit quaternion, in the order of geometry_msgs/Quaternion."""
+    """A rotation as a unit quaternion, with the fields of geometry_msgs/Quaternion."""
 
     x: Finite
     y: Finite
@@ -87,14 +87,14 @@ class Quaternion(Request):
 
     @model_validator(mode="after")
     def _unit(self) -> Self:
-        # tf2 tolerates the same deviation; an all-zero quaternion (an unset message) is refused.
+        # tf2 allows the same deviation; an all-zero quaternion (an unset message) is refused.
         if abs(math.hypot(self.x, self.y, self.z, self.w) - 1) > 0.01:
             raise PydanticCustomError("unit_quaternion", "must be a unit quaternion (length 1)")
         return self
 
 
 class Viewpoint(Request):
-    """Where the robot stands in ``frame_id`` and where it looks (radians from x towards y)."""
+    """Position of the robot in ``frame_id``, and its direction of view in radians (x towards y)."""
 
     x: Metres
     y: Metres
@@ -102,31 +102,36 @@ class Viewpoint(Request):
 
 
 class Stamp(Request):
-    """A time as builtin_interfaces/Time."""
+    """A time with the fields of builtin_interfaces/Time."""
 
     sec: Annotated[int, Field(ge=-(2**31), le=2**31 - 1)]
     nanosec: Annotated[int, Field(ge=0, le=999_999_999)]
 
 
 class Detection(Request):
-    """One object as a detector reports it."""
+    """One object, as a detector reports it."""
 
     id: Annotated[
         Name | None,
-        Field(
-            description="its name in this scene; without one the label serves, numbered if needed"
-        ),
+        Field(description="id of the object in this scene; default: the label, numbered if needed"),
     ] = None
-    label: Annotated[Label, Field(description="any spelling the model's vocabulary accepts")]
+    label: Annotated[Label, Field(description="any spelling that the model's vocabulary accepts")]
     confidence: Annotated[
         float,
-        Field(gt=0, le=1, allow_inf_nan=False, description="soft evidence that it is there"),
+        Field(
+            gt=0,
+            le=1,
+            allow_inf_nan=False,
+            description="confidence that the object is present (soft evidence)",
+        ),
     ] = 1.0
-    position: Annotated[Position | None, Field(description="centre of its box")] = None
+    position: Annotated[Position | None, Field(description="centre of the object's box")] = None
     size: Annotated[
-        Size | None, Field(description="left out: the typical size of its class, where known")
+        Size | None, Field(description="default: the typical size of the class, if known")
     ] = None
-    orientation: Annotated[Quaternion | None, Field(description="turns the box")] = None
+    orientation: Annotated[Quaternion | None, Field(description="rotation of the object's box")] = (
+        None
+    )
 
 
 def _kind_of_object(value: object) -> str | None:
@@ -135,8 +140,8 @@ def _kind_of_object(value: object) -> str | None:
     return OBJECT_TAGS[1] if isinstance(value, dict | Detection) else None
 
 
-# Names of the union's members as pydantic reports them in error locations. They hold a space, so
-# they are told apart from field names when a location becomes a JSON pointer.
+# Names of the union's members in pydantic's error locations. Their space distinguishes them from
+# field names when a location becomes a JSON pointer.
 OBJECT_TAGS = ("a label", "a detection")
 
 SceneObject = Annotated[
@@ -153,7 +158,7 @@ SomeObjects = Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
 
 
 class Relation(Request):
-    """``subject`` stands in ``relation`` to ``object``; both name an id or an unambiguous label."""
+    """``subject`` has the ``relation`` to ``object``; both are an id or an unambiguous label."""
 
     subject: Name
     relation: RelationName
@@ -161,52 +166,58 @@ class Relation(Request):
 
 
 class SceneRequest(Request):
-    """What the robot sees, and which model to ask."""
+    """The scene that the robot observes, and the model to ask."""
 
     objects: Annotated[
         list[SceneObject],
-        Field(max_length=256, description="labels or detections; at most 256"),
+        Field(max_length=256, description="labels or detections, at most 256"),
     ]
     relations: Annotated[
         list[Relation] | None,
         Field(
             max_length=MAX_RELATIONS,
-            # Of so many, each wrong in many ways: a list of all faults would take a hundred times
-            # the memory of the request.
+            # With this many relations, a list of all errors would need a hundred times the memory
+            # of the request.
             fail_fast=True,
-            description="relations that hold; relations not listed are unobserved, unless "
-            "`relations_complete`. Left out, they are derived from positions; an empty list says "
-            "that none is known and derives none",
+            description="relations that hold. Relations that are not listed are unobserved, "
+            "unless `relations_complete` is true. Without this field, relations are derived from "
+            "positions. With an empty list, no relation is stated and none is derived",
         ),
     ] = None
     relations_complete: Annotated[
-        bool, Field(description="relations that are not listed do not hold")
+        bool, Field(description="if true, relations that are not listed do not hold")
     ] = False
     room_type: Annotated[Label | None, Field(description="one of the model's room types")] = None
     frame_id: Annotated[
-        str | None, Field(max_length=256, description="as in std_msgs/Header; echoed")
+        str | None,
+        Field(max_length=256, description="as in std_msgs/Header; the answer repeats it"),
     ] = None
-    stamp: Annotated[Stamp | None, Field(description="as in std_msgs/Header; echoed")] = None
+    stamp: Annotated[
+        Stamp | None, Field(description="as in std_msgs/Header; the answer repeats it")
+    ] = None
     viewpoint: Annotated[
         Viewpoint | None,
-        Field(description="left out: at the origin of the frame, looking along x"),
+        Field(description="default: the origin of the frame, view along x"),
     ] = None
     model: Annotated[ModelSpec, Field(description="an alias, `name` or `name@version`")] = "default"
     seed: Annotated[
         int | None,
-        Field(ge=0, le=MAX_SEED, description="only `/generate` draws; the others ignore it"),
+        Field(
+            ge=0, le=MAX_SEED, description="random seed of `/generate`; other questions ignore it"
+        ),
     ] = None
     unknown_labels: Annotated[
         UnknownLabels,
         Field(
-            description="labels the model does not know: refuse them, answer without them, or map "
-            "each to the nearest class (`mapped`); a label that is like none is refused"
+            description="treatment of labels that the model does not know: refuse them, leave "
+            "them out of the answer, or use the nearest class (`mapped`). A label without a "
+            "similar class is refused"
         ),
     ] = "error"
 
 
 class SceneFields(TypedDict, total=False):
-    """The fields of `SceneRequest`; relations and pairs may be plain tuples of names."""
+    """The fields of `SceneRequest`; relations and pairs may be tuples of names."""
 
     relations: Iterable[Relation | Body | tuple[str, RelationName, str]]
     relations_complete: bool
@@ -220,20 +231,22 @@ class SceneFields(TypedDict, total=False):
 
 
 class AliasRequest(Request):
-    """Where an alias shall lead."""
+    """The new target of an alias."""
 
-    model: Annotated[ModelSpec, Field(description="`name@version`, or `name` for its newest")]
+    model: Annotated[
+        ModelSpec, Field(description="`name@version`, or `name` for the newest version")
+    ]
     expected: Annotated[
         ModelSpec | None,
         Field(
-            description="where the alias must lead now, as GET /models shows it; null: it must not "
-            "exist; left out: wherever it leads"
+            description="required current target of the alias, as in GET /models. null: the alias "
+            "must not exist yet. Default: any target"
         ),
     ] = None
 
 
 class AliasFields(TypedDict, total=False):
-    """The fields of `AliasRequest` beside the model."""
+    """The fields of `AliasRequest` except the model."""
 
     expected: str | None
 
@@ -246,9 +259,10 @@ def _as_it_came(value: Any, _validate: object) -> Any:
 
 
 class BatchRequest(Request, Generic[RequestT]):
-    """Scenes to answer in order. Each is judged alone: a bad one spoils only its own entry."""
+    """Scenes to answer in order. An invalid scene affects only its own entry of the answer."""
 
-    # Described as RequestT and left as it came: validating here would refuse the whole batch.
+    # The schema describes RequestT, and the value stays raw: validation here would refuse the
+    # batch.
     scenes: Annotated[
         list[Annotated[RequestT, WrapValidator(_as_it_came)]],
         Field(min_length=1, max_length=MAX_BATCH),
