@@ -356,10 +356,11 @@ def generation_metrics(
 def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Measure T4: compare generated scenes with the first half of the held-out scenes.
 
-    The number of generated scenes is the size of the second half. There are three conditions: free, with the room types of the second half, and with one given
-    class. The given class is drawn from all class mentions of the second half, so a scene is chosen
-    in proportion to its number of classes. The first half gets the same weights in this condition;
-    a perfect sampler then has no discrepancy.
+    The number of generated scenes is the size of the second half. There are three conditions: free,
+    with the room types of the second half, and with one given class. The given class is drawn from
+    all class mentions of the second half, so a scene is chosen in proportion to its number of
+    classes. In this condition the first half is weighted in the same way, so that a perfect sampler
+    has no discrepancy.
     """
     if contender.sampler is None or setting.train is None:
         return None

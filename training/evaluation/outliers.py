@@ -281,7 +281,7 @@ def judge_intruders(
 
     Args:
         intruders: (N,) classes; -1 for scenes without an intruder.
-        law: what the names of the metrics say of the intruders.
+        law: suffix of the metric names, for the distribution of the intruders.
 
     Raises:
         LeakError: see `ask_every`.
@@ -310,13 +310,13 @@ def judge_intruders(
 
 
 def verdict(artifact: Artifact, sensitivity: Sensitivity, scene: Scene) -> Floats:
-    """(n, 3) of its objects: probability, log-odds, called an outlier."""
+    """Return (n, 3) per object: probability, log-odds, and 1 if it is flagged as an outlier."""
     found = judge(artifact, scene, sensitivity)
     return np.column_stack([found.probability, found.log_odds, found.is_outlier])
 
 
 def share_of_first(values: Floats, target: int) -> float:
-    """Whether the value at `target` is the highest; ties in expectation."""
+    """Return 1 if the value at `target` is the highest, 0 otherwise; expectation over ties."""
     best = values == values.max()
     return float(best[target] / best.sum())
 
@@ -328,7 +328,7 @@ def alarms(
     sensitivity: Sensitivity,
     judged: Flags,
 ) -> Ratio:
-    """Share of the judged of N untouched scenes with an object that is called an outlier."""
+    """Return the share of judged clean scenes with an object flagged as an outlier."""
     found = ask_every(partial(verdict, artifact, sensitivity), cases)
     loud = [
         bool(((columns[:, 2] > 0) & things(case, structure.numpy())).any())
@@ -340,7 +340,7 @@ def alarms(
 def first_classes(
     encoded: EncodedScene, structure: Tensor, listed: int, rng: np.random.Generator
 ) -> Scene:
-    """All instances of so many of its classes, drawn at random, and its structure."""
+    """Return a scene of structure and all instances of ``listed`` random classes."""
     every = np.unique(encoded.instance_classes)
     hidden = rng.permutation(every[~structure.numpy()[every]])[listed:]
     kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden))
