@@ -1,8 +1,8 @@
 """Decide whether a new version may replace the version that an alias serves.
 
-It may not if a primary metric is worse than the margin with the whole interval of the paired
-difference. A difference that chance could explain is accepted. It also may not if the comparison
-measures no relations, but the served version was measured on relations.
+A primary metric must not be worse by more than the margin, with the whole interval of the paired
+difference. Smaller or uncertain losses are accepted. If the served version was measured on
+relations, the comparison must measure relations too.
 """
 
 from __future__ import annotations
