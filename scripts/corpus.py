@@ -3,7 +3,7 @@
     python -m scripts.corpus record http://127.0.0.1:8000 answers.jsonl.gz --key ADMIN_KEY
     python -m scripts.corpus compare http://127.0.0.1:8001 answers.jsonl.gz --key ADMIN_KEY
 
-Both services serve the `model_store` of the repository, and `compare` replays the recorded requests.
+Both services serve the `model_store` of the repository; `compare` replays the recorded requests.
 Two answers are equal if status, problem type and fields are equal, with numbers within 1e-5. Order
 and length of a list may differ among entries with equal probabilities. Answers of `/generate` are
 random. They are compared by their fixed fields, and by the shares of classes in many scenes, with a

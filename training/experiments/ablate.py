@@ -221,7 +221,7 @@ def load_rows(path: Path, full: Config) -> list[Config]:
     try:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
-        raise ConfigError(f"file {path} does not exist") from error
+        raise ConfigError(f"ablation file {path} does not exist") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not TOML: {error}") from error
     except ValidationError as error:

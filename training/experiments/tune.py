@@ -148,7 +148,7 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ConfigError(f"file {path} does not exist") from error
+        raise ConfigError(f"search space {path} does not exist") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not TOML: {error}") from error
     if not values:
