@@ -198,7 +198,7 @@ def test_sources_by_name_are_found_in_the_folder_extra(
         (json.dumps(BARE_SCENE | {"objects": [{"id": 0}]}), "an object lacks label"),
         (json.dumps(BARE_SCENE | {"objects": [{"id": 0, "label": ""}]}), "label must be"),
         (json.dumps(BARE_SCENE | {"objects": [{"id": 1.5, "label": "a"}]}), "an id must be"),
-        (json.dumps(BARE_SCENE | {"objects": BARE_SCENE["objects"] * 2}), "objects with the same id"),
+        (json.dumps(BARE_SCENE | {"objects": BARE_SCENE["objects"] * 2}), "with the same id"),
         (json.dumps(BARE_SCENE | {"room_type": 3}), "room_type must be"),
         (json.dumps(BARE_SCENE | {"viewer_frame": "yes"}), "viewer_frame must be"),
         (json.dumps(BARE_SCENE | {"relations": {}}), "relations must be a list or null"),

@@ -223,7 +223,7 @@ def test_every_trial_is_kept(finished):
     [
         (("--baseline", "nobody"), "unknown baselines ['nobody']"),
         (("--task", "T9"), "unknown task 'T9'"),
-        (("--shuffled", "--task", "T4"), f"only {', '.join(YARDSTICKS)} are asked"),
+        (("--shuffled", "--task", "T4"), f"only the tasks {', '.join(YARDSTICKS)}"),
     ],
 )
 def test_bad_requests_are_named(tmp_path, others, message):
