@@ -31,7 +31,7 @@ class Result:
         subject: name of our contender.
         timings: timings of all contenders.
         work, unit: amount of work of one call and its unit; without a unit, only times are shown.
-        targets: yardstick to the minimum speed ratio that we aim at.
+        targets: minimum speed ratio that we aim at, by yardstick.
         facts: further results.
     """
 

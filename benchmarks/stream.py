@@ -1,8 +1,9 @@
 """``python -m benchmarks.stream``: updates over a stream, compared with requests of whole scenes.
 
 At each tick one object of a room with poses moves, and all three questions are asked. Blocks of
-ticks alternate between the stream and requests, so that both see the same machine. A tick takes
-three requests on a keep-alive connection. A ping between two updates measures the round-trip time.
+ticks alternate between the stream and requests, so that both see the same machine. Without the
+stream, a tick takes three requests on a keep-alive connection. A ping between two updates measures
+the round-trip time.
 Latency runs from the scheduled time of a tick, so it includes delays of the client.
 """
 

@@ -2,8 +2,9 @@
 
 For each scan of a room with several scans, a random other scan of the room replaces the model:
 
-    relations   its triples, random order of ties: R-precision between classes of both scans
-    objects     its classes: reciprocal rank of a removed class, expectation over ties
+    relations   its triples predict relations. Metric: R-precision between classes of both scans,
+                with ties in random order
+    objects     its classes predict a removed class. Metric: reciprocal rank, expected over ties
 
 Run as `python -m scripts.ceiling [FOLDER] [SOURCE]`.
 """

@@ -48,7 +48,7 @@ PATIENCE: Final = {"x-request-timeout-ms": "60000"}
 VOLATILE: Final = frozenset({"request_id", "instance", "session", "seed"})
 # Lists that describe the scene, not the answer.
 NOTES: Final = frozenset({"ignored", "mapped", "warnings"})
-# Probability that the test reports at least one changed share without a change.
+# Probability of at least one false alarm among all compared shares.
 FAILURE: Final = 1e-3
 
 Json = Any

@@ -1,6 +1,7 @@
 """`python -m scripts.estimators`: errors of the closed form and of 64 samples.
 
-The reference uses a very large number of samples. The model is a shipped one with a closed form.
+The reference uses many more samples (by default 4,096). The model is a shipped one with a closed
+form.
 Its own scenes are used in three forms: labels only, with 20 random relations, or with random poses,
 which determine hundreds of relations. Errors of objects are in nats of log-odds; errors of
 relations and placements are in probability.

@@ -25,7 +25,7 @@ CUDA_COMPANION = re.compile(r"^(cuda-|nvidia-|triton$)")
 
 
 def resolve(requirements: list[str], pins: Path | None, pip_arguments: list[str]) -> dict[str, str]:
-    """Return name → line `name==version` for `requirements` and all their dependencies."""
+    """Return the lines `name==version` of `requirements` and their dependencies, by name."""
     command = [
         *(sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "-qq"),
         *("--dry-run", "--ignore-installed", "--report", "-"),

@@ -155,7 +155,7 @@ def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Se
 def autoencoder(
     train: SceneTensors, structure: Tensor, seed: int, course: Course = _AUTOENCODER
 ) -> Proposals[ObjectScore]:
-    """Propose dropout × epochs."""
+    """Yield a score for each dropout rate and number of epochs."""
     for dropout in _HIDDEN_DROPOUT:
         network = build_autoencoder(train.v, _HIDDEN, dropout, seed)
         for epoch, score in train_network(network, train.v, structure, course, seed):
@@ -165,7 +165,7 @@ def autoencoder(
 def autoencoder_for_parts(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectScore]:
-    """Propose the autoencoder with heavy masking: up to all other classes are hidden."""
+    """Yield autoencoder scores after heavy masking: up to all other classes are hidden."""
     return autoencoder(train, structure, seed, _HEAVY)
 
 
@@ -222,7 +222,7 @@ class SetTransformer(nn.Module):
 
 
 def transformer(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Propose dropout × epochs."""
+    """Yield a score for each dropout rate and number of epochs."""
     for dropout in _DROPOUT:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)

@@ -21,7 +21,7 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 
 @dataclass(frozen=True, eq=False)
 class LinearScore:
-    """bias + v · weights, where a class has no weight to itself.
+    """Linear score bias + v · weights; the weight from a class to itself is zero.
 
     Attributes:
         bias: (V,).
@@ -60,7 +60,7 @@ def frequency(v: Tensor) -> Tensor:
 
 
 def popularity(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Propose the log-odds of the class frequencies; the method has no parameters to tune."""
+    """Yield the log-odds of the class frequencies, the only grid point."""
     V = train.v.shape[1]
     yield {}, LinearScore(frequency(train.v).logit(), torch.zeros(V, V))
 
@@ -91,7 +91,7 @@ def evidence(v: Tensor, smoothing: float) -> Tensor:
 
 
 def naive_bayes(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Propose smoothing × exponent."""
+    """Yield a score for each smoothing and exponent."""
     bias = frequency(train.v).logit()
     for smoothing in _SMOOTHING:
         weights = evidence(train.v, smoothing)
@@ -135,7 +135,7 @@ def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScor
 
 
 def nearest(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Propose neighbours × sharpness."""
+    """Yield a score for each number of neighbours and sharpness."""
     for k in _NEIGHBOURS:
         for power in _SHARPNESS:
             score = nearest_score(train.v, neighbours=k, sharpness=power)
@@ -154,7 +154,7 @@ _EASE_L2 = (10.0, 30.0, 100.0, 300.0)
 
 
 def fit_ease(v: Tensor, l2: float) -> LinearScore:
-    """Ridge regression of every class on all others.
+    """Fit a ridge regression of every class on all other classes.
 
     Args:
         v: (N, V) presence.
@@ -170,7 +170,7 @@ def fit_ease(v: Tensor, l2: float) -> LinearScore:
 
 
 def ease(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Propose L2 penalties."""
+    """Yield a score for each L2 penalty."""
     for l2 in _EASE_L2:
         yield {"l2": l2}, fit_ease(train.v, l2)
 
@@ -229,7 +229,7 @@ def fit_pairwise(
 
 
 def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[LinearScore]:
-    """Propose L2 penalties in decreasing order; each fit starts at the previous solution."""
+    """Yield a score for each L2 penalty, decreasing; each fit starts at the previous solution."""
     score = None
     for l2 in _PAIRWISE_L2:
         score = fit_pairwise(train.v, l2, start=score)
@@ -239,7 +239,7 @@ def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[L
 def pairwise_densities(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectDensity]:
-    """Propose the joint distributions of the pairwise models.
+    """Yield the joint distributions of the pairwise models.
 
     Their best penalty differs from that of the conditionals. With a weak penalty, pseudo-likelihood
     leaves a second mode of scenes with very many classes. Conditionals of real scenes do not show
@@ -299,7 +299,7 @@ def _as_machine(rbm: BernoulliRBM) -> BoltzmannMachine:
 
 
 def bernoulli_rbm(train: SceneTensors, _structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Propose learning rates."""
+    """Yield a score for each learning rate."""
     for rate in _LEARNING_RATES:
         machine = fit_annealed(
             train.v, hidden=_HIDDEN, learning_rate=rate, epochs=_EPOCHS, seed=seed

@@ -80,8 +80,8 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
     - Boxes in an image, by the rule of `scene_client.image_plane`: left and above.
     - Otherwise support links only.
 
-    `training.datasets.sources` defines which relations missing from a list are false. It also
-    defines which labels of a source are ignored.
+    `training.datasets.sources` defines which relations are false if a scene does not list them. It
+    also defines which labels of a source are ignored.
 
     Relations of structure classes are unobserved.
     """
@@ -98,7 +98,7 @@ def annotated_classes(
 
     If an annotated class is missing from a scene, the object is absent. A source annotates the
     classes that it mentions at least once; a source of open vocabulary annotates all classes.
-    Labels that the source leaves out are excluded. Initial biases are frequencies over the sources
+    Labels in `Source.left_out` are excluded. Initial biases are frequencies over the sources
     that annotate a class. Generated scenes are compared in the annotated classes.
     """
     annotated: dict[str, NDArray[np.bool_]] = {}
@@ -114,7 +114,7 @@ def annotated_classes(
 
 
 def _left_out(source: str, vocabulary: Vocabulary) -> list[int]:
-    """Return the indices of the labels that a source annotates too incompletely."""
+    """Return the class indices of the labels in `Source.left_out`."""
     labels = SOURCES[source].left_out if source in SOURCES else ()
     return [index for label in labels if (index := vocabulary.index(label)) is not None]
 
@@ -212,13 +212,13 @@ def _relations(
 def _from_lists(
     scene: AnnotatedScene, listed: Sequence[tuple[int, str, int]], meaning: Meaning
 ) -> PoseRelations:
-    """Combine listed and denied relations with the default of the source for missing relations."""
+    """Combine listed relations, denied relations, and the source's rule for unlisted relations."""
     n = len(scene.objects)
     holds, denied = np.zeros((2, A, n, n), dtype=np.bool_)
     for relations, array in ((listed, holds), (scene.false_relations, denied)):
         for subject, relation, anchor in relations:
             array[canonicalise(subject, relation, anchor)] = True
-        # Two opposite statements cancel: both directions listed, or listed and denied.
+        # Contradictory annotations are unobserved: both directions listed, or listed and denied.
     contradicted = (holds & holds.swapaxes(1, 2)) | (holds & denied)
     related = holds.any(0)
     masks = {
@@ -236,7 +236,7 @@ def _from_lists(
 def _close_poses(
     found: PoseRelations, objects: Sequence[AnnotatedObject], meaning: Meaning
 ) -> None:
-    """Apply the meaning of the source to relations derived from positions."""
+    """Apply the source's rule for unlisted relations to relations derived from positions."""
     located = np.array([thing.position is not None for thing in objects])
     sized = located & np.array([thing.size is not None for thing in objects])
     for relation, unlisted in enumerate(meaning.unlisted):

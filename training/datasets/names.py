@@ -24,9 +24,9 @@ class Names:
         not_objects: labels that never become a class.
         surroundings: outdoor structure; excluded from indoor vocabularies.
         outdoor: outdoor objects; excluded from indoor vocabularies.
-        aliases: class to its other names.
-        kinds: class to narrower kinds; the class represents a kind that has no class of its own.
-        rooms: room type to its other names; the key "" lists names that mean no room type.
+        aliases: other names of each class.
+        kinds: narrower kinds of each class. A kind outside a vocabulary can become an alias.
+        rooms: other names of each room type; the key "" lists names that mean no room type.
     """
 
     base: tuple[str, ...] = ()

@@ -2,7 +2,7 @@
 
 The table has tab-separated columns and may be gzipped. Its first line names the columns:
 ``source``, ``subject``, ``relation``, ``object``, ``count``, ``room`` (empty = any room).
-The reader skips other relations than the eight of the service (``inside``, ``at``, ``next to``).
+The reader skips relations outside the eight of the service, such as ``inside`` and ``next to``.
 """
 
 from __future__ import annotations

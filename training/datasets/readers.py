@@ -1,4 +1,4 @@
-"""The readers by format name."""
+"""The dataset readers, by format name."""
 
 from __future__ import annotations
 

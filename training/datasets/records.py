@@ -19,7 +19,7 @@ MAX_PROBLEM: Final = 500
 
 
 class DatasetError(ValueError):
-    """Malformed data file.
+    """A data file cannot be read or is malformed.
 
     Args:
         path: the file.

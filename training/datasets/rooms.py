@@ -24,7 +24,7 @@ from training.datasets.vocabulary import source_vocabulary
 
 SOURCE = "rooms"
 
-_HEIGHT = 2.6  # m, floor to ceiling
+_HEIGHT = 2.6  # height of a room in metres
 _ATTEMPTS = 20  # maximum number of random positions for one object; then it is left out
 _GONE = 0.1  # probability that a view omits a small object
 _CLEARANCE = 0.02  # minimum distance in metres between pieces of furniture
@@ -43,7 +43,7 @@ class Small:
     Attributes:
         label: class of the object.
         size: mean extents.
-        chance: probability that one of the ``most`` attempts adds the object.
+        chance: probability of adding the object, in each of ``most`` attempts.
         most: maximum number of these objects.
     """
 
@@ -73,7 +73,7 @@ class Piece:
     Attributes:
         label: class of the piece.
         size: mean extents.
-        chance: probability that one of the ``most`` attempts adds the piece to the room.
+        chance: probability of adding the piece to the room, in each of ``most`` attempts.
         where: at a wall, in the centre, hung on a wall or under the ceiling.
         most: maximum number of these pieces.
         carries: small objects on the piece.
@@ -90,7 +90,7 @@ class Piece:
 
 
 Rooms = Mapping[str, tuple[Piece, ...]]
-"""Room type to the pieces that such a room may contain."""
+"""The pieces that each room type may contain."""
 
 
 class _Tables:
@@ -152,7 +152,7 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
     """Generate ``count`` scenes; the same seed gives the same scenes.
 
     Args:
-        rooms: room type to the pieces that such a room may contain; one mapping per domain.
+        rooms: the pieces that each room type may contain; another mapping is another domain.
 
     Positions are in viewer axes. Boxes have sizes and yaws. An object on furniture names the
     furniture as its support. ``relations`` is None, because encoding derives the relations.

@@ -74,7 +74,7 @@ def _exchange(
     for s, c in zip(scene, label, strict=True):
         there.setdefault(s, set()).add(c)
     drawn = rng.integers(len(label), size=(2, _STEPS_PER_MENTION * len(label)))
-    # Each step depends on all earlier ones: plain lists and sets are the fastest choice.
+    # Each step depends on the earlier ones, so array operations are slower than lists and sets.
     for i, j in zip(*drawn.tolist(), strict=True):
         c, d = label[i], label[j]
         first, second = there[scene[i]], there[scene[j]]

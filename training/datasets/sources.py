@@ -39,7 +39,7 @@ class Meaning:
     Attributes:
         on_top, above, lateral: state of an unlisted relation; lateral covers left and front.
         complete_objects: True if the object list covers nearly the whole scene. Then absent
-            objects inform the model about co-occurrence.
+            objects are evidence in object learning.
         scenes_per_group: maximum total weight of a group in object learning, in scenes. None if
             each scene has weight 1.
     """
@@ -105,9 +105,8 @@ class Source:
         research_only: True if the licence excludes commercial use.
         meaning: meaning of an unlisted relation. None if it depends on whether scenes list
             relations.
-        predicates: predicate to relation. The reader skips all other predicates, because they match
-            none of the eight relations ("inside", "attached", "next to", "wear"). None if an
-            unknown predicate is an error.
+        predicates: relation of each predicate. The reader skips predicates outside this table,
+            such as "inside" and "wear". If the table is None, an unknown predicate is an error.
         left_out: labels with annotations too incomplete to be used.
         open_vocabulary: True if annotators used free words; an unmentioned class is then absent.
             Otherwise annotators chose from a list, and a class outside the list is unobserved.
@@ -220,7 +219,7 @@ def relation_of(source: str, predicate: str) -> str | None:
     """Map a predicate of a source to one of the eight relations, or None if no relation matches.
 
     Raises:
-        ValueError: the source has no predicate table, and the predicate is no relation name.
+        ValueError: the source lacks a predicate table, and the predicate is not a relation name.
     """
     known = SOURCES.get(source)
     if known is not None and known.predicates is not None:

@@ -126,8 +126,8 @@ def _assign(
     """Assign each unit to the part furthest below its target share, one stratum at a time.
 
     The stratum of a unit is its most common room type. Large strata come first; a hash orders the
-    units within a stratum. The distance to the target adds the stratum and the total, so that units
-    of small strata do not all go to training.
+    units within a stratum. The distance is the sum of two: within the stratum and over all scenes.
+    So units of small strata do not all go to training.
     """
     strata: dict[str, list[str]] = defaultdict(list)
     for unit, rooms in rooms_of.items():

@@ -83,7 +83,7 @@ def _relations(
 
 
 def _labels(path: Path) -> dict[str, dict[str, str]]:
-    """Read ``objects.json``: scan id to object id to label."""
+    """Read the labels from ``objects.json``, by scan id and object id."""
     labels: dict[str, dict[str, str]] = {}
     for number, scan in enumerate(take(path, "", load_json(path), "scans", list)):
         where = f"scans[{number}]"
@@ -96,7 +96,7 @@ def _labels(path: Path) -> dict[str, dict[str, str]]:
 
 
 def _rooms(path: Path) -> dict[str, str]:
-    """Read ``3RScan.json``: scan id to the reference scan of its room."""
+    """Read the reference scan of each scan's room from ``3RScan.json``, by scan id."""
     rooms: dict[str, str] = {}
     entries = load_json(path)
     if not isinstance(entries, list):

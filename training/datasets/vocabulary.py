@@ -16,7 +16,7 @@ from training.datasets.records import AnnotatedScene
 
 INDOOR_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "indoor.json"
 
-# Minimum mentions to train a class. Word vectors support the indoor classes, so fewer suffice.
+# Minimum mentions of a class in training. Indoor classes have word vectors, so fewer suffice.
 MINIMUM_MENTIONS = 8
 INDOOR_MINIMUM_MENTIONS = 5
 # Minimum number of boxes for a typical size.
@@ -135,7 +135,7 @@ def source_vocabulary(
     """Build a vocabulary of the mentioned classes only, without the base classes.
 
     It suits models trained on one source, such as ProcTHOR or VRD. Such a vocabulary has few
-    classes, so a class also gets the names of narrower kinds: "dining table" means table.
+    classes, so names of narrower kinds become aliases: "dining table" becomes an alias of "table".
     """
     names = curated_names()
     mentioned_only = Names(

@@ -78,7 +78,7 @@ class WordVectors:
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, NDArray[np.bool_]]:
     """Vectors of the classes of a vocabulary.
 
-    The label gives the vector. Without a vector for the label, the first alias with a vector does.
+    The vector comes from the label. If the label has none, it comes from the first alias with one.
 
     Returns:
         Vectors (V, d) float32 of unit length, zero for a class without a vector.

@@ -14,9 +14,9 @@ from training.datasets import AnnotatedScene, Names
 
 # Number of most frequent names that are compared with each other.
 _COMPARED = 2000
-# One edit is allowed from 5 letters on, two edits from 10 letters on.
+# Names of at least 5 letters may differ by one edit, names of at least 10 letters by two.
 _ONE_SLIP, _TWO_SLIPS = 5, 10
-# A misspelling is rarer than the correct name; a short name is merged only by hand.
+# A merged name has at most two mentions or 10 % of the other name's, and at least 6 letters.
 _RARE, _MERGED_LENGTH = 0.1, 6
 
 
@@ -29,7 +29,6 @@ class Label:
         mentions: number of objects with this name.
         scenes: number of scenes with this name.
         spellings: spellings as annotated, most frequent first.
-        spellings: as annotated, the most frequent first.
     """
 
     name: str
@@ -58,7 +57,7 @@ class Lookalike:
 
 
 def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
-    """Count all names, most frequent first; spellings with one key and aliases are one name."""
+    """Count all names, most frequent first; spellings with the same key count as one name."""
     spellings: dict[str, Counter[str]] = {}
     shown: dict[str, Counter[str]] = {}
     seen: Counter[str] = Counter()
@@ -95,8 +94,8 @@ def lookalikes(
 ) -> list[Lookalike]:
     """Find pairs of names that differ by one or two letters, and merge clear misspellings.
 
-    Two curated names are never a pair, because they are different objects. Names that differ by a
-    digit are no pair either. Two names in the same scene are a pair but are not merged.
+    Pairs of curated names and pairs that differ in digits are left out, because they are different
+    objects. Names that occur in the same scene are reported as a pair and not merged.
     """
     compared = [label for label in labels[:_COMPARED] if len(label_key(label.name)) >= _ONE_SLIP]
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}

@@ -184,11 +184,11 @@ def _pair(scene: AnnotatedScene, i: int, j: int) -> str:
 
 
 def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str] | None:
-    """Return the labels of a support cycle, or None; on-top in both directions is no cycle here."""
+    """Return the labels of a support cycle, or None."""
     place = {thing.id: index for index, thing in enumerate(scene.objects)}
     below: dict[int, set[int]] = {}
     for a, i, j in held:
-        # Two objects on top of each other are reported by the finding on both directions.
+        # Another finding reports pairs of objects that are on top of each other.
         if a == _ON_TOP and (a, j, i) not in held:
             below.setdefault(i, set()).add(j)
     for index, thing in enumerate(scene.objects):

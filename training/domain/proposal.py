@@ -45,7 +45,7 @@ class Proposal:
         name: name of the configuration and of the model.
         facts, labels, lookalikes: results of the analysis.
         minimum: minimum number of mentions of a class.
-        covered: minimum to the number of classes and the covered share of the mentions.
+        covered: number of classes and covered share of the mentions, by minimum.
         vocabulary: the vocabulary; merged lookalikes are aliases.
         dropped: names without a class: name, mentions and reason.
         values: the configuration by section.

@@ -52,7 +52,7 @@ Ask = Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]
 
 
 def uncalibrated(artifact: Artifact) -> Artifact:
-    """Return the artifact without calibration; only the signs of the log-odds fit the answers."""
+    """Return the artifact with uncalibrated log-odds; slopes of -1 only correct the sign."""
     plain = Calibration.neutral(artifact.spec.A).model_copy(
         update={"outlier": CountSlope(slope=-1.0), "misplaced": Slope(slope=-1.0)}
     )
@@ -86,7 +86,7 @@ def ask_relations(
 def ask_given(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Ask for the relations between some pairs of a scene, given those of the other pairs."""
+    """Ask for the relations of some pairs of a scene, given the relations of the other pairs."""
     asked, given = told_pairs(encoded, artifact.vocabulary.structure, rng)
     if not given:
         return None

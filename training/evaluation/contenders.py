@@ -1,4 +1,4 @@
-"""Build contenders: a model with scores as the service computes them, and two references."""
+"""Build contenders: a model with scores as the service computes them, and two reference rows."""
 
 from __future__ import annotations
 
@@ -120,13 +120,13 @@ def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
 
 
 def floor_contender(setting: Setting) -> Contender:
-    """Use the second half of the held-out scenes as samples: the best possible value of T4."""
+    """Return a contender with held-out scenes as samples, which estimates the best value of T4."""
     _, second = held_out_halves(setting.complete)
     return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
 
 
 def independent_contender(setting: Setting) -> Contender:
-    """Sample classes independently at their training frequencies."""
+    """Return a contender that samples classes independently at their training frequencies."""
     train = setting.complete.train
     if train is None:
         return Contender()

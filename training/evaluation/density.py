@@ -6,13 +6,14 @@ so the machine is annealed without them. With h1 drawn from its mean field q giv
 
     log p(v) = log mean_h [ exp(b·v + h·(c1 + v'W)) prod_l (1 + exp(c2 + h'J)_l) / q(h) ] - log Z
 
-The mean is unbiased, so its log is too low in expectation. The upper estimate of log Z makes the
-log-likelihood more conservative still.
+The mean is unbiased, so its log is too low in expectation. The upper estimate of log Z lowers the
+log-likelihood further, so the result is conservative.
 
 The pairwise model is the fully visible Boltzmann machine (Ising model) of classes:
-p(v) = exp(b·v + v'Wv / 2) / Z with symmetric W and zero diagonal. The path starts at beta = 0 with
-independent classes of log-odds a, where log Z is a sum. It ends at beta = 1 with the model. At beta
-the log-odds are (1 - beta) a + beta b, and the edges are beta W. One sweep updates each class once.
+p(v) = exp(b·v + v'Wv / 2) / Z with symmetric W and zero diagonal. The annealing path starts at
+beta = 0 with independent classes of log-odds a, where log Z is a sum. It ends at beta = 1 with the
+model. In between, the log-odds are (1 - beta) a + beta b, and the edges are beta W. One sweep
+updates each class once.
 
 Source: Neal, "Annealed importance sampling" (2001), run in both directions as in
 `training.machines.partition`.

@@ -10,8 +10,8 @@ keep the generated scenes fixed.
     copies      share of generated scenes with the same set of classes as a training scene
     mirrored    share of related pairs with both a(x, y) and a(y, x). Several instances of a class
                 can make both true, so held-out scenes have a share above 0 too
-    cycles      share of scenes with an on-top cycle, among scenes with on-top relations. The remark
-                on several instances applies here too
+    cycles      share of scenes with an on-top cycle, among scenes with on-top relations. Several
+                instances of a class can form a true cycle of classes
 
 Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
 """
@@ -53,7 +53,7 @@ class Contradictions:
 
     Attributes:
         related: (B,) number of unordered pairs × canonical relations with at least one direction.
-        mirrored: (B,) number of those with both directions.
+        mirrored: (B,) number of these pairs with both directions.
         stacked: (B,) bool, the scene has an on-top relation.
         cyclic: (B,) bool, the scene has an on-top cycle.
     """
@@ -150,7 +150,7 @@ def independent_sampler(train: SceneTensors) -> Sampler:
 
 
 def scene_sampler(scenes: SceneTensors) -> Sampler:
-    """Return a sampler that returns real scenes: the best possible value of a metric.
+    """Return a sampler of real scenes, which estimates the best possible value of a metric.
 
     Without given classes, row k returns scene k if its room type fits. Otherwise the sampler
     returns a random scene that satisfies the row.
@@ -220,7 +220,7 @@ def _grid(machine: BoltzmannMachine, state: State) -> Tensor:
 
 
 def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
-    """Split held-out scenes into two halves: the reference, and the best possible sample.
+    """Split held-out scenes into reference scenes and scenes that serve as the best sample.
 
     A group stays in one half. The limit of the setting applies to each half.
     """

@@ -141,7 +141,7 @@ def kinds_of_intruders(
     laws: list[Tensor | None] = [None]
     if train is not None:
         laws += [by_popularity(scenes, train), by_signature(scenes, train)]
-    # `answers.ask_outliers` uses the random numbers of `seed`, so these use another seed.
+    # `answers.ask_outliers` draws with `seed`; another seed here keeps the draws independent.
     drawn = [draw_intruders(scenes, structure, weights, seed + 1) for weights in laws]
     each = torch.stack(drawn, 1).numpy()
     names = [(scene.source, scene.scene_id) for scene in scenes.scenes]

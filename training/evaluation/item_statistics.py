@@ -96,7 +96,7 @@ def calibration_error(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 
 def brier_skill(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Return 1 - Brier score / Brier score of the base rate; positive if better than the rate."""
+    """Return 1 - Brier score / Brier score of the base rate; 0 means as good as the base rate."""
     levels = _levels(score, truth)
 
     def at(weight: Floats) -> float:

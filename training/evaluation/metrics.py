@@ -160,7 +160,7 @@ def resample(
 
 
 def _centred(drawn: Floats, value: float) -> Floats:
-    """Shift the resamples to a mean equal to the value; only their spread is kept."""
+    """Shift the resamples so that their mean equals the value."""
     return drawn + (value - np.nanmean(drawn)) if np.isfinite(drawn).any() else drawn
 
 

@@ -1,4 +1,4 @@
-"""T2: rank of objects that were hidden from a scene. All tasks about missing objects.
+"""T2: rank of objects that were hidden from a scene, in three tasks.
 
     T2          each class is removed in turn, with all its instances and relations
     T2 partial  25, 50 or 75 % of the classes are shown, or all but one; at least one class is shown

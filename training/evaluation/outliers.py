@@ -1,4 +1,4 @@
-"""T3: one absent class is added to a scene; does the model rank it as the worst fit? And the alarm.
+"""T3: rank of an intruder, an absent class that is added to a scene; and the alarm for intruders.
 
 A score ranks by the log-odds of each object given the rest. A published model gets the labels of
 all instances of the scene and no other evidence. Its hit@1 follows the ranking of the service, by
@@ -51,7 +51,7 @@ MEDIUM = 0.1
 """Target share of clean scenes with an alarm at the default sensitivity."""
 
 _RESAMPLES = 200
-# Quantile over resampled groups: the threshold is safe in this share of the resamples.
+# The threshold keeps the target share of alarms in this share of the resampled sets of groups.
 _CONFIDENCE = 0.7
 # Minimum scenes of a source with its own threshold, and of all small sources together.
 _SOURCE_SCENES = 200

@@ -12,7 +12,7 @@ annotators list only a few relations per scene. Structure classes are excluded. 
 annotated triples are skipped; T1b and T3b need two triples.
 
 Triples are canonical and distinct. So T1b never gives a held-out relation in its opposite form
-(right for left). All other relations are unobserved.
+(right for left). Relations that are not given are unobserved.
 
 The false triple of T3b has another relation between the two classes, or another present class at
 one end, with equal probability. The scene contains neither the false triple nor its mirror image,
@@ -256,7 +256,7 @@ def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Can
 
 
 def expected_hits(score: Floats, truth: Flags, count: int) -> float:
-    """Return the expected number of true items among the first `count`, under random ties."""
+    """Return the expected number of true items among the first `count`; ties in random order."""
     if count >= len(score):
         return float(truth.sum())
     threshold = np.partition(score, -count)[-count]

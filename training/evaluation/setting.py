@@ -40,7 +40,7 @@ class Contender:
         alarm: alarm of T3.
         artifact: model for Calibration and for all questions to the service.
         objects_in_rooms: score of T2 with the room type given.
-        machine: machine for the seed protocol, which samples.
+        machine: machine for the seed protocol.
         parameters: number of trained weights, or None if this number is not meaningful.
     """
 
@@ -112,7 +112,7 @@ class Outcome:
     """Metrics of one task.
 
     Attributes:
-        metrics: name to metric; the primary metric comes first.
+        metrics: metrics by name; the primary metric comes first.
         scenes, skipped: number of scenes, and number of scenes that could not be scored.
         notes: additional values, such as a bandwidth.
     """

@@ -57,7 +57,7 @@ class Task:
     of_objects: bool = False
 
     def __call__(self, contender: Contender, setting: Setting) -> Outcome | None:
-        """Return the outcome, or None without questions."""
+        """Return the outcome, or None if the task has no scenes."""
         if self.of_objects:
             setting = setting.complete
             if not len(setting.scenes):

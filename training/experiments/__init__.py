@@ -10,7 +10,7 @@ results.py      means over seeds, paired differences, JSON and Markdown
 plots.py        plots for the tables
 benchmark.py    all baselines and machines on the same scenes; the seed protocol; shuffled scenes
 ablate.py       a configuration and variants with one change
-compare.py      two models on scenes that both did not learn from
+compare.py      two models on scenes held out from both
 tune.py         search for settings on validation scenes
 sides.py        the two models of a comparison, and their common held-out scenes
 translation.py  a model queried with the classes of another model

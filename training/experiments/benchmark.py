@@ -102,7 +102,7 @@ class Domain:
 
     @property
     def leaks(self) -> bool:
-        """True if a group may be in several parts, so that test near-duplicates are learnt."""
+        """True if a group may be in several parts, so near-duplicates of test scenes are learnt."""
         return self.configs[0].data.split == "random"
 
     def require_groups(self) -> None:
@@ -348,7 +348,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
 
     Raises:
         ConfigError: the split is random, see `Domain.require_groups`.
-        ValueError: invalid tasks, see `shuffled_tasks`; or only relation tasks without relations.
+        ValueError: invalid tasks, see `shuffled_tasks`, or the scenes lack the relations for them.
     """
     domain.require_groups()
     real = options.scenes(domain)
@@ -457,8 +457,8 @@ def shuffled_text(task: str, results: Results) -> str:
 The rows are trained on scenes with objects permuted between scenes. Each scene keeps its number of
 classes, and each class keeps its number of scenes, but co-occurrence is random. Test scenes are
 real. No row should exceed {results.ours}; a row above it uses information from outside the training
-scenes. A star marks a row below the bold row, with the whole interval.
+scenes. A star marks a row that is worse than the bold row over the whole interval.
 
 {results.markdown({task: (metric,)})}
-Rows above {results.ours} with the whole interval: {", ".join(above) or "none"}.
+Rows above {results.ours} over the whole interval: {", ".join(above) or "none"}.
 """

@@ -1,4 +1,4 @@
-"""`python -m training compare`: compare two models on scenes that both did not learn from."""
+"""`python -m training compare`: compare two models on scenes held out from both."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Comparison:
         results: results with the first model as `ours`.
         b: title of the second model.
         scenes, groups: number of scenes and groups.
-        certain: True if both models certainly did not learn from the scenes.
+        certain: True if the scenes are certainly held out from both models.
         notes: remarks on the results.
         examples: questions with the most different answers.
         unmeasured: relation tasks that the published second model was measured on, if the scenes
@@ -113,7 +113,7 @@ class Comparison:
         return self.results.ours
 
     def worse_by(self, margin: float) -> list[Difference]:
-        """Return primary metrics whose whole interval is worse than the margin."""
+        """Return primary metrics that are worse than the margin over the whole interval."""
         return [
             row for row in self.results.differences if is_primary(row) and row.figure.high < -margin
         ]
@@ -147,7 +147,7 @@ def compare_command(
     examples: Annotated[int, typer.Option(min=0, help="number of changed answers to show")] = 3,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
 ) -> None:
-    """Compare two models on scenes that both did not learn from.
+    """Compare two models on scenes held out from both.
 
     The scenes are the test part of the first model's configuration, without scenes that the second
     model learnt from. Intervals are 95 % and paired, over groups of scenes.

@@ -1,6 +1,6 @@
 """Decide whether a new version may replace the version that an alias serves.
 
-A primary metric must not be worse by more than the margin, with the whole interval of the paired
+A primary metric must not be worse by more than the margin over the whole interval of the paired
 difference. Smaller or uncertain losses are accepted. If the served version was measured on
 relations, the comparison must measure relations too.
 """
@@ -22,7 +22,7 @@ MARGIN = 0.02
 
 
 class WorseError(RuntimeError):
-    """The new version is worse, or unmeasured on relations; `comparison` holds the details."""
+    """The new version is worse, or it is not measured on relations; see `comparison`."""
 
     def __init__(self, comparison: Comparison, margin: float) -> None:
         a, b, reasons = comparison.a, comparison.b, []

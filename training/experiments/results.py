@@ -65,7 +65,7 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """`better`, `worse` or `undecided`: verdict on the reference row by the whole interval."""
+        """Return `better`, `worse` or `undecided` for the reference row, by the whole interval."""
         low, high = self.figure.low, self.figure.high
         if self.metric.startswith(_LOWER_IS_BETTER):
             low, high = -high, -low
@@ -123,7 +123,7 @@ class Results:
     ) -> str:
         """Return one Markdown table per metric, rows by sources, and remarks on each task.
 
-        A star marks a row that the reference row exceeds, with the whole paired interval.
+        A star marks a row that is worse than the reference row over the whole paired interval.
 
         Args:
             shown: metrics by task; by default those of `TASKS`.

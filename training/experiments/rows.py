@@ -100,7 +100,7 @@ def baseline_rows(
     related: bool = True,
     whole: bool = True,
 ) -> Iterator[Row]:
-    """Generate the selected baselines; later seeds only if training depends on the seed.
+    """Generate the rows of selected baselines; deterministic ones have a row for seed 0 only.
 
     Args:
         related: the scenes contain relations; otherwise relation baselines are left out.

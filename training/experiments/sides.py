@@ -27,7 +27,7 @@ from training.runs import RunError, load_run
 from training.trainer import TrainingData
 
 BASELINE_SIDE = "baselines"
-"""Name of the baseline side: EASE for objects, frequency table for relations, their product."""
+"""Baseline side: EASE for objects, frequency table for relations, their product for places."""
 
 _OBJECTS, _RELATIONS = "EASE", "frequency table"
 
@@ -43,7 +43,7 @@ class Side:
     Attributes:
         title: name in tables.
         config: training configuration, or None if unknown.
-        learnt: name to digest of each source that the model learnt from.
+        learnt: digest of each source that the model learnt from, by name.
         artifact: the model; None for the baselines.
         data: folder of the scenes of a run.
     """
@@ -146,7 +146,7 @@ def _baselines(data: TrainingData, say: Say) -> Contender:
 
 # --------------------------------------------------------------------------------- held-out scenes
 
-# Function of a scene: True if the model certainly or possibly did not learn from it.
+# Filter of scenes: False if the model is known to have learnt from the scene.
 Kept = Callable[[AnnotatedScene], bool]
 
 

@@ -55,14 +55,14 @@ FIGURES = {
     "MRR": ("T2 missing", "MRR"),
     "R-precision": ("T1a relations", "R-precision, instance counts"),
 }
-"""Metrics of a trial: name to task and metric of the evaluation."""
+"""Task and metric of the evaluation, by name; trials are judged by these metrics."""
 
 _BY: dict[By, tuple[str, ...]] = {
     "mrr": ("MRR",),
     "r-precision": ("R-precision",),
     "both": tuple(FIGURES),
 }
-# All trials use the same scenes and seed, so that only the search space distinguishes them.
+# All trials use the same scenes and seed, so that they differ only in the searched settings.
 _FIXED = ("data.", "training.seed", "training.threads")
 # Median pruning starts after this number of finished trials and this share of a run.
 _RIVALS = 4

@@ -151,7 +151,7 @@ def test_the_shuffled_control_has_a_page_for_each_task(finished, task, rows):
     assert {cell["row"] for cell in control["cells"]} == rows | MACHINES
     assert {gap["row"] for gap in control["differences"]} == (rows | MACHINES) - {control["ours"]}
     text = (finished[1] / "shuffled" / task / "results.md").read_text()
-    assert f"above {control['ours']} with the whole interval: " in text
+    assert f"above {control['ours']} over the whole interval: " in text
 
 
 def test_the_control_learns_from_other_scenes_and_is_asked_about_the_same(finished, results):
@@ -180,9 +180,9 @@ def test_rows_above_the_yardstick_are_named():
         for source in ("x", "pooled")
     )
     text = shuffled_text("T2 missing", Results("popularity", (), differences))
-    assert "above popularity with the whole interval: sees more by 0.200." in text
+    assert "above popularity over the whole interval: sees more by 0.200." in text
     none = shuffled_text("T2 missing", Results("popularity", (), ()))
-    assert "with the whole interval: no row." in none
+    assert "over the whole interval: none." in none
 
 
 def test_plots_lie_beside_the_results(finished):
