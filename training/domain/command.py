@@ -153,7 +153,7 @@ def _next(
     written = ", ".join(map(str, [*targets, *copies]))
     console.print(f"\nwritten: {written}", markup=False, soft_wrap=True)
     console.print(
-        f"next: read them, then  python -m training train {folder}",
+        f"next: check these files, then run  python -m training train {folder}",
         markup=False,
         soft_wrap=True,
     )
@@ -177,7 +177,7 @@ def fail(error: Exception) -> NoReturn:
 
 
 def example(
-    file: Annotated[Path, typer.Argument(help="to write, such as scenes.jsonl")],
+    file: Annotated[Path, typer.Argument(help="output file, such as scenes.jsonl")],
     domain: Annotated[
         Literal["homes", "workplaces"],
         typer.Option(
