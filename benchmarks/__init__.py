@@ -1,1 +1,1 @@
-"""Benchmarks: each a ratio against a yardstick measured in the same run. See docs/benchmarks.md."""
+"""Benchmarks: each compares with a yardstick measured in the same run. See docs/benchmarks.md."""

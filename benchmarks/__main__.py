@@ -1,4 +1,4 @@
-"""``python -m benchmarks``: run them all, or those named."""
+"""``python -m benchmarks``: run all benchmarks, or those named on the command line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from benchmarks.training import training_step
 
 
 class Name(StrEnum):
-    """The benchmarks, in the order in which they run."""
+    """The benchmarks, in the order of execution."""
 
     GIBBS = "gibbs"
     TRAINING = "training"
@@ -29,13 +29,13 @@ class Name(StrEnum):
 
 
 def main(
-    names: Annotated[list[Name] | None, typer.Argument(help="all of them by default")] = None,
+    names: Annotated[list[Name] | None, typer.Argument(help="benchmarks; by default all")] = None,
     json_path: Annotated[
-        Path | None, typer.Option("--json", help="also write every sample here")
+        Path | None, typer.Option("--json", help="also write all samples to this file")
     ] = None,
     store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
 ) -> None:
-    """Measure ratios against yardsticks that run in turns with what is measured."""
+    """Measure speed ratios against yardsticks; contender and yardstick alternate."""
     console = Console()
     machine = describe_machine()
     for key, value in machine.items():

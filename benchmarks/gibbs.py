@@ -1,4 +1,4 @@
-"""Gibbs sampling of an RBM over objects: sweeps of many chains a second."""
+"""Gibbs sampling of an RBM over objects: sweeps per second of many chains."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ S = TypeVar("S")
 
 
 class Chains(Generic[S]):
-    """A state that every call moves on by one sweep."""
+    """A chain state; each call advances it by one sweep."""
 
     def __init__(self, state: S, sweep: Callable[[S], S]) -> None:
         self.state, self.sweep = state, sweep
@@ -33,7 +33,7 @@ class Chains(Generic[S]):
 def gibbs(
     *, V: int = 417, H: int = 200, chains: int = 512, objects: int = 12, rounds: int = 41
 ) -> Result:
-    """Sweeps over all chains; every sampler has the same weights and starts at the same scenes."""
+    """Time sweeps over all chains; all samplers use the same weights and initial scenes."""
     machine = object_machine(MachineSpec("rbm", V=V, A=4, H1=H), objects)
     generator = torch.Generator().manual_seed(1)
     v = presence(random_scenes(chains, V, objects, generator), V)
@@ -41,7 +41,7 @@ def gibbs(
     W = machine.W
 
     def sweep(state: State) -> State:
-        # No relation unit exists, so there is none to draw.
+        # An RBM over objects has no relation units.
         return gibbs_step(machine, state, generator, relations=False)
 
     sklearn_rbm, rbms_rbm = scikit_learn(machine), rbms(machine)

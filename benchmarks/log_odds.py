@@ -1,4 +1,4 @@
-"""Log-odds of every object class for one scene."""
+"""Time to compute the log-odds of every object class for one scene."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ONE_COPY = "scikit-learn, V + 1 copies"
 def log_odds(
     *, V: int = 417, H: int = 200, objects: int = 12, K: int = 32, rounds: int = 31
 ) -> Result:
-    """The local Triway machine in closed form; scikit-learn by free energies of copied scenes."""
+    """Time the local Triway machine in closed form, and scikit-learn with copies of the scene."""
     spec = MachineSpec("triway", V=V, A=4, H1=H, K=K, form="local")
     machine = object_machine(spec, objects)
     scorer, rbm = ContextScorer(machine.W.detach().numpy()), scikit_learn(machine)
@@ -39,7 +39,7 @@ def log_odds(
         return object_log_odds(machine, Evidence(v))
 
     def two_copies() -> Any:
-        """Each class present against absent, which scores all classes alike."""
+        """Score each class as present against absent; valid for all classes."""
         present = np.repeat(v.numpy(), V, axis=0)
         absent = present.copy()
         np.fill_diagonal(present, 1)
@@ -47,7 +47,7 @@ def log_odds(
         return rbm._free_energy(absent) - rbm._free_energy(present)
 
     def one_copy() -> Any:
-        """Each class present against the scene as it is, which is enough for the absent ones."""
+        """Score each class as present against the unchanged scene; valid for absent classes."""
         present = np.repeat(v.numpy(), V, axis=0)
         np.fill_diagonal(present, 1)
         return rbm._free_energy(v.numpy()) - rbm._free_energy(present)

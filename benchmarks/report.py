@@ -1,4 +1,4 @@
-"""Results as tables and as JSON, with the machine that they were taken on."""
+"""Results as tables and as JSON, with a description of the machine."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _PACKAGES = ("torch", "numpy", "scikit-learn", "rbms", "fastapi", "uvicorn", "py
 
 @dataclass(frozen=True)
 class Result:
-    """One benchmark's outcome.
+    """Result of one benchmark.
 
     Attributes:
-        name: of the benchmark.
-        title: what was measured, in words.
-        subject: the contender that is ours.
-        timings: of every contender.
-        work, unit: a call does `work` of `unit`; None where the time of a call says it all.
-        targets: at least so many times faster than this yardstick is what we aim at.
-        facts: whatever else belongs to the outcome.
+        name: name of the benchmark.
+        title: description of the measurement.
+        subject: name of our contender.
+        timings: timings of all contenders.
+        work, unit: amount of work of one call and its unit; without a unit, only times are shown.
+        targets: minimum speed ratio that we aim at, by yardstick.
+        facts: further results.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Result:
     facts: Mapping[str, Fact] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
-        """Every sample, and the ratios that follow from them."""
+        """Return all samples and the ratios computed from them."""
         return {
             "name": self.name,
             "title": self.title,
@@ -63,7 +63,7 @@ class Result:
         }
 
     def table(self) -> Group:
-        """Contenders by row; the ratio is our speed over theirs, with its quartiles over rounds."""
+        """Return a table by contender; the ratio is our speed over theirs, with quartiles."""
         table = Table(title=self.title, title_justify="left")
         table.add_column("")
         table.add_column("a call", justify="right")
@@ -90,7 +90,7 @@ class Result:
 
 
 def duration(seconds: float) -> str:
-    """Seconds in the unit that reads best."""
+    """Format seconds with a suitable unit."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"
@@ -98,12 +98,12 @@ def duration(seconds: float) -> str:
 
 
 def document(results: Sequence[Result], machine: Mapping[str, object]) -> dict[str, object]:
-    """The JSON document of a run."""
+    """Return the JSON document of a run."""
     return {"machine": dict(machine), "results": [result.to_dict() for result in results]}
 
 
 def describe_machine() -> dict[str, object]:
-    """The machine as it is now, its load included."""
+    """Describe the machine and its current load."""
     load = os.getloadavg() if hasattr(os, "getloadavg") else ()
     return {
         "taken": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -1,9 +1,9 @@
-"""What a larger vocabulary costs: memory of the loaded model, and latency of every question.
+"""Cost of larger vocabularies: memory of the loaded model, and latency of every question.
 
-Random weights of the shipped default's sizes, as wide as trained ones spread and with as many
-objects a scene: how long an answer takes depends on these, not on what the weights say. Random
-relation weights lie in more directions than trained ones, so `/relations` takes longer here than
-with a trained model; the ratios between vocabularies are what this is for.
+The weights are random, with the sizes and standard deviations of the shipped default model and the
+same number of objects per scene. Latency depends on these, not on the learnt values. Random
+relation weights have a higher rank than trained ones, so `/relations` takes longer here. The
+benchmark serves to compare vocabulary sizes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from training.machines.chain_samples import pack_scenes
 CLASSES = (417, 2_000, 10_000)
 OBJECTS, SCENES = 12, 8
 
-# Standard deviations of the trained default's weights; the rest is drawn by `object_machine`.
+# Standard deviations of the default model's weights; `object_machine` draws the other weights.
 _SPREAD = {"S": 0.065, "O": 0.065, "R": 0.32, "M": 0.23, "P": 0.06, "B": 0.14}
 _TRIPLES_A_CLASS = 17
 _MEGABYTE = 1e6
@@ -47,12 +47,12 @@ def scaling(
     objects: int = OBJECTS,
     rounds: int = 31,
 ) -> list[Result]:
-    """One result for each question: the same machine but for V, called in turns.
+    """Return one result per question; machines that differ only in V are called in turns.
 
     Args:
-        classes: vocabulary sizes V, the least first: it is the yardstick of the others.
-        N: fantasies.
-        objects: in the scene that is asked about, the same for all.
+        classes: vocabulary sizes V in increasing order; the first is the yardstick.
+        N: number of persistent-chain samples.
+        objects: number of objects of the scene, equal for all sizes.
     """
     scene = _scene(classes[0], objects)
     with TemporaryDirectory() as folder:
@@ -71,7 +71,7 @@ def scaling(
         results.append(
             Result(
                 name=f"scaling {question}",
-                title=f"/{question}: how many times as long as with {_name(classes[0])}",
+                title=f"/{question}: latency relative to {_name(classes[0])}",
                 subject=_name(classes[0]),
                 timings=interleave(calls, rounds=rounds),
                 facts={} if results else facts,
@@ -103,7 +103,7 @@ def _questions(scene: Scene) -> Mapping[str, Question]:
 
 
 def _scene(V: int, objects: int) -> Scene:
-    """Objects among the first V classes, by their frequencies."""
+    """Draw a scene of objects among the first V classes, by frequency."""
     drawn = random_scenes(1, V, objects, torch.Generator().manual_seed(1))[0].tolist()
     return Scene(tuple(SceneObject(_label(i), _label(i), i) for i in drawn))
 
@@ -143,14 +143,14 @@ def _machine(spec: MachineSpec, objects: int) -> BoltzmannMachine:
     machine = object_machine(spec, objects)
     generator = torch.Generator().manual_seed(2)
     if not isinstance(machine, Triway):
-        raise TypeError("scaling is measured of a Triway")
+        raise TypeError("the scaling benchmark needs a Triway machine")
     for name, spread in _SPREAD.items():
         parameter = machine.get_parameter(name)
         parameter.copy_(torch.randn(parameter.shape, generator=generator) * spread)
     machine.d.fill_(-2.0)
-    # Rules that nobody learnt would only turn relations on by the hundred.
+    # Random rules at full strength would turn on hundreds of relations.
     machine.get_parameter("gamma").mul_(0.2)
-    # Distinct (a, i, j), sorted, spread over all of them.
+    # Distinct sorted triples (a, i, j), evenly spread over all triples.
     units = spec.A * spec.V**2
     keys = (torch.arange(spec.T, dtype=torch.float64) * (units / spec.T)).long()
     square = spec.V**2
@@ -163,8 +163,8 @@ def _machine(spec: MachineSpec, objects: int) -> BoltzmannMachine:
 
 
 def _memory(first: Path, path: Path, scene: Scene) -> int:
-    """Resident bytes that loading a model and asking it everything adds to a process of its own."""
-    # A process that has asked another model before holds the compiled loops already.
+    """Return the resident bytes that loading and querying a model adds to a new process."""
+    # The process queries another model first, so that compiled loops are already loaded.
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(_resident, (first, path, scene))
 

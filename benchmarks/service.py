@@ -1,4 +1,4 @@
-"""The running service: from process start to ready, and one warm question on one connection."""
+"""Start-up time of the service, and latency of one warm question on one connection."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 
 
 class NoModelError(RuntimeError):
-    """There is no store, or none of its models answers."""
+    """The store is missing, or none of its models is ready."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class Service:
     """A service that is ready.
 
     Attributes:
-        client: one connection, kept alive.
-        seconds: from the start of the process to the first 200 of /health/ready.
+        client: client with one keep-alive connection.
+        seconds: time from the start of the process to the first status 200 of /health/ready.
     """
 
     client: httpx.Client
@@ -45,19 +45,19 @@ class Service:
 def service(
     *, store: Path = Path("model_store"), objects: int = 12, requests: int = 500, rounds: int = 3
 ) -> list[Result]:
-    """Start-up, and latency at one connection.
+    """Measure start-up, and latency on one connection.
 
     Args:
-        store: directory of published models, of which the default one is asked.
-        objects: in the scene.
-        requests: of each kind, in turns, after a tenth as many to warm up.
-        rounds: starts.
+        store: directory of published models; the default model is queried.
+        objects: number of objects in the scene.
+        requests: number of requests of each kind, alternating, after 10 % warm-up requests.
+        rounds: number of starts.
 
     Raises:
-        NoModelError: nothing can be measured.
+        NoModelError: the service cannot be measured.
     """
     if not store.is_dir():
-        raise NoModelError(f"{store} does not exist: publish a model, or name a store")
+        raise NoModelError(f"{store} does not exist: publish a model or name another store")
     ready: list[float] = []
     imports: list[float] = []
     requested: dict[str, list[float]] = {}
@@ -87,15 +87,15 @@ def service(
 
 @contextmanager
 def running(store: Path) -> Iterator[Service]:
-    """A service of its own process, stopped at the end.
+    """Run the service in a separate process and stop it at the end.
 
     Raises:
-        NoModelError: it ended, or was not ready in time.
+        NoModelError: the process ended, or the service was not ready in time.
     """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    # The machine's own settings must not decide what is measured.
+    # SCENE_* settings of this machine must not affect the benchmark.
     environment = {name: value for name, value in os.environ.items() if name[:6] != "SCENE_"}
     environment |= {"SCENE_STORE": str(store.resolve()), "SCENE_PORT": str(port)}
     start = time.perf_counter()
@@ -127,7 +127,7 @@ def _wait(client: httpx.Client, process: subprocess.Popen[bytes], start: float) 
             continue
         if response.is_success:
             return
-        # It listens only after everything is loaded, so it will not become ready by itself.
+        # The service listens only after loading, so it will not become ready later.
         answer = response.json()["title"]
         break
     raise NoModelError(f"the service is not ready: {answer}")

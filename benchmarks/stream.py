@@ -1,9 +1,10 @@
-"""``python -m benchmarks.stream``: updates over a stream, beside requests with the whole scene.
+"""``python -m benchmarks.stream``: updates over a stream, compared with requests of whole scenes.
 
-One thing of a posed room moves every tick, and all three questions are asked. Blocks of ticks go
-over a stream and as requests (three of them, on a connection kept alive) in turns, so that both see
-the same machine; between two updates a ping says what the way there and back takes by itself. A
-latency runs from when its tick was due: whatever delays the client or the service is charged.
+At each tick one object of a room with poses moves, and all three questions are asked. Blocks of
+ticks alternate between the stream and requests, so that both see the same machine. Without the
+stream, a tick takes three requests on a keep-alive connection. A ping between two updates measures
+the round-trip time.
+Latency runs from the scheduled time of a tick, so it includes delays of the client.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from benchmarks.report import describe_machine
 ASK: Final = {"missing": {"top_k": 10}, "outliers": {}, "relations": {"top_k": 20}}
 STREAM, PING, REQUESTS = "update, answered", "ping, answered", "three requests, answered"
 AIM: Final = 0.020
-"""Seconds that 99 of 100 updates may take."""
+"""Target: 99 % of the updates take less than this time in seconds."""
 
 _BLOCK: Final = 100
 _QUANTILES: Final = (0.5, 0.9, 0.99)
@@ -40,13 +41,13 @@ _QUANTILES: Final = (0.5, 0.9, 0.99)
 
 @dataclass
 class Measured:
-    """What one run saw.
+    """Results of one run.
 
     Attributes:
-        seconds: from when each tick was due until it was answered.
-        answers: how many messages answered the updates.
-        superseded: updates that an answer to a newer one covered.
-        bytes: of all these answers, and of all responses to requests.
+        seconds: time from the schedule of each tick to its answer.
+        answers: number of messages that answered updates.
+        superseded: number of updates covered by the answer to a newer update.
+        bytes: size of all answers of the stream, and of all responses to requests.
     """
 
     seconds: dict[str, list[float]] = field(
@@ -57,12 +58,12 @@ class Measured:
     bytes: dict[str, int] = field(default_factory=lambda: {STREAM: 0, REQUESTS: 0})
 
     def quantile(self, name: str, q: float) -> float:
-        """Seconds."""
+        """Quantile of the latency in seconds."""
         return float(np.quantile(self.seconds[name], q))
 
 
 def room(labels: list[str], objects: int, seed: int = 0) -> list[dict[str, Any]]:
-    """Detections with poses in a room of three metres."""
+    """Return detections with poses in a room of three metres."""
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(labels), objects, replace=False)
     return [
@@ -77,7 +78,7 @@ def room(labels: list[str], objects: int, seed: int = 0) -> list[dict[str, Any]]
 
 
 def moves(things: list[dict[str, Any]], count: int, seed: int = 1) -> list[dict[str, Any]]:
-    """So many detections, each of one thing in another place than before."""
+    """Return ``count`` detections, each with one object at a new position."""
     rng = np.random.default_rng(seed)
     found = []
     for number in range(count):
@@ -87,13 +88,13 @@ def moves(things: list[dict[str, Any]], count: int, seed: int = 1) -> list[dict[
 
 
 async def measure(port: int, *, updates: int, rate: float, objects: int) -> Measured:
-    """Send so many updates at a rate, and as many scenes as requests.
+    """Send updates at a fixed rate, and the same number of scenes as requests.
 
     Args:
-        port: of a service on this machine.
-        updates: how many; those of a first block that warms up come on top.
-        rate: updates a second.
-        objects: in the room.
+        port: port of a service on this machine.
+        updates: number of updates, without the warm-up block.
+        rate: updates per second.
+        objects: number of objects in the room.
     """
     base = f"http://127.0.0.1:{port}"
     async with (
@@ -115,7 +116,7 @@ async def measure(port: int, *, updates: int, rate: float, objects: int) -> Meas
 
 
 class _Run:
-    """A stream and a connection that are used in turns."""
+    """A stream and a connection, used alternately."""
 
     def __init__(
         self,
@@ -206,11 +207,11 @@ async def _timed(
 
 def main(
     store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
-    updates: Annotated[int, typer.Option(min=1, help="how many")] = 1000,
-    rate: Annotated[float, typer.Option(min=1, help="updates a second")] = 50.0,
-    objects: Annotated[int, typer.Option(min=1, max=256, help="in the room")] = 12,
+    updates: Annotated[int, typer.Option(min=1, help="number of updates")] = 1000,
+    rate: Annotated[float, typer.Option(min=1, help="updates per second")] = 50.0,
+    objects: Annotated[int, typer.Option(min=1, max=256, help="objects in the room")] = 12,
 ) -> None:
-    """Stream updates to the service, and ask it the same in requests."""
+    """Stream updates to the service, and send the same scenes as requests."""
     console = Console(width=120)
     for key, value in describe_machine().items():
         console.print(f"{key}: {value}", highlight=False)
@@ -220,7 +221,7 @@ def main(
         os.sched_setaffinity(0, servers.cores()[1])
         found = uvloop.run(measure(service.port, updates=updates, rate=rate, objects=objects))
     table = Table(title=f"{updates} updates at {rate:g} a second, {objects} objects (milliseconds)")
-    for column in ("", *(f"p{100 * q:g}" for q in _QUANTILES), "p99 beside the stream's"):
+    for column in ("", *(f"p{100 * q:g}" for q in _QUANTILES), "p99 relative to the stream"):
         table.add_column(column, justify="left" if not column else "right")
     own = found.quantile(STREAM, 0.99)
     for name in (STREAM, PING, REQUESTS):
@@ -230,8 +231,8 @@ def main(
     console.print(table)
     share = found.bytes[STREAM] / found.bytes[REQUESTS]
     each = found.bytes[STREAM] / found.answers
-    console.print(f"answers: {found.answers}, covering {found.superseded} updates besides")
-    console.print(f"bytes: {each:.0f} an answer; {share:.2f} of all that the requests brought")
+    console.print(f"answers: {found.answers}; they also cover {found.superseded} older updates")
+    console.print(f"bytes: {each:.0f} per answer; {share:.2f} of the bytes of the requests")
     verdict = "met" if own < AIM else "MISSED"
     console.print(f"p99 of an update: {1e3 * own:.2f} ms; below {1e3 * AIM:.0f} ms: {verdict}")
 

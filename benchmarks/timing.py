@@ -1,8 +1,8 @@
-"""Interleaved timing: what is compared is measured in turns, so that it sees the same machine.
+"""Interleaved timing: contenders take turns, so that all see the same state of the machine.
 
-A shared machine slows down and speeds up within seconds. Contenders take turns in short slices, the
-first of a round changing from round to round, and a ratio is taken within each round; its median
-over the rounds is the result.
+The speed of a shared machine varies within seconds. Contenders run alternately in short slices, and
+the first contender changes from round to round. The speed ratio is computed within each round. The
+result is the median ratio over the rounds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times faster: median over rounds, and the first and third quartile."""
+    """Speed ratio: median over rounds, and the first and third quartile."""
 
     median: float
     low: float
@@ -28,7 +28,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Timings:
-    """Seconds of one call by contender, one number a round."""
+    """Seconds per call by contender, one value per round."""
 
     seconds: Mapping[str, list[float]]
 
@@ -36,7 +36,7 @@ class Timings:
         return median(self.seconds[name])
 
     def ratio(self, name: str, yardstick: str) -> Ratio:
-        """How many times faster `name` is than `yardstick`."""
+        """Return how many times faster `name` is than `yardstick`."""
         pairs = zip(self.seconds[yardstick], self.seconds[name], strict=True)
         ratios = [other / own for other, own in pairs]
         if len(ratios) == 1:
@@ -55,7 +55,7 @@ def interleave(
 
     Args:
         rounds: at least 1.
-        slice_seconds: a contender is called again until its turn has taken about so long.
+        slice_seconds: approximate time of a slice; a contender is called repeatedly within it.
     """
     if rounds < 1:
         raise ValueError(f"rounds must be at least 1, not {rounds}")
@@ -79,7 +79,7 @@ def interleave(
 
 
 def _calls(contender: Callable[[], object], slice_seconds: float) -> int:
-    contender()  # the first call pays for allocations and caches
+    contender()  # warm up allocations and caches
     return max(1, round(slice_seconds / _seconds(contender, 1)))
 
 

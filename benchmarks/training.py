@@ -1,4 +1,4 @@
-"""One step of contrastive divergence: active pairs and shared weights against the dense machine."""
+"""One step of contrastive divergence: active pairs with shared weights against a dense machine."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def training_step(
     objects: int = 12,
     rounds: int = 5,
 ) -> Result:
-    """CD-1 of the Triway machine, on active pairs and over all V + A·V² units."""
+    """Time CD-1 of the Triway machine on active pairs and on all V + A·V² units."""
     generator = torch.Generator().manual_seed(0)
     classes = random_scenes(scenes, V, objects, generator)
     pairs = (scenes, A, objects, objects)
@@ -73,7 +73,7 @@ def training_step(
 def _triway_step(
     spec: MachineSpec, batch: Batch, objects: int, generator: torch.Generator
 ) -> Callable[[], None]:
-    """Forward, gradients by autograd and update, with the objective that training uses."""
+    """Return a step: forward pass, gradients by autograd, and update, as in training."""
     machine = build(spec).initialise(generator, scale=0.05)
     with torch.no_grad():
         machine.b.copy_(frequencies(spec.V, objects).logit())
@@ -93,10 +93,11 @@ def _triway_step(
 
 
 def _dense_step(batch: Batch, A: int, H: int, generator: torch.Generator) -> Callable[[], None]:
-    """The same step with every unit and weight in memory, one hidden layer, plain torch.
+    """Return the same step with all units and weights in memory, one hidden layer, plain torch.
 
-    Objects and all A·V² relations are one visible layer x; gates and held objects are products and
-    maxima over it. Gradients are added to the weights as they are formed, by hand.
+    Objects and all A·V² relations form one visible layer x. Gates are products over x, and objects
+    that active relations force on are maxima over x. The step adds gradients directly to the
+    weights.
     """
     scenes, V = batch.v.shape
     x = torch.zeros(scenes, V + A * V * V)

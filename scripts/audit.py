@@ -1,10 +1,10 @@
-"""Audit the code and its locked packages: known vulnerabilities, risky code, a bill of materials.
+"""Audit the code and its locked packages: known vulnerabilities, risky code, bill of materials.
 
 Usage: python scripts/audit.py [--may-be-unreachable]   (or `make audit`)
 
-Exit status: 0 everything was looked at and nothing found; 1 something was found, or a part failed;
-3 nothing was found, but a part was NOT RUN because no advisory service answered. With
---may-be-unreachable that, too, is 0; the last line says NOT RUN all the same.
+Exit status: 0 if all parts ran without findings; 1 if a part has findings or failed; 3 if a part
+is NOT RUN because no advisory service answered. With --may-be-unreachable the status is 0 instead
+of 3; the last line still says NOT RUN.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 LOCKS = ("requirements.lock", "requirements-training.lock", "requirements-dev.lock")
-# What the two images hold; development tools are shipped nowhere.
+# Lock files of the two images; images contain no development tools.
 SHIPPED = {"service": "requirements.lock", "training": "requirements-training.lock"}
 SOURCES = ("app", "training")
 BILLS = ROOT / "build"
 
-# Asked in turn until one of them answers as an advisory service does.
+# Advisory services, tried in this order until one works.
 SERVICES = ("pypi", "osv")
-# Vulnerable for good (CVE-2019-10906). A package index that knows no advisories answers without
-# any, and pip-audit takes that, and even "no such package", for "no known vulnerabilities": so
-# an answer about the locks counts only where this one is known.
+# Permanently vulnerable package (CVE-2019-10906). A package index without advisories returns an
+# empty list, which pip-audit reports as "no known vulnerabilities". So a service counts as working
+# only if it reports this vulnerability.
 CANARY = "jinja2==2.10"
 
 
 class Verdict(Enum):
-    """How a part of the audit ended."""
+    """Result of a part of the audit."""
 
     OK = "ok"
     FOUND = "FOUND"
@@ -42,26 +42,26 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A verdict and, line by line, what it rests on."""
+    """A verdict and its reasons, one per line."""
 
     verdict: Verdict
     lines: tuple[str, ...]
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:
-    """A tool of this environment, run from the repository's root."""
+    """Run a tool of this environment in the root of the repository."""
     return subprocess.run(
         [sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, check=False
     )
 
 
 def judge(output: str, trouble: str, required: set[str]) -> Outcome:
-    """What a run of pip-audit means.
+    """Interpret the output of pip-audit.
 
     Args:
-        output: its standard output, JSON where it got an answer for every package.
-        trouble: its standard error.
-        required: names of the packages it was to look at.
+        output: standard output; JSON if pip-audit received an answer for every package.
+        trouble: standard error.
+        required: names of the packages to check.
     """
     try:
         entries = json.loads(output)["dependencies"]
@@ -84,24 +84,24 @@ def judge(output: str, trouble: str, required: set[str]) -> Outcome:
 
 
 def ask(service: str, *arguments: str) -> tuple[str, str]:
-    """Output and error of pip-audit over pinned requirements, which it is not to resolve."""
+    """Run pip-audit on pinned requirements without resolving them; return output and error."""
     fixed = ("--no-deps", "--disable-pip", "--progress-spinner=off", "--format=json")
     done = run("pip_audit", f"--vulnerability-service={service}", *fixed, *arguments)
     return done.stdout, done.stderr
 
 
 def knows_advisories(service: str) -> Outcome:
-    """`FOUND` where the service knows of a flaw that everybody knows of."""
+    """Return `FOUND` if the service reports the vulnerability of `CANARY`."""
     canary = BILLS / "canary.txt"
     canary.write_text(CANARY + "\n", "utf-8")
     outcome = judge(*ask(service, f"--requirement={canary}"), {CANARY.partition("==")[0]})
     if outcome.verdict is Verdict.OK:
-        return Outcome(Verdict.NOT_RUN, (f"it knows no advisory about {CANARY}",))
+        return Outcome(Verdict.NOT_RUN, (f"the service has no advisory about {CANARY}",))
     return outcome
 
 
 def pinned(lock: str) -> set[str]:
-    """The names in a lock file that apply to this machine's platform."""
+    """Return the package names of a lock file that apply to this platform."""
     lines = (ROOT / lock).read_text("utf-8").splitlines()
     apply = [line for line in lines if "==" in line and not line.startswith("#")]
     if sys.platform == "win32":
@@ -110,7 +110,7 @@ def pinned(lock: str) -> set[str]:
 
 
 def advisories() -> Outcome:
-    """Known vulnerabilities of everything in the lock files."""
+    """Check all packages of the lock files for known vulnerabilities."""
     reasons = []
     for service in SERVICES:
         known = knows_advisories(service)
@@ -118,19 +118,19 @@ def advisories() -> Outcome:
             files = [f"--requirement={lock}" for lock in LOCKS]
             return judge(*ask(service, *files), set().union(*map(pinned, LOCKS)))
         reasons.append(f"{service}: {known.lines[0]}")
-    return Outcome(Verdict.NOT_RUN, ("no advisory service could be reached", *reasons))
+    return Outcome(Verdict.NOT_RUN, ("all advisory services failed", *reasons))
 
 
 def risky_code() -> Outcome:
-    """Bandit's findings in what is shipped, as pyproject.toml configures it."""
+    """Run bandit on the shipped code, configured by pyproject.toml."""
     done = run("bandit", "--quiet", "--configfile=pyproject.toml", "--recursive", *SOURCES)
     if done.returncode:
         return Outcome(Verdict.FOUND, tuple((done.stdout + done.stderr).strip().splitlines()))
-    return Outcome(Verdict.OK, (f"nothing in {', '.join(SOURCES)}",))
+    return Outcome(Verdict.OK, (f"no findings in {', '.join(SOURCES)}",))
 
 
 def bills_of_materials() -> Outcome:
-    """CycloneDX documents of what each image holds, checked against the format's schema."""
+    """Write a CycloneDX document for each image and validate it against the schema."""
     lines = []
     for name, lock in SHIPPED.items():
         bill = BILLS / f"sbom-{name}.cdx.json"
@@ -148,7 +148,7 @@ def bills_of_materials() -> Outcome:
 
 
 def exit_status(verdicts: list[Verdict], *, may_be_unreachable: bool) -> int:
-    """What the audit as a whole comes to."""
+    """Return the exit status of the whole audit."""
     if Verdict.FOUND in verdicts:
         return 1
     return 3 if Verdict.NOT_RUN in verdicts and not may_be_unreachable else 0
@@ -159,7 +159,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--may-be-unreachable",
         action="store_true",
-        help="exit with 0 where no advisory service answers",
+        help="exit with status 0 if no advisory service answers",
     )
     options = parser.parse_args(arguments)
     BILLS.mkdir(exist_ok=True)

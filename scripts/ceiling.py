@@ -1,10 +1,10 @@
-"""How far two scans of one room agree: what a perfect model of rooms could hope for.
+"""Agreement of two scans of the same room: an upper bound for models of rooms.
 
-For each scan of a room that was scanned more than once, another scan of the same room, drawn at
-random, answers in place of a model:
+For each scan of a room with several scans, a random other scan of the room replaces the model:
 
-    relations   its triples, ties broken at random: R-precision between classes that both hold
-    objects     its classes: the reciprocal rank of a removed class, ties in expectation
+    relations   its triples predict relations. Metric: R-precision between classes of both scans,
+                with ties in random order
+    objects     its classes predict a removed class. Metric: reciprocal rank, expected over ties
 
 Run as `python -m scripts.ceiling [FOLDER] [SOURCE]`.
 """
@@ -22,7 +22,7 @@ from training.datasets import EncodedScene, encode, indoor_vocabulary, read_scen
 
 
 def agreement(scenes: list[EncodedScene], structure: np.ndarray, seed: int = 0) -> dict[str, float]:
-    """The figures over all scans that have a sibling."""
+    """Compute the metrics over all scans of rooms with several scans."""
     rooms: dict[str, list[EncodedScene]] = defaultdict(list)
     for scene in scenes:
         if scene.evidence.holds.any():
@@ -52,7 +52,7 @@ def agreement(scenes: list[EncodedScene], structure: np.ndarray, seed: int = 0) 
 def _relations(
     scan: EncodedScene, other: EncodedScene, structure: np.ndarray
 ) -> tuple[float, float, float]:
-    """(expected hits, annotated triples, hits of random order) over the scan's candidates."""
+    """Return (expected hits, annotated triples, hits of random order) over a scan's candidates."""
     ours, theirs = scan.evidence, other.evidence
     usable = ~structure[ours.classes]
     pair = usable[:, None] & usable[None, :] & ~np.eye(len(usable), dtype=np.bool_)
@@ -70,7 +70,7 @@ def _relations(
 
 
 def _objects(scan: EncodedScene, other: EncodedScene, structure: np.ndarray) -> list[float]:
-    """Reciprocal rank of each removed class: what the other scan holds comes first."""
+    """Return the reciprocal rank of each removed class; classes of the other scan come first."""
     mine = {int(c) for c in scan.evidence.classes if not structure[c]}
     theirs = {int(c) for c in other.evidence.classes if not structure[c]}
     absent = int((~structure).sum()) - len(mine) + 1
@@ -85,7 +85,7 @@ def _objects(scan: EncodedScene, other: EncodedScene, structure: np.ndarray) -> 
 
 
 def main() -> None:
-    """Print the figures of one source, 3dssg by default."""
+    """Print the metrics of one source, by default 3dssg."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "../shared/data")
     source = sys.argv[2] if len(sys.argv) > 2 else "3dssg"
     vocabulary = indoor_vocabulary()

@@ -1,13 +1,13 @@
-"""Record what a running service answers, and compare another version's answers with the record.
+"""Record the answers of a running service, and compare another version with the record.
 
     python -m scripts.corpus record http://127.0.0.1:8000 answers.jsonl.gz --key ADMIN_KEY
     python -m scripts.corpus compare http://127.0.0.1:8001 answers.jsonl.gz --key ADMIN_KEY
 
-Both services serve the repository's own `model_store`; `compare` replays the recorded requests. An
-answer is equal if its status, its problem type and its fields are, its numbers within 1e-5. Order
-and cut of a list may differ where probabilities are that close. Of `/generate` only what does not
-depend on the draw is compared here, and the shares of classes in many drawn scenes, each by a test
-of two proportions.
+Both services serve the `model_store` of the repository; `compare` replays the recorded requests.
+Two answers are equal if status, problem type and fields are equal, with numbers within 1e-5. Order
+and length of a list may differ among entries with equal probabilities. Answers of `/generate` are
+random. They are compared by their fixed fields, and by the shares of classes in many scenes, with a
+test of two proportions per class.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ MODELS: Final = (
 )  # fmt: skip
 RELATIONS: Final = ("left", "right", "front", "behind", "on-top", "under", "above", "below")
 HEADERS: Final = ("content-type", "retry-after", "www-authenticate", "allow", "location")
-# No deadline passes on a busy machine.
+# A long deadline, so that requests also finish on a busy machine.
 PATIENCE: Final = {"x-request-timeout-ms": "60000"}
-# Different in each answer, or in each process.
+# Fields that differ between answers or between processes.
 VOLATILE: Final = frozenset({"request_id", "instance", "session", "seed"})
-# Lists of an answer that are about the scene.
+# Lists that describe the scene, not the answer.
 NOTES: Final = frozenset({"ignored", "mapped", "warnings"})
-# Chance that one of all compared shares of classes differs although nothing has changed.
+# Probability of at least one false alarm among all compared shares.
 FAILURE: Final = 1e-3
 
 Json = Any
@@ -58,12 +58,12 @@ Json = Any
 
 
 class Scenes:
-    """Random scenes of one model.
+    """Generator of random scenes for one model.
 
     Args:
-        labels: that the model knows.
-        rooms: room types that it knows.
-        likely: scenes that it has drawn, so that half of ours are like real ones.
+        labels: labels that the model knows.
+        rooms: room types that the model knows.
+        likely: scenes that the model generated; about 60 % of the random scenes extend one.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Scenes:
         self.rng, self.labels, self.rooms, self.likely = rng, labels, rooms, likely
 
     def classes(self) -> list[str]:
-        """1 to 24 labels, some of them twice."""
+        """Return 1 to 24 labels, some of them twice."""
         rng = self.rng
         found = list(rng.choice(self.likely)) if rng.random() < 0.6 else []
         found += rng.sample(self.labels, rng.choice([0, 1, 1, 2, 4, 12]))
@@ -83,7 +83,7 @@ class Scenes:
         return found[:24]
 
     def scene(self) -> dict[str, Json]:
-        """What every question takes."""
+        """Return the fields common to all questions."""
         rng, labels = self.rng, self.classes()
         body: dict[str, Json] = {"objects": labels}
         form = rng.random()
@@ -139,7 +139,7 @@ class Scenes:
         ]
 
     def options(self, question: str, body: dict[str, Json]) -> dict[str, Json]:
-        """What one question takes beside the scene."""
+        """Return the fields of one question."""
         rng = self.rng
         names = [o if isinstance(o, str) else o.get("id", o["label"]) for o in body["objects"]]
         found: dict[str, Json] = {}
@@ -172,7 +172,7 @@ class Scenes:
 
 
 def post(path: str, body: Json, **headers: str) -> dict[str, Json]:
-    """A request as it is recorded."""
+    """Return a request in the form of the record."""
     return {
         "method": "POST", "path": path,
         "headers": {"content-type": "application/json", **PATIENCE, **headers},
@@ -181,7 +181,7 @@ def post(path: str, body: Json, **headers: str) -> dict[str, Json]:
 
 
 def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Json]]:
-    """Scenes of every model, alone and in batches."""
+    """Generate questions about scenes for every model, single and in batches."""
     for model in MODELS:
         words = client.get(f"/models/{model}/vocabulary").raise_for_status().json()
         drawn = client.post("/generate", json={"model": model, "count": 64, "seed": 1}).json()
@@ -206,7 +206,7 @@ def questions(client: httpx.Client, rng: random.Random) -> Iterator[dict[str, Js
 
 
 def drawn(client: httpx.Client) -> Iterator[dict[str, Json]]:
-    """Questions of `/generate` whose answers are compared by the shares of classes."""
+    """Generate requests to `/generate` that are compared by the shares of classes."""
     for model in MODELS[1:7]:
         words = client.get(f"/models/{model}/vocabulary").json()
         rooms = [room for room in ("kitchen", "bedroom", "bathroom") if room in words["room_types"]]
@@ -220,7 +220,7 @@ def drawn(client: httpx.Client) -> Iterator[dict[str, Json]]:
 
 
 def errors() -> Iterator[dict[str, Json]]:
-    """Requests that are refused, some of each kind."""
+    """Generate invalid requests of every kind."""
     kinds = (
         list(hostile.wrong_values())[::23], list(hostile.whole_bodies())[::2],
         list(hostile.nonsense()), list(hostile.media_types())[::5], list(hostile.methods()),
@@ -242,7 +242,7 @@ def errors() -> Iterator[dict[str, Json]]:
 
 
 def pages(client: httpx.Client) -> Iterator[dict[str, Json]]:
-    """Everything that is read, and administration without and with its key."""
+    """Generate all GET requests, and administration requests with and without the key."""
     listed = client.get("/models").json()
     paths = [
         "/", "/docs", "/redoc", "/openapi.json", "/models", "/health/live", "/health/ready", "/v2",
@@ -277,7 +277,7 @@ def pages(client: httpx.Client) -> Iterator[dict[str, Json]]:
 
 
 def streams(rng: random.Random) -> Iterator[list[dict[str, Json]]]:
-    """Conversations: a scene that grows and shrinks, with faults in between."""
+    """Generate conversations: a scene that grows and shrinks, with invalid messages in between."""
     labels = ["bed", "lamp", "pillow", "nightstand", "stove", "desk", "chair", "toilet", "sofa"]
     for number in range(24):
         ask = [{"missing": {"top_k": 5}, "outliers": {}}, {"relations": {"top_k": 5}}][number % 2]
@@ -312,7 +312,7 @@ def streams(rng: random.Random) -> Iterator[list[dict[str, Json]]]:
 
 
 def ask(client: httpx.Client, request: dict[str, Json], key: str) -> dict[str, Json]:
-    """What the service answers."""
+    """Send a request and return the answer in the form of the record."""
     headers = {k: v.replace("KEY", key) if v == "KEY" else v for k, v in request["headers"].items()}
     body = base64.b64decode(request["body"])
     answer = client.request(request["method"], request["path"], headers=headers, content=body)
@@ -328,12 +328,12 @@ def ask(client: httpx.Client, request: dict[str, Json], key: str) -> dict[str, J
 
 
 def _in_order(header: str) -> str:
-    """The methods of `Allow` have no order."""
+    """Sort the methods of an `Allow` header, because their order has no meaning."""
     return ", ".join(sorted(header.split(", ")))
 
 
 def converse(url: str, talk: list[dict[str, Json]]) -> list[Json]:
-    """The events of a stream, one after each message."""
+    """Return the events of a stream, one per message."""
     events = []
     with connect(url.replace("http", "ws", 1) + "/stream", max_size=2**24) as socket:
         for message in talk:
@@ -343,15 +343,15 @@ def converse(url: str, talk: list[dict[str, Json]]) -> list[Json]:
 
 
 def comparable(event: dict[str, Json]) -> dict[str, Json]:
-    """An event of a stream in the form of the record, whichever service sent it.
+    """Return an event of a stream in the form of the record, for every version of the service.
 
-    The record holds the lists of all answers together as `lists`, and their other fields beside it.
+    The record has the lists of all answers under `lists`, and their other fields beside it.
     """
     event = {k: v for k, v in event.items() if k not in {"alarms", "superseded"}}
     if event["type"] == "opened":
         return {"type": "opened", "seq": event["seq"]}
     if event["type"] == "problem" and event["problem"].get("errors"):
-        # The message of an unknown type lists the known ones.
+        # The message about an unknown type lists the known types, which may differ.
         for error in event["problem"]["errors"]:
             error["message"] = error["message"].partition("must be open, ")[0]
     if event["type"] == "answer" and "lists" not in event:
@@ -368,7 +368,7 @@ def comparable(event: dict[str, Json]) -> dict[str, Json]:
 
 
 def differences(old: Json, new: Json, at: str = "") -> Iterator[str]:
-    """Where two JSON values differ."""
+    """Generate descriptions of the differences between two JSON values."""
     if isinstance(old, bool) or isinstance(new, bool) or old is None or isinstance(old, str):
         if old != new or type(old) is not type(new):
             yield f"{at}: {old!r:.80} → {new!r:.80}"
@@ -401,7 +401,7 @@ def _lists(old: list[Json], new: list[Json], at: str) -> Iterator[str]:
     for name, entry in before.items():
         if name in after:
             yield from differences(entry, after[name], f"{at}/{name}")
-    # An entry may be cut off by another that is as likely.
+    # An entry at the end of a list may be replaced by an entry of equal probability.
     for mine, other, when in ((old, after, "before"), (new, before, "now")):
         last = abs(_score(mine[-1]) or 0.0) if mine else 0.0
         for entry in mine:
@@ -411,11 +411,11 @@ def _lists(old: list[Json], new: list[Json], at: str) -> Iterator[str]:
     falling = old and abs(_score(old[0]) or 0.0) >= abs(_score(old[-1]) or 0.0)
     steps = pairwise(ranks)
     if falling and any(b > a + TOLERANCE for a, b in steps) and not _is_ordered(old, before, new):
-        yield f"{at}: another order"
+        yield f"{at}: the order differs"
 
 
 def _is_ordered(old: list[Json], before: dict[Json, Json], new: list[Json]) -> bool:
-    """Whether the new order is the old one, which need not fall (disagreements, reasons)."""
+    """Return True if common entries keep their order; some lists are not sorted by probability."""
     common = [_texts(e) for e in new if _texts(e) in before]
     return [_texts(e) for e in old if _texts(e) in set(common)] == common
 
@@ -429,13 +429,13 @@ def _texts(entry: dict[str, Json]) -> Json:
 
 
 def shares(old: Json, new: Json, tests: int) -> Iterator[str]:
-    """Classes whose shares in drawn scenes differ: two proportions, Bonferroni over all tests."""
+    """Generate classes with different shares: test of two proportions, Bonferroni correction."""
     a, b = (
         Counter(label for scene in answer["json"]["scenes"] for label in set(scene["objects"]))
         for answer in (old, new)
     )
     n, m = len(old["json"]["scenes"]), len(new["json"]["scenes"])
-    # |z| of a normal above which a share of FAILURE / tests lies.
+    # Upper bound of the |z| that a normal variable exceeds with probability FAILURE / tests.
     limit = math.sqrt(2 * math.log(tests / FAILURE))
     for label in a.keys() | b.keys():
         p = (a[label] + b[label] + 1) / (n + m + 2)
@@ -445,7 +445,7 @@ def shares(old: Json, new: Json, tests: int) -> Iterator[str]:
 
 
 def undrawn(answer: dict[str, Json]) -> dict[str, Json]:
-    """An answer of `/generate` without what depends on the draw."""
+    """Return an answer of `/generate` without its random fields."""
     if answer["status"] != 200:
         return answer
     scenes = answer["json"]["scenes"]
@@ -457,7 +457,7 @@ def undrawn(answer: dict[str, Json]) -> dict[str, Json]:
 
 
 def record(url: str, file: Path, key: str) -> int:
-    """Ask everything, and write what came."""
+    """Send all requests and write the answers."""
     rng = random.Random(SEED)
     with httpx.Client(base_url=url, timeout=60) as client, gzip.open(file, "wt") as out:
         asked: Counter[str] = Counter()
@@ -479,7 +479,7 @@ def record(url: str, file: Path, key: str) -> int:
 
 
 def compare(url: str, file: Path, key: str) -> int:
-    """Ask everything again; 1 if an answer differs."""
+    """Send all recorded requests again; return 1 if an answer differs."""
     with gzip.open(file, "rt") as lines:
         entries = [json.loads(line) for line in lines]
     tests = 400 * sum(entry["kind"] == "drawn" for entry in entries)
@@ -509,10 +509,10 @@ def compare(url: str, file: Path, key: str) -> int:
 
 
 def wait_until_ready(url: str) -> None:
-    """Return when the service is ready; it may have to compile first.
+    """Wait until the service is ready; its first start compiles kernels.
 
     Raises:
-        TimeoutError: it is not within ten minutes.
+        TimeoutError: the service is not ready within ten minutes.
     """
     end = time.monotonic() + 600
     while time.monotonic() < end:
@@ -520,16 +520,16 @@ def wait_until_ready(url: str) -> None:
             if httpx.get(f"{url}/health/ready").status_code == 200:
                 return
         time.sleep(0.5)
-    raise TimeoutError(f"{url} is not ready")
+    raise TimeoutError(f"{url} is not ready after ten minutes")
 
 
 def main() -> int:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("command", choices=("record", "compare"))
     parser.add_argument("url")
     parser.add_argument("file", type=Path)
-    parser.add_argument("--key", default="", help="the service's admin key")
+    parser.add_argument("--key", default="", help="admin key of the service")
     options = parser.parse_args()
     wait_until_ready(options.url)
     act = record if options.command == "record" else compare

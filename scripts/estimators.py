@@ -1,8 +1,10 @@
-"""`python -m scripts.estimators`: errors of the closed form, and of 64 draws, against very many.
+"""`python -m scripts.estimators`: errors of the closed form and of 64 samples.
 
-For a shipped model that has a closed form, on scenes of its own: bare; with 20 relations drawn at
-random; with random poses, which show hundreds of relations that do and do not hold. Log-odds of
-objects in nats, relations and placements as probabilities.
+The reference uses many more samples (by default 4,096). The model is a shipped one with a closed
+form.
+Its own scenes are used in three forms: labels only, with 20 random relations, or with random poses,
+which determine hundreds of relations. Errors of objects are in nats of log-odds; errors of
+relations and placements are in probability.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ _RELATIONS = 20
 
 
 def scenes(artifact: Artifact, count: int, kind: str) -> Iterator[Scene]:
-    """Scenes of the machine's own objects."""
+    """Generate scenes of objects that the machine sampled."""
     rng = np.random.default_rng(0)
     for v in artifact.weights.scenes[:count]:
         classes = np.flatnonzero(v)[:_OBJECTS].tolist()
@@ -56,7 +58,7 @@ def scenes(artifact: Artifact, count: int, kind: str) -> Iterator[Scene]:
 
 
 def answers(given: Posterior, absent: NDArray[np.int64]) -> dict[str, Values]:
-    """What the questions are made of; placements of some of the absent classes."""
+    """Return the values behind the answers; placements use a few of the absent classes."""
     anchors, likely = np.arange(len(given.present.classes)), absent[:: len(absent) // 5]
     return {
         "absent objects": given.absent_log_odds(absent),
@@ -67,7 +69,7 @@ def answers(given: Posterior, absent: NDArray[np.int64]) -> dict[str, Values]:
 
 
 def errors(artifact: Artifact, count: int, draws: int) -> dict[tuple[str, str, str], list[Values]]:
-    """|estimate - reference| by kind of scene, answer and estimate."""
+    """Return |estimate - reference| by kind of scene, answer and estimate."""
     structure = artifact.vocabulary.structure
     found: dict[tuple[str, str, str], list[Values]] = {}
     few: Callable[[Scene], Any] = lambda scene: DrawnPosterior(artifact, scene)  # noqa: E731

@@ -1,9 +1,9 @@
-"""Write requirements*.lock from both pyproject.toml: the exact versions that are tested together.
+"""Write requirements*.lock from both pyproject.toml: exact versions that are tested together.
 
-pip resolves the development set first, downloads nothing it can read the metadata of, and installs
-nothing; the smaller sets are then resolved inside those pins, so that the files never disagree.
+pip resolves the development set first, without installation. The smaller sets are then resolved
+within these pins, so that all files agree.
 
-Usage: python scripts/lock.py   (or `make lock`; any further arguments go to pip)
+Usage: python scripts/lock.py   (or `make lock`; further arguments go to pip)
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 HEADER = "# {what}. Written by `make lock` from pyproject.toml; do not edit.\n"
 
-# Packages that torch's CUDA builds ask for. Which build is installed is up to the machine, so its
-# companions cannot be pinned here: a pin would drag them onto machines without a GPU.
+# Dependencies of the CUDA builds of torch. The machine determines the build, so these packages are
+# not pinned: a pin would install them on machines without a GPU.
 CUDA_COMPANION = re.compile(r"^(cuda-|nvidia-|triton$)")
 
 
 def resolve(requirements: list[str], pins: Path | None, pip_arguments: list[str]) -> dict[str, str]:
-    """Name → line `name==version` of everything that `requirements` pull in."""
+    """Return the lines `name==version` of `requirements` and their dependencies, by name."""
     command = [
         *(sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "-qq"),
         *("--dry-run", "--ignore-installed", "--report", "-"),
@@ -39,13 +39,13 @@ def resolve(requirements: list[str], pins: Path | None, pip_arguments: list[str]
         name, version = item["metadata"]["name"], item["metadata"]["version"]
         key = re.sub(r"[-_.]+", "-", name).lower()
         if not CUDA_COMPANION.match(key):
-            # A local version (2.13.0+cpu) names one build of one index; the public one fits all.
+            # A local version (2.13.0+cpu) names one build; the public version fits all builds.
             locked[key] = f"{key}=={version.partition('+')[0]}"
     return locked
 
 
 def with_markers(locked: dict[str, str], requirements: list[str]) -> list[str]:
-    """The pins in order, carrying over the environment markers that pyproject.toml states."""
+    """Return the sorted pins with the environment markers of pyproject.toml."""
     markers = {"uvloop": "sys_platform != 'win32'"}
     for requirement in requirements:
         name, _, marker = requirement.partition(";")

@@ -1,7 +1,8 @@
-"""``python -m scripts.request_path``: the files and functions of ours that one request passes.
+"""``python -m scripts.request_path``: files and functions of this project that a request uses.
 
-Counted are Python functions of `app` and `scene_client` that run for one warm request in process,
-with the loops that they compile. Generated methods and comprehensions are part of their function.
+The script counts Python functions of `app` and `scene_client`, and the compiled loops that they
+call, during one warm request in process. Generated methods and comprehensions count as part of
+their function.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ SCENE = {
 
 
 async def ask(app: Any, path: str, body: bytes) -> int:
-    """Send one request to an application; the status of its answer."""
+    """Send one request to an application and return the status of the answer."""
     statuses: list[int] = []
 
     async def receive() -> dict[str, Any]:
@@ -53,7 +54,7 @@ async def ask(app: Any, path: str, body: bytes) -> int:
 
 @contextmanager
 def compiled_calls(found: set[tuple[str, str]]) -> Iterator[None]:
-    """Note the compiled functions that Python calls, which a profiler does not see."""
+    """Record calls of compiled functions, which a profiler does not see."""
     replaced: list[tuple[Any, str, Any]] = []
     for module in [m for name, m in sys.modules.items() if name.startswith("app.")]:
         for name, value in list(vars(module).items()):
@@ -79,7 +80,7 @@ def noted(loop: Any, found: set[tuple[str, str]]) -> Callable[..., Any]:
 
 
 async def passed(path: str, body: bytes, requests: int = 20) -> set[tuple[str, str]]:
-    """(file, function) of everything that one request passes."""
+    """Return (file, function) of all functions that one request calls."""
     app = create_app(Settings())
     found: set[tuple[str, str]] = set()
     is_counting = False
@@ -94,7 +95,7 @@ async def passed(path: str, body: bytes, requests: int = 20) -> set[tuple[str, s
         ):
             found.add((str(Path(code.co_filename).relative_to(ROOT)), code.co_qualname))
 
-    # A busy machine computes in a thread, which begins here.
+    # On a busy machine a thread computes the answer; profile new threads too.
     threading.setprofile(note)
     async with app.router.lifespan_context(app):
         for _ in range(requests):

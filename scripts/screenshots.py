@@ -1,8 +1,8 @@
-"""Pictures of the visual page for the documentation, taken from a running service.
+"""Take screenshots of the web page for the documentation, from a running service.
 
     python scripts/screenshots.py http://127.0.0.1:8000
 
-They need Debian's chromium and the development dependencies, and go to docs/images.
+The script needs Debian's chromium and the development dependencies. It writes into docs/images.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "images"
 WIDE: ViewportSize = {"width": 1360, "height": 820}
-SETTLED = 1500  # milliseconds after which everything is answered and drawn
+SETTLED = 1500  # milliseconds to wait until all answers are displayed
 
 
 def bedroom(page: Page) -> None:
-    """As it opens."""
+    """Show the page as it opens."""
     page.evaluate("scrollTo(0, 0)")
 
 
@@ -58,7 +58,7 @@ PICTURES: dict[str, tuple[Callable[[Page], None], Literal["light", "dark"], View
 
 
 def take(browser: Browser, url: str, name: str) -> Path:
-    """One picture."""
+    """Take one screenshot."""
     act, colours, size = PICTURES[name]
     context = browser.new_context(viewport=size, color_scheme=colours, reduced_motion="reduce")
     page = context.new_page()
@@ -73,10 +73,10 @@ def take(browser: Browser, url: str, name: str) -> Path:
 
 
 def main() -> None:
-    """Take every picture, or those named."""
+    """Take all screenshots, or those named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("url", help="of a running service")
-    parser.add_argument("names", nargs="*", help=f"of {', '.join(PICTURES)}; all by default")
+    parser.add_argument("url", help="URL of a running service")
+    parser.add_argument("names", nargs="*", help=f"screenshots: {', '.join(PICTURES)}; default all")
     arguments = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
     with sync_playwright() as playwright:

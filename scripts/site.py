@@ -1,11 +1,11 @@
-"""What the documentation's site needs beyond mkdocs: hooks, named in mkdocs.yml.
+"""Hooks of mkdocs for the documentation site, named in mkdocs.yml.
 
-- A line ``::: package.module:name`` becomes the source of that function or class, read from the
-  working tree when the site is built, so no excerpt goes stale. Indented lines below it name the
-  tests that check it, ``tests/path.py::test_name``.
-- Links to files of the repository outside docs/ lead to pages that show them.
-- Formulas become MathML, which browsers draw without a script.
-- ``folder/*`` in the navigation is the pages of a folder; CHANGELOG.md is a page.
+- A line ``::: package.module:name`` is replaced by the source of that function or class. The source
+  is read from the working tree when the site is built, so excerpts are always current. Indented
+  lines below the directive name tests of the function, ``tests/path.py::test_name``.
+- Links to repository files outside docs/ lead to generated pages that show the files.
+- Formulas are converted to MathML, which browsers display without scripts.
+- ``folder/*`` in the navigation lists the pages of a folder; CHANGELOG.md becomes a page.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mkdocs.structure.pages import Page
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SOURCES = "source"
-"""Folder of the site with the files of the repository that pages show."""
+"""Folder of the site for pages that show repository files."""
 
 DIRECTIVE = re.compile(
     r"^::: (?P<module>[\w.]+):(?P<name>[\w.]+)\n(?P<checks>(?: {4}\S+\n)*)", re.M
@@ -38,7 +38,7 @@ _LANGUAGES = {".py": "python", ".toml": "toml", ".yml": "yaml", ".json": "json",
 
 
 class Excerpt(NamedTuple):
-    """A piece of a module: its file, relative to the repository, its first line and its text."""
+    """A piece of a module: path relative to the repository, first line, and text."""
 
     path: str
     first: int
@@ -46,19 +46,19 @@ class Excerpt(NamedTuple):
 
 
 def module_path(module: str) -> str:
-    """The file of a module, relative to the repository."""
+    """Return the file of a module, relative to the repository."""
     base = module.replace(".", "/")
     for path in (f"{base}.py", f"{base}/__init__.py"):
         if (REPOSITORY / path).is_file():
             return path
-    raise PluginError(f"there is no module {module} to take an excerpt from")
+    raise PluginError(f"cannot take an excerpt: module {module} does not exist")
 
 
 def excerpt(module: str, name: str) -> Excerpt:
-    """The source of a function, method or class of the repository.
+    """Return the source of a function, method or class of the repository.
 
     Raises:
-        PluginError: there is none of this name.
+        PluginError: the name does not exist.
     """
     path = module_path(module)
     text = (REPOSITORY / path).read_text(encoding="utf-8")
@@ -76,7 +76,7 @@ def excerpt(module: str, name: str) -> Excerpt:
 
 
 def checks(match: re.Match[str]) -> list[tuple[str, str]]:
-    """(path, test) of a directive's checks."""
+    """Return (path, test) for the tests of a directive."""
     return [(path, test) for path, _, test in (c.partition("::") for c in match["checks"].split())]
 
 
@@ -84,7 +84,7 @@ def checks(match: re.Match[str]) -> list[tuple[str, str]]:
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Write out ``folder/*`` in the navigation."""
+    """Expand ``folder/*`` in the navigation."""
     config.nav = [_expanded(entry, Path(config.docs_dir)) for entry in config.nav or []]
     return config
 
@@ -101,14 +101,14 @@ def _expanded(entry: Any, docs: Path) -> Any:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the changelog, and a page for every file of the repository that a page shows."""
+    """Add the changelog, and a page for each repository file that a page shows."""
     changelog = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8").replace("](docs/", "](")
     files.append(File.generated(config, "changelog.md", content=changelog))
     pages = [(page.src_uri, page.content_string) for page in files.documentation_pages()]
     for path in sorted({path for uri, text in pages for path in _shown(uri, text)}):
         language = _LANGUAGES.get(Path(path).suffix, "text")
         source = (REPOSITORY / path).read_text(encoding="utf-8")
-        # Tildes: a docstring may hold a fence of its own.
+        # Fence with tildes, because a docstring may contain a fence of backticks.
         text = (
             f"---\ntitle: {path}\nsearch:\n  exclude: true\n---\n\n~~~~ {language}\n{source}~~~~\n"
         )
@@ -120,7 +120,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def _shown(uri: str, text: str) -> Iterator[str]:
-    """Files outside docs/ that a page links to or quotes, relative to the repository."""
+    """Iterate over files outside docs/ that a page links to or quotes, relative to the root."""
     for match in _LINK.finditer(text):
         if path := _outside(uri, match["target"]):
             yield path
@@ -130,14 +130,14 @@ def _shown(uri: str, text: str) -> Iterator[str]:
 
 
 def _outside(uri: str, target: str) -> str | None:
-    """A link's target relative to the repository, where that is a file outside docs/."""
+    """Return the target of a link relative to the root if it is a file outside docs/, else None."""
     path = posixpath.normpath(posixpath.join("docs", posixpath.dirname(uri), target))
     inside = path.startswith(("docs/", "../"))
     return path if not inside and (REPOSITORY / path).is_file() else None
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Put excerpts in, and lead links out of docs/ to the pages of those files."""
+    """Insert excerpts, and redirect links to files outside docs/ to their generated pages."""
     del config, files
     uri = page.file.src_uri
     if uri.startswith(f"{SOURCES}/"):
@@ -162,7 +162,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Formulas as MathML."""
+    """Convert formulas to MathML."""
     del page, config, files
 
     def draw(match: re.Match[str]) -> str:

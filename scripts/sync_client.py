@@ -1,4 +1,4 @@
-"""Write the blocking client from the one of coroutines.
+"""Write the blocking client from the asynchronous client.
 
 Usage: python scripts/sync_client.py   (part of `make format`)
 """
@@ -29,7 +29,7 @@ NAMES: Final = {
 
 
 def generated() -> str:
-    """The text of the blocking client, in the house format."""
+    """Return the source of the blocking client, formatted by ruff."""
     with tempfile.TemporaryDirectory() as scratch:
         folders = Path(scratch, "async"), Path(scratch, "sync")
         folders[0].mkdir()

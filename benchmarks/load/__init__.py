@@ -1,1 +1,1 @@
-"""Throughput and latency of the running service under load, beside a plain FastAPI app."""
+"""Throughput and latency of the running service under load, compared with a plain FastAPI app."""

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.load``: the running service under load, beside a plain FastAPI app."""
+"""``python -m benchmarks.load``: load test of the service, compared with a plain FastAPI app."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from benchmarks.report import describe_machine
 _MANY = 32
 _DRAWN = 8
 _QUANTILES = (0.5, 0.9, 0.99, 0.999)
-# Share of its own rate at 32 connections, so that it is not saturated.
+# Fraction of the service's rate at 32 connections: below saturation.
 _SHARE = 0.5
 
 
@@ -34,17 +34,17 @@ AIMS = {
     ("12 labels", "/outliers"): 0.35,
     ("12 labels", "/missing"): 0.18,
 }
-"""Of the plain app's rate at 32 connections."""
+"""Target rate as a fraction of the plain app's rate, at 32 connections."""
 
 
 def main(
     store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
-    seconds: Annotated[float, typer.Option(min=0.1, help="of one window")] = 1.5,
+    seconds: Annotated[float, typer.Option(min=0.1, help="length of one window")] = 1.5,
     kind: Annotated[list[str] | None, typer.Option(help="only these kinds of request")] = None,
-    json_path: Annotated[Path | None, typer.Option("--json", help="every figure")] = None,
-    plot: Annotated[Path | None, typer.Option(help="latency distributions, as an image")] = None,
+    json_path: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
+    plot: Annotated[Path | None, typer.Option(help="image file of latency distributions")] = None,
 ) -> None:
-    """Ask the service and a plain FastAPI app the same, in turns, until both are steady."""
+    """Send the same requests to the service and to a plain FastAPI app until both are steady."""
     console = Console(width=140)
     for key, value in describe_machine().items():
         console.print(f"{key}: {value}", highlight=False)
@@ -112,7 +112,7 @@ def _all(
 
 
 def _prepare_answer(ports: tuple[int, int], route: str, request: bytes) -> None:
-    """Let the plain app answer a question as the service answers one such request."""
+    """Give the plain app the service's answer to one request as its fixed answer."""
     service, plain = ports
     _, _, body = request.partition(b"\r\n\r\n")
     headers = {"Content-Type": "application/json"}

@@ -1,4 +1,4 @@
-"""HTTP/1.1 connections that cost the client next to nothing: prepared bytes out, a status in."""
+"""Fast HTTP/1.1 client connections: they send prepared bytes and read status and body."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LENGTH = b"content-length:"
 
 
 def prepared(path: str, body: Any, headers: dict[str, str] | None = None) -> bytes:
-    """A POST of a JSON body as it goes over the wire."""
+    """Return the bytes of a POST request with a JSON body."""
     content = json.dumps(body, separators=(",", ":")).encode()
     lines = [
         f"POST {path} HTTP/1.1",
@@ -25,11 +25,11 @@ def prepared(path: str, body: Any, headers: dict[str, str] | None = None) -> byt
 
 
 class Connection(asyncio.Protocol):
-    """One connection with at most one request under way.
+    """One connection with at most one pending request.
 
     Attributes:
-        on_answer: called with (this connection, status, body) once an answer is complete; status 0
-            stands for a connection that broke.
+        on_answer: called with (this connection, status, body) after each complete answer; status 0
+            means that the connection broke.
     """
 
     def __init__(self, on_answer: Callable[[Connection, int, bytes], None]) -> None:
@@ -39,11 +39,11 @@ class Connection(asyncio.Protocol):
         self._received = b""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        # uvloop's transports are none of asyncio's classes.
+        # The transports of uvloop are not subclasses of asyncio's classes.
         self._transport = cast("asyncio.Transport", transport)
 
     def send(self, request: bytes) -> None:
-        """Send a request; the answer comes to `on_answer`."""
+        """Send a request; `on_answer` receives the answer."""
         assert self._transport is not None
         self.busy = True
         self._transport.write(request)
@@ -71,7 +71,7 @@ class Connection(asyncio.Protocol):
             self.on_answer(self, 0, b"")
 
     def close(self) -> None:
-        """Close the connection; what is under way is lost."""
+        """Close the connection; a pending request is lost."""
         self.busy = False
         if self._transport is not None:
             self._transport.close()
@@ -80,10 +80,10 @@ class Connection(asyncio.Protocol):
 async def connect(
     port: int, count: int, on_answer: Callable[[Connection, int, bytes], None]
 ) -> list[Connection]:
-    """So many connections to a port of this machine.
+    """Open ``count`` connections to a port of this machine.
 
     Raises:
-        OSError: nobody listens.
+        OSError: the connection was refused.
     """
     loop = asyncio.get_running_loop()
     made = []

@@ -1,4 +1,4 @@
-"""The service beside a plain FastAPI app, window by window, until both are steady."""
+"""Compare the service with a plain FastAPI app in alternating windows until both are steady."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import uvloop
 from benchmarks.load.windows import Window, at_concurrency, at_rate, joined
 
 Load: TypeAlias = Callable[[int, Sequence[bytes], float], Coroutine[Any, Any, Window]]
-"""(port, requests, seconds) to a window."""
+"""Function of (port, requests, seconds) that returns a window."""
 
 _STEADY = 0.1
 _FEWEST, _MOST = 3, 10
@@ -20,13 +20,13 @@ _FEWEST, _MOST = 3, 10
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The same requests to both.
+    """Results of the same requests to the service and to the plain app.
 
     Attributes:
-        kind, route, load: what was asked, and how.
+        kind, route, load: kind of request, route and load.
         service, plain: all windows of each, joined.
-        ratios: of the rates, window by window.
-        steady: the last three windows of both were within a tenth of each other.
+        ratios: ratio of the rates, one per pair of windows.
+        steady: True if the last three windows of both were within 10 % of their mean.
     """
 
     kind: str
@@ -39,22 +39,22 @@ class Comparison:
 
     @property
     def rate_ratio(self) -> float:
-        """Median over windows of the service's rate over the plain app's."""
+        """Median over windows of the service's rate divided by the plain app's rate."""
         return median(self.ratios)
 
     @property
     def p99_ratio(self) -> float:
-        """The service's p99 over the plain app's."""
+        """p99 of the service divided by p99 of the plain app."""
         return self.service.quantile(0.99) / self.plain.quantile(0.99)
 
     @property
     def extra_p50(self) -> float:
-        """Seconds that the service's p50 is above the plain app's."""
+        """p50 of the service minus p50 of the plain app, in seconds."""
         return self.service.quantile(0.5) - self.plain.quantile(0.5)
 
 
 def concurrency(connections: int) -> Load:
-    """So many connections without pause."""
+    """Return a load of this number of connections, each without pauses."""
 
     async def load(port: int, requests: Sequence[bytes], seconds: float) -> Window:
         return await at_concurrency(port, requests, connections, seconds)
@@ -63,7 +63,7 @@ def concurrency(connections: int) -> Load:
 
 
 def rate(a_second: float) -> Load:
-    """So many requests a second, whatever becomes of them."""
+    """Return a load of this number of requests per second, independent of the answers."""
 
     async def load(port: int, requests: Sequence[bytes], seconds: float) -> Window:
         return await at_rate(port, requests, a_second, seconds)
@@ -79,12 +79,12 @@ def compare(
     *,
     seconds: float,
 ) -> Comparison:
-    """Take turns until both are steady, or ten times.
+    """Alternate windows until both are steady, at most ten times.
 
     Args:
-        ports: of the service and of the plain app.
+        ports: port of the service and port of the plain app.
         names: kind, route and load.
-        seconds: of one window.
+        seconds: length of one window.
     """
     found: tuple[list[Window], list[Window]] = ([], [])
     for port in ports:
@@ -101,7 +101,7 @@ def compare(
 
 
 def is_steady(windows: Sequence[Window]) -> bool:
-    """Whether the rates and p50 of the last three windows are within a tenth of their mean."""
+    """Return True if rate and p50 of the last three windows are within 10 % of their mean."""
     last = windows[-_FEWEST:]
     for values in ([w.rate for w in last], [w.quantile(0.5) for w in last]):
         mean = sum(values) / len(values)

@@ -1,7 +1,7 @@
 """``python -m benchmarks.load.plain PORT``: the yardstick, a plain FastAPI app.
 
-It validates the same requests with the same models and sends a prepared answer. It has no model, no
-middleware, no metrics and no log.
+The app validates the same requests with the same models and sends a prepared answer. It has no
+model, middleware, metrics or log.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _answers: dict[str, bytes] = {}
 
 @app.put("/answers/{question}")
 async def prepare(question: str, request: Request) -> None:
-    """Keep the body as the answer to a question."""
+    """Store the body as the answer to a question."""
     _answers[question] = await request.body()
 
 

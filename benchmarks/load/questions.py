@@ -1,4 +1,4 @@
-"""What is asked under load: scenes of a dozen objects, all different, as bodies ready to send."""
+"""Requests of the load test: scenes of a dozen objects, all different, as bytes ready to send."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from benchmarks.load.connections import prepared
 ROUTES = ("/missing", "/relations", "/outliers")
 KINDS = ("12 labels", "12 poses", "20 relations")
 SCENES = 64
-"""More than there are connections, so that no two requests under way are alike."""
+"""More scenes than connections, so that all pending requests differ."""
 
 _OBJECTS, _RELATIONS = 12, 20
 
 
 def bodies(kind: str, labels: Sequence[str], seed: int = 0) -> list[dict[str, Any]]:
-    """Scenes of one kind.
+    """Return request bodies of one kind.
 
     Raises:
-        ValueError: no such kind.
+        ValueError: unknown kind.
     """
     rng = np.random.default_rng(seed)
     return [_body(kind, labels, rng) for _ in range(SCENES)]
 
 
 def requests(kind: str, route: str, labels: Sequence[str]) -> list[bytes]:
-    """The same as they go over the wire."""
+    """Return the requests of one kind as bytes."""
     return [prepared(route, body) for body in bodies(kind, labels)]
 
 
 def drawings(labels: Sequence[str], count: int, seed: int = 0) -> list[bytes]:
-    """Requests for so many scenes each that hold three objects, as they go over the wire."""
+    """Return requests to generate ``count`` scenes with three given objects each, as bytes."""
     rng = np.random.default_rng(seed)
     return [
         prepared(
@@ -80,4 +80,4 @@ def _body(kind: str, labels: Sequence[str], rng: np.random.Generator) -> dict[st
                 for a, i, j in triples
             ],
         }
-    raise ValueError(f"{kind!r} is none of {KINDS}")
+    raise ValueError(f"kind {kind!r} must be one of {KINDS}")

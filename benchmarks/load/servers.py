@@ -1,4 +1,4 @@
-"""The service and a plain FastAPI app, each a process of its own on a core of its own."""
+"""Start the service and the plain FastAPI app, each in a process pinned to one core."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 class ServerError(RuntimeError):
-    """A server ended, or was not ready in time."""
+    """A server ended, or it was not ready in time."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Server:
     """A server that is ready.
 
     Attributes:
-        port: on 127.0.0.1.
-        pid: of its process.
-        seconds: from the start of the process to the first 200 of /health/ready.
+        port: port on 127.0.0.1.
+        pid: process id.
+        seconds: time from the start of the process to the first status 200 of /health/ready.
     """
 
     port: int
@@ -38,20 +38,20 @@ class Server:
 
     @property
     def memory(self) -> int:
-        """Resident bytes."""
+        """Resident memory in bytes."""
         pages = Path(f"/proc/{self.pid}/statm").read_text("ascii").split()[1]
         return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 def cores() -> tuple[set[int], set[int]]:
-    """For the servers, and for the client: one each where there are two, else all."""
+    """Return the cores of servers and of the client: disjoint if there are at least two."""
     every = sorted(os.sched_getaffinity(0))
     return ({every[0]}, set(every[1:])) if len(every) > 1 else (set(every), set(every))
 
 
 @contextmanager
 def service(store: Path, **settings: str) -> Iterator[Server]:
-    """``python -m app``; settings by name, as SCENE_*."""
+    """Run ``python -m app``; settings by name become SCENE_* variables."""
     port = _free_port()
     variables = {"SCENE_STORE": str(store.resolve()), "SCENE_PORT": str(port)}
     variables |= {f"SCENE_{name.upper()}": value for name, value in settings.items()}
@@ -61,7 +61,7 @@ def service(store: Path, **settings: str) -> Iterator[Server]:
 
 @contextmanager
 def plain() -> Iterator[Server]:
-    """``python -m benchmarks.load.plain``."""
+    """Run ``python -m benchmarks.load.plain``."""
     port = _free_port()
     with _running(["-m", "benchmarks.load.plain", str(port)], port, {}) as server:
         yield server
@@ -76,7 +76,7 @@ def _free_port() -> int:
 
 @contextmanager
 def _running(arguments: list[str], port: int, variables: dict[str, str]) -> Iterator[Server]:
-    # The machine's own settings must not decide what is measured.
+    # SCENE_* settings of this machine must not affect the benchmark.
     environment = {name: value for name, value in os.environ.items() if name[:6] != "SCENE_"}
     start = time.perf_counter()
     process = subprocess.Popen(

@@ -1,7 +1,7 @@
-"""Windows of load: so many connections without pause, or so many requests a second.
+"""Windows of load: a number of connections without pauses, or a number of requests per second.
 
-At a rate, a request's time runs from when it was due, not from when a connection was free: a server
-that stalls is charged for all that waited (no coordinated omission).
+At a fixed rate, the latency of a request runs from its scheduled time, not from its sending time.
+So a stalled server is charged for all delayed requests (no coordinated omission).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from benchmarks.load.connections import Connection, connect
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """What a window of load saw.
+    """Results of one window of load.
 
     Attributes:
-        seconds: its length.
-        latency: (N,) seconds of each answer.
-        statuses: how many answers had which status; 0 stands for broken connections.
+        seconds: length of the window.
+        latency: (N,) latency of each answer in seconds.
+        statuses: number of answers by status; status 0 means a broken connection.
     """
 
     seconds: float
@@ -34,21 +34,21 @@ class Window:
 
     @property
     def rate(self) -> float:
-        """Answers of status 200 a second."""
+        """Number of answers with status 200 per second."""
         return self.statuses[200] / self.seconds
 
     @property
     def errors(self) -> int:
-        """Answers of any other status."""
+        """Number of answers with another status."""
         return sum(self.statuses.values()) - self.statuses[200]
 
     def quantile(self, q: float) -> float:
-        """Seconds."""
+        """Quantile of the latency in seconds."""
         return float(np.quantile(self.latency, q)) if len(self.latency) else float("nan")
 
 
 def joined(windows: Sequence[Window]) -> Window:
-    """Several windows as one."""
+    """Join several windows into one."""
     return Window(
         sum(window.seconds for window in windows),
         np.concatenate([window.latency for window in windows]),
@@ -59,7 +59,7 @@ def joined(windows: Sequence[Window]) -> Window:
 async def at_concurrency(
     port: int, requests: Sequence[bytes], connections: int, seconds: float
 ) -> Window:
-    """Each connection sends its next request as soon as it has its answer."""
+    """Run a window in which each connection sends its next request right after an answer."""
     latency: list[float] = []
     statuses: Counter[int] = Counter()
     began: dict[Connection, float] = {}
@@ -97,7 +97,7 @@ async def at_concurrency(
 async def at_rate(
     port: int, requests: Sequence[bytes], rate: float, seconds: float, connections: int = 64
 ) -> Window:
-    """Requests due at even times, whatever became of those before."""
+    """Run a window with requests at regular times, independent of earlier answers."""
     latency: list[float] = []
     statuses: Counter[int] = Counter()
     due: dict[Connection, float] = {}

@@ -83,8 +83,8 @@ def test_every_command_says_what_it_did(workplace) -> None:
     assert "next:" in told["init"]
     assert "best epoch" in told["train"]
     assert "baselines" in told["compare"]
-    assert "taken out:" in told["compare"]
-    assert "nothing is served as default yet" in told["publish"]
+    assert "removed:" in told["compare"]
+    assert "default is a new alias" in told["publish"]
     assert "promoted: default → my-lab@1.0.0" in told["publish"]
 
 
@@ -125,7 +125,7 @@ def test_the_same_again_is_not_worse_and_may_take_its_place(workplace) -> None:
     assert comparison["b"].startswith("my-lab@1.0.0")
     assert {row["verdict"] for row in comparison["differences"]} == {"undecided"}
     assert {row["figure"]["value"] for row in comparison["differences"]} == {0.0}
-    assert "Answers that differ" not in output
+    assert "Most different answers" not in output
     output = workplace.publish(workplace.run, "1.0.1", "--promote")
     assert "promoted: default → my-lab@1.0.1, before my-lab@1.0.0" in output
 

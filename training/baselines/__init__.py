@@ -1,9 +1,9 @@
 """Baselines that an evaluation trains in the same run, on the same scenes.
 
-A class that a source never mentions counts as absent from its scenes, as in our own objective: a
-score is not told the source and has to rank all classes. Leaving such classes out weakens a
-baseline (validation MRR: EASE .398 to .381, denoising autoencoder .397 to .335, popularity .152 to
-.145).
+A class that a source never mentions counts as absent from its scenes, as in our own objective. A
+score does not know the source and has to rank all classes. Leaving such classes out lowers the
+validation MRR of baselines: EASE .398 to .381, denoising autoencoder .397 to .335, popularity .152
+to .145.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from training.baselines.fitting import Baseline, Fitted, Trial
 from training.evaluation.missing import PlacedScore
 
 RELATIONS: Final = ("relations", "placement")
-"""The scores of `Contender` that a score of relations without evidence gives."""
+"""Fields of `Contender` filled by a relation score without evidence."""
 
 _EVERY: tuple[Baseline[Any], ...] = (
     Baseline("popularity", objects.popularity),
@@ -61,13 +61,13 @@ _EVERY: tuple[Baseline[Any], ...] = (
 )
 
 BASELINES: Final[dict[str, Baseline[Any]]] = {entry.name: entry for entry in _EVERY}
-"""By the name of their row."""
+"""Baselines by row name."""
 
 PLACED: Final = BASELINES["frequency table p(i | a, j)"]
 
 
 def placed_product(name: str, score: Any, table: Any) -> Baseline[PlacedScore]:
-    """The T2-at row of a fitted object baseline times the fitted table of `PLACED`."""
+    """Return the T2-at baseline: a fitted object score times the fitted table of `PLACED`."""
     propose = relations.times(score, table)
     return Baseline(f"{PLACED.name} × {name}", propose, fitting.placed_mrr, ("placed",))
 

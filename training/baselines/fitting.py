@@ -1,9 +1,9 @@
-"""One interface of all baselines: a model proposes, validation chooses, every trial is kept.
+"""Common interface of all baselines: fit on training scenes, select on validation scenes.
 
-A model is a generator: it fits on the training part alone and proposes (parameters, score) for
-every point of its declared grid, an epoch of one run being a point too. It never sees the
-validation part, by which `Baseline.fit` judges each proposal: by the primary metric of its task,
-pooled over sources.
+A baseline is a generator. It fits on the training part and yields (parameters, score) for each
+point of its grid; an epoch of a run is also a point. `Baseline.fit` evaluates each score on the
+validation part by the primary metric of its task, pooled over sources. The generator never sees the
+validation part. All trials are kept.
 """
 
 from __future__ import annotations
@@ -38,10 +38,9 @@ class Trial:
     """One point of a grid.
 
     Attributes:
-        parameters: what was tried.
-        validation: its figure on the validation part.
-        seconds: wall time of fitting it, without what it shares with earlier points, and of judging
-            it.
+        parameters: the grid point.
+        validation: metric on the validation part.
+        seconds: wall time of fitting and evaluation, without work shared with earlier points.
     """
 
     parameters: Parameters
@@ -51,52 +50,54 @@ class Trial:
 
 @dataclass(frozen=True)
 class Fitted(Generic[Score]):
-    """The score of the best trial (the first of the highest figure), and every trial in order."""
+    """The score of the best trial, and all trials in order; on a tie the first trial wins."""
 
     score: Score
     trials: tuple[Trial, ...]
 
 
 def missing_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """T2: mean reciprocal rank of removed objects."""
+    """Return the mean reciprocal rank (MRR) of removed objects, task T2."""
     return leave_one_out(scenes, structure, score).mrr().value
 
 
 def partial_mrr(scenes: SceneTensors, structure: Tensor, score: ObjectScore) -> float:
-    """T2 partial: mean reciprocal rank of the hidden half of every scene."""
+    """Return the MRR of the hidden half of every scene, task T2 partial."""
     return rank_hidden(hide(scenes, structure, 0.5), structure, score)[0].value
 
 
 def placed_mrr(scenes: SceneTensors, structure: Tensor, score: PlacedScore) -> float:
-    """T2-at: mean reciprocal rank of removed objects of which one relation is known."""
+    """Return the MRR of removed objects with one known relation, task T2-at."""
     return leave_one_out_at(scenes, structure, score)[0].mrr().value
 
 
 def r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
-    """T1a: R-precision, the counts of instances known."""
+    """Return the R-precision of relations with known instance counts, task T1a."""
     return rank_relations(scenes, structure, score).pooled().value
 
 
 def completion_r_precision(scenes: SceneTensors, structure: Tensor, score: RelationScore) -> float:
-    """T1b: R-precision on the half of the relations that is not given."""
+    """Return the R-precision on the half of the relations that is not given, task T1b."""
     return rank(complete_scenes(scenes, structure, score), len(scenes)).pooled().value
 
 
 def log_likelihood(scenes: SceneTensors, _structure: Tensor, density: ObjectDensity) -> float:
-    """Density: mean log-likelihood of the objects, nats, with the upper estimate of log Z."""
+    """Return the mean log-likelihood of the objects in nats, with the upper estimate of log Z."""
     return float(density.log_unnormalised(scenes.v).double().mean()) - density.upper
 
 
 @dataclass(frozen=True)
 class Baseline(Generic[Score]):
-    """A row of a table.
+    """One baseline, a row of a table.
 
     Attributes:
-        name: the row.
-        propose: training scenes, structure classes (V,) bool and a seed -> what to choose from.
-        judge: validation scenes, structure classes and a score -> figure, higher is better.
-        scores: the attributes of `Contender` that the score gives.
-        stochastic: the seed changes the fit.
+        name: name of the row.
+        propose: function of training scenes, structure classes (V,) bool and a seed; yields the
+            trials.
+        judge: function of validation scenes, structure classes and a score; returns the metric,
+            higher is better.
+        scores: fields of `Contender` that the score fills.
+        stochastic: True if the fit depends on the seed.
     """
 
     name: str
@@ -107,7 +108,7 @@ class Baseline(Generic[Score]):
 
     @property
     def learns_relations(self) -> bool:
-        """It needs scenes that are annotated with relations."""
+        """True if the baseline needs scenes with annotated relations."""
         return self.scores not in (("objects",), ("density",))
 
     def fit(
@@ -119,14 +120,14 @@ class Baseline(Generic[Score]):
         seed: int = 0,
         progress: Callable[[str], None] = lambda _: None,
     ) -> Fitted[Score]:
-        """Fit on one part, choose on another.
+        """Fit on the training part and select on the validation part.
 
         Args:
-            structure: (V,) bool; such classes may be evidence, but are never asked for.
+            structure: (V,) bool; structure classes are evidence only, never candidates.
 
         Raises:
-            ValueError: shapes disagree, or there is nothing to learn from or to choose by.
-            FloatingPointError: the figure of a trial is not a number.
+            ValueError: shapes disagree, or the training or validation scenes are unusable.
+            FloatingPointError: the metric of a trial is NaN.
         """
         V = train.v.shape[1]
         if validation.v.shape[1] != V or structure.shape != (V,):
@@ -135,7 +136,7 @@ class Baseline(Generic[Score]):
                 f"and structure has shape {tuple(structure.shape)}"
             )
         if not train.v.any():
-            raise ValueError(f"no objects in {len(train)} training scenes")
+            raise ValueError(f"the {len(train)} training scenes contain no objects")
         trials: list[Trial] = []
         chosen: list[Score] = []
         highest = -math.inf
@@ -143,7 +144,7 @@ class Baseline(Generic[Score]):
         for parameters, score in self.propose(train, structure, seed):
             figure = self.judge(validation, structure, score)
             if math.isnan(figure):
-                raise FloatingPointError(f"{self.name}: {dict(parameters)} has no figure")
+                raise FloatingPointError(f"{self.name}: the metric of {dict(parameters)} is NaN")
             if figure > highest:
                 highest, chosen = figure, [score]
             now = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Networks over sets of classes: an autoencoder and a transformer, trained in one way."""
+"""Neural networks over sets of classes: an autoencoder and a transformer with common training."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from training.baselines.objects import frequency
 from training.batches import SceneTensors
 from training.evaluation.missing import ObjectScore
 
-# How both networks learn: a class is taken out of a set and found among all that are absent.
+# Training of both networks: predict a removed class among all absent classes.
 #
-# One present class is drawn from each scene and removed, so is every other class with a chance that
-# is itself drawn per scene (the noise), and the loss is the cross-entropy of the removed class
-# under a softmax over the classes that are absent (a multinomial likelihood, as in D. Liang et al.,
-# "Variational Autoencoders for Collaborative Filtering", WWW 2018). AdamW, one learning-rate cycle,
-# and an exponential moving average of the weights. Every few epochs of the last stretch are offered
-# as candidates, so that validation stops early.
+# One present class of each scene is removed as the target. Each other class is also hidden with a
+# probability that is drawn per scene (the noise). The loss is the cross-entropy of the target under
+# a softmax over the absent classes. This is a multinomial likelihood as in D. Liang et al.,
+# "Variational Autoencoders for Collaborative Filtering", WWW 2018. Optimiser: AdamW with one
+# learning-rate cycle and an exponential moving average of the weights. Several late epochs are
+# candidates, so that selection on the validation part acts as early stopping.
 
 
 _AVERAGING = 0.998
@@ -33,14 +33,14 @@ _WARM_UP = 0.1
 
 @dataclass(frozen=True)
 class Course:
-    """How long and how hard to train.
+    """Training settings.
 
     Attributes:
-        epochs, batch_size: as they say.
-        learning_rate: the peak of its cycle.
-        weight_decay: AdamW's.
-        noise: largest chance with which a class that stays is hidden all the same.
-        offers: epochs at which the network is offered, as shares of all.
+        epochs, batch_size: number of epochs, scenes per batch.
+        learning_rate: peak learning rate of the cycle.
+        weight_decay: weight decay of AdamW.
+        noise: maximum probability of hiding a class that is not the target.
+        offers: epochs that are candidates, as shares of all epochs.
     """
 
     epochs: int
@@ -53,11 +53,11 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class NetworkScore:
-    """log p(i) under the softmax over absent, non-structure classes.
+    """log p(i) under the softmax over absent classes without structure classes.
 
     Attributes:
-        network: presence (B, V) -> (B, V).
-        structure: (V,) bool.
+        network: maps presence (B, V) to logits (B, V).
+        structure: (V,) bool, True for structure classes.
     """
 
     network: nn.Module
@@ -65,12 +65,12 @@ class NetworkScore:
 
     @property
     def parameter_count(self) -> int:
-        """Trained weights."""
+        """Number of trained weights."""
         return sum(parameter.numel() for parameter in self.network.parameters())
 
     @torch.no_grad()
     def __call__(self, v: Tensor) -> Tensor:
-        """Scores (B, V) of presence (B, V); -inf for what is present or structure."""
+        """Return scores (B, V) for presence (B, V); -inf for present and structure classes."""
         values: Tensor = self.network(v)
         return values.masked_fill((v > 0) | self.structure, -torch.inf).log_softmax(1)
 
@@ -78,18 +78,18 @@ class NetworkScore:
 def train_network(
     network: nn.Module, v: Tensor, structure: Tensor, course: Course, seed: int
 ) -> Iterator[tuple[int, NetworkScore]]:
-    """Train and offer the averaged network at some epochs, as (epochs done, score).
+    """Train a network; yield (epoch, score of the averaged network) at the candidate epochs.
 
     Args:
         network: presence (B, V) -> unnormalised log-probabilities (B, V).
-        v: (N, V) presence; scenes without anything but structure are left out.
+        v: (N, V) presence; scenes with structure classes only are left out.
 
     Raises:
-        ValueError: there is no scene left.
+        ValueError: all scenes are left out.
     """
     v = v[(v * ~structure).any(1)]
     if not len(v):
-        raise ValueError("no scene has a class that could be taken out")
+        raise ValueError("all scenes lack a class that could be removed")
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=course.learning_rate, weight_decay=course.weight_decay
     )
@@ -100,7 +100,7 @@ def train_network(
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(_AVERAGING))
     offers = {max(1, round(share * course.epochs)) for share in course.offers}
     for epoch in range(1, course.epochs + 1):
-        # Dropout draws from the global generator; nobody else's draws may change.
+        # Dropout uses the global generator; the fork keeps other random numbers unchanged.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed * 1_000_003 + epoch)
             network.train()
@@ -115,7 +115,7 @@ def train_network(
 
 
 def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float) -> Tensor:
-    """Mean cross-entropy of one removed class a scene; draws from the global generator."""
+    """Return the mean cross-entropy of one removed class per scene; uses the global generator."""
     target = torch.multinomial(v * ~structure, 1)
     left = v.scatter(1, target, 0.0)
     hidden = torch.rand(v.shape) < noise * torch.rand(len(v), 1)
@@ -127,7 +127,7 @@ def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float)
 # Denoising autoencoder with two hidden layers and a softmax over classes.
 #
 # P. Vincent et al., "Extracting and composing robust features with denoising autoencoders",
-# ICML 2008. Trained by `train_network`.
+# ICML 2008. `train_network` trains the network.
 
 
 _HIDDEN = 600
@@ -137,7 +137,7 @@ _HEAVY = replace(_AUTOENCODER, noise=1.0)
 
 
 def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
-    """V -> width -> width -> V; it starts at the popularity of (N, V) training scenes."""
+    """Build layers V -> width -> width -> V; the output bias starts at class frequencies."""
     V = v.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -155,7 +155,7 @@ def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Se
 def autoencoder(
     train: SceneTensors, structure: Tensor, seed: int, course: Course = _AUTOENCODER
 ) -> Proposals[ObjectScore]:
-    """Dropout × epochs."""
+    """Yield a score for each dropout rate and number of epochs."""
     for dropout in _HIDDEN_DROPOUT:
         network = build_autoencoder(train.v, _HIDDEN, dropout, seed)
         for epoch, score in train_network(network, train.v, structure, course, seed):
@@ -165,14 +165,16 @@ def autoencoder(
 def autoencoder_for_parts(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectScore]:
-    """The same trained with heavy masking: any share of the other classes is hidden as well."""
+    """Yield autoencoder scores after heavy masking: up to all other classes are hidden."""
     return autoencoder(train, structure, seed, _HEAVY)
 
 
-# Masked transformer: the classes of a scene are the tokens, one more token asks what is missing.
+# Masked transformer: the classes of a scene are tokens, and one query token predicts the removed
+# class.
 #
-# A. Vaswani et al., "Attention is all you need", NeurIPS 2017, masked as in J. Devlin et al.,
-# "BERT", NAACL 2019; a set has no positions. Trained by `train_network`.
+# A. Vaswani et al., "Attention is all you need", NeurIPS 2017. Masking as in J. Devlin et al.,
+# "BERT", NAACL 2019. A set has no order, so there are no position embeddings. `train_network`
+# trains the network.
 
 
 _WIDTH, _HEADS, _LAYERS = 64, 4, 2
@@ -181,12 +183,12 @@ _TRANSFORMER = Course(epochs=20, learning_rate=5e-3, weight_decay=0.05, noise=0.
 
 
 class SetTransformer(nn.Module):
-    """Presence (B, V) -> unnormalised log-probabilities (B, V) of what is missing.
+    """Transformer: presence (B, V) -> unnormalised log-probabilities (B, V) of the removed class.
 
     Args:
-        popularity: (V,) share of scenes with each class, where it starts.
-        width, heads, layers: of the encoder; the feed-forward part is twice as wide.
-        dropout: the encoder's.
+        popularity: (V,) share of scenes with each class, the start of the output bias.
+        width, heads, layers: sizes of the encoder; its feed-forward part is twice as wide.
+        dropout: dropout rate of the encoder.
     """
 
     def __init__(
@@ -195,7 +197,7 @@ class SetTransformer(nn.Module):
         super().__init__()
         V = len(popularity)
         self.classes = V
-        # Class V is the question, class V + 1 padding.
+        # Token V is the query, token V + 1 is padding.
         self.embedding = nn.Embedding(V + 2, width)
         layer = nn.TransformerEncoderLayer(
             width, heads, 2 * width, dropout, activation="gelu", batch_first=True, norm_first=True
@@ -204,11 +206,11 @@ class SetTransformer(nn.Module):
             layer, layers, norm=nn.LayerNorm(width), enable_nested_tensor=False
         )
         self.bias = nn.Parameter(popularity.log())
-        # Small, since the same vectors give the answer's logits.
+        # Small initial values, because the embeddings also give the output logits.
         nn.init.normal_(self.embedding.weight, std=width**-0.5)
 
     def forward(self, v: Tensor) -> Tensor:
-        """The answer of the asking token."""
+        """Return the logits from the query token."""
         most = int((v > 0).sum(1).max())
         present, token = v.topk(most, dim=1)
         token = torch.where(present > 0, token, self.classes + 1)
@@ -220,7 +222,7 @@ class SetTransformer(nn.Module):
 
 
 def transformer(train: SceneTensors, structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Dropout × epochs."""
+    """Yield a score for each dropout rate and number of epochs."""
     for dropout in _DROPOUT:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)

@@ -1,4 +1,4 @@
-"""Baselines that score a scene's objects in closed form, by counting, or by scikit-learn's RBM."""
+"""Object baselines: closed forms, counts, and the RBM of scikit-learn."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from training.evaluation.density import DensitySettings, ObjectDensity, ising_de
 from training.evaluation.missing import MachineScore, ObjectScore
 from training.machines import BoltzmannMachine, MachineSpec, build
 
-# Scores that are linear in what else is present.
+# Scores that are linear in the presence of the other classes.
 
 
 @dataclass(frozen=True, eq=False)
 class LinearScore:
-    """bias + v · weights; a class says nothing of itself.
+    """Linear score bias + v · weights; the weight from a class to itself is zero.
 
     Attributes:
         bias: (V,).
-        weights: (V, V), from present class to scored class, its diagonal zero.
+        weights: (V, V), row = present class, column = scored class; the diagonal is zero.
 
     Raises:
-        ValueError: shapes disagree or the diagonal is not zero.
+        ValueError: shapes disagree, or the diagonal is not zero.
     """
 
     bias: Tensor
@@ -43,24 +43,24 @@ class LinearScore:
 
     @property
     def parameter_count(self) -> int:
-        """Weights that are not zero."""
+        """Number of weights that are not zero."""
         return len(self.bias) + int(self.weights.count_nonzero())
 
     def __call__(self, v: Tensor) -> Tensor:
-        """Scores (B, V) of presence (B, V)."""
+        """Return scores (B, V) for presence (B, V)."""
         return self.bias + v @ self.weights
 
 
-# How often each class is there at all.
+# Frequency of each class.
 
 
 def frequency(v: Tensor) -> Tensor:
-    """Share of scenes with each class (V,), half a scene added to both sides."""
+    """Return the share of scenes with each class (V,), smoothed by half a scene on both sides."""
     return (v.sum(0) + 0.5) / (len(v) + 1.0)
 
 
 def popularity(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """One proposal: nothing to tune."""
+    """Yield the log-odds of the class frequencies, the only grid point."""
     V = train.v.shape[1]
     yield {}, LinearScore(frequency(train.v).logit(), torch.zeros(V, V))
 
@@ -69,9 +69,8 @@ def popularity(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals
 #
 #     log-odds of i = logit p(i) + t · sum_{j present} log p(j | i) / p(j | not i)
 #
-# Classes that are absent are not counted as evidence: most of them were merely not mentioned.
-# Evidence from classes that go together is counted many times over, which the exponent t < 1
-# tempers.
+# Only present classes are evidence, because most absent classes were merely not mentioned. Classes
+# that occur together count as evidence several times; the exponent t < 1 corrects for that.
 
 
 _SMOOTHING = (10.0, 100.0, 300.0)
@@ -79,10 +78,10 @@ _EXPONENTS = (0.2, 0.3, 0.5, 1.0)
 
 
 def evidence(v: Tensor, smoothing: float) -> Tensor:
-    """log p(j | i) / p(j | not i) as (V, V) [j, i], zero on the diagonal.
+    """Return log p(j | i) / p(j | not i) as (V, V) [j, i], with a zero diagonal.
 
     Args:
-        smoothing: scenes of average content that are added to those with i and to those without.
+        smoothing: number of average scenes added to the scenes with i and to those without i.
     """
     both, count, scenes = v.T @ v, v.sum(0), len(v)
     average = frequency(v).unsqueeze(1) * smoothing
@@ -92,7 +91,7 @@ def evidence(v: Tensor, smoothing: float) -> Tensor:
 
 
 def naive_bayes(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Smoothing × exponent."""
+    """Yield a score for each smoothing and exponent."""
     bias = frequency(train.v).logit()
     for smoothing in _SMOOTHING:
         weights = evidence(train.v, smoothing)
@@ -101,13 +100,12 @@ def naive_bayes(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposal
             yield parameters, LinearScore(bias, exponent * weights)
 
 
-# kNN over scenes: what is in the training scenes most like this one.
+# kNN over scenes: the classes of the training scenes most similar to the query.
 #
 #     p(i) = (sum of the votes of the neighbours that have i + share of all scenes with i)
 #            / (sum of votes + 1),    scored as its logit
 #
-# The nearest scene has one vote, the others a power of their cosine as a share of the nearest
-# one's.
+# The vote of a neighbour is (its cosine / cosine of the nearest scene) ** sharpness.
 
 
 _NEIGHBOURS = (100, 200)
@@ -115,12 +113,12 @@ _SHARPNESS = (2.0, 4.0, 8.0, 12.0)
 
 
 def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScore:
-    """Log-odds (B, V) of presence (B, V).
+    """Return a score: presence (B, V) -> log-odds (B, V).
 
     Args:
         v: (N, V) training scenes.
         neighbours: k.
-        sharpness: power of a cosine, relative to the nearest's, in a vote.
+        sharpness: exponent of the cosine ratio in a vote.
     """
     popularity = frequency(v)
     index = normalize(v, dim=1).T.contiguous()
@@ -128,7 +126,7 @@ def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScor
     def score(query: Tensor) -> Tensor:
         cosine = normalize(query, dim=1) @ index
         near, place = cosine.topk(min(neighbours, len(v)), dim=1)
-        # A scene that shares nothing has no vote, nor has any for an empty query.
+        # The vote is 0 for a scene without common classes, and for an empty query.
         vote = (near / near[:, :1].clamp(min=1e-6)) ** sharpness
         share = embedding_bag(place, v, per_sample_weights=vote, mode="sum") + popularity
         return (share / (vote.sum(1, keepdim=True) + 1.0)).logit()
@@ -137,7 +135,7 @@ def nearest_score(v: Tensor, *, neighbours: int, sharpness: float) -> ObjectScor
 
 
 def nearest(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """Neighbours × powers of their cosines."""
+    """Yield a score for each number of neighbours and sharpness."""
     for k in _NEIGHBOURS:
         for power in _SHARPNESS:
             score = nearest_score(train.v, neighbours=k, sharpness=power)
@@ -146,17 +144,17 @@ def nearest(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[Ob
 
 # EASE, the linear item model in closed form.
 #
-# H. Steck, "Embarrassingly Shallow Autoencoders for Sparse Data", WWW 2019, equation 8: with P =
-# (X'X + λI)⁻¹ the least-squares weights without a diagonal are -P[j,i] / P[i,i]. Here X is centred,
-# which is the same regression with a free intercept. (Recommender libraries that offer EASE bring
-# their own data sets and trainers around these three lines, without the intercept.)
+# H. Steck, "Embarrassingly Shallow Autoencoders for Sparse Data", WWW 2019, equation 8. With
+# P = (X'X + λI)⁻¹, the least-squares weights without a diagonal are -P[j,i] / P[i,i]. Here X is
+# centred, which is equivalent to a regression with a free intercept. Recommender libraries offer
+# EASE without the intercept and only with their own data sets and trainers.
 
 
 _EASE_L2 = (10.0, 30.0, 100.0, 300.0)
 
 
 def fit_ease(v: Tensor, l2: float) -> LinearScore:
-    """Ridge regression of every class on all others.
+    """Fit a ridge regression of every class on all other classes.
 
     Args:
         v: (N, V) presence.
@@ -172,35 +170,38 @@ def fit_ease(v: Tensor, l2: float) -> LinearScore:
 
 
 def ease(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[ObjectScore]:
-    """L2 penalties."""
+    """Yield a score for each L2 penalty."""
     for l2 in _EASE_L2:
         yield {"l2": l2}, fit_ease(train.v, l2)
 
 
 # Pairwise logistic model: an Ising model of classes, fitted by pseudo-likelihood.
 #
-# J. Besag, "Statistical analysis of non-lattice data", The Statistician 24 (1975): maximise over
-# the training set sum log p(v_i | others) - l2/2 · sum_{i<j} W[i,j]², where logit p(v_i = 1 |
-# others) = b_i + sum_j W[i,j] v_j and W is symmetric with zero diagonal. The problem is convex;
-# L-BFGS solves it.
+# J. Besag, "Statistical analysis of non-lattice data", The Statistician 24 (1975). Maximise over
+# the training set
+#
+#     sum log p(v_i | others) - l2/2 · sum_{i<j} W[i,j]²,
+#     logit p(v_i = 1 | others) = b_i + sum_j W[i,j] v_j,    W symmetric with zero diagonal.
+#
+# The problem is convex; L-BFGS solves it.
 
 
 _PAIRWISE_L2 = (30.0, 10.0, 3.0)
 _ITERATIONS = 40
-# Sweeps go class by class and are slow; log Z is known to some .01 nats by them.
+# Gibbs sweeps over single classes are slow. These settings estimate log Z to about 0.01 nats.
 _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
 
 
 def fit_pairwise(
     v: Tensor, l2: float, *, start: LinearScore | None = None, iterations: int = _ITERATIONS
 ) -> LinearScore:
-    """Penalised pseudo-likelihood weights.
+    """Fit the weights by penalised pseudo-likelihood.
 
     Args:
         v: (N, V) presence.
         l2: strength of the penalty, >= 0.
-        start: where to begin; by default independent classes.
-        iterations: of L-BFGS, at most.
+        start: initial weights; by default independent classes.
+        iterations: maximum number of L-BFGS iterations.
     """
     V = v.shape[1]
     if start is None:
@@ -228,7 +229,7 @@ def fit_pairwise(
 
 
 def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[LinearScore]:
-    """L2 penalties, each starting where the stronger one ended."""
+    """Yield a score for each L2 penalty, decreasing; each fit starts at the previous solution."""
     score = None
     for l2 in _PAIRWISE_L2:
         score = fit_pairwise(train.v, l2, start=score)
@@ -238,23 +239,24 @@ def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[L
 def pairwise_densities(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectDensity]:
-    """The joint distributions of the same models.
+    """Yield the joint distributions of the pairwise models.
 
-    Their best penalty is another one: at a weak one pseudo-likelihood leaves a second mode of
-    scenes that are full of everything, which conditionals of real scenes never show.
+    Their best penalty differs from that of the conditionals. With a weak penalty, pseudo-likelihood
+    leaves a second mode of scenes with very many classes. Conditionals of real scenes do not show
+    this mode.
     """
     for parameters, score in pairwise(train, structure, seed):
         yield parameters, ising_density(score.bias, score.weights, train, _EFFORT, seed)
 
 
-# scikit-learn's `BernoulliRBM` on objects alone, scored by its exact log-odds.
+# `BernoulliRBM` of scikit-learn on objects only, scored by its exact log-odds.
 #
-# The trained weights are put into our own machine without relation units, whose energy is the same,
-# so that both models are scored by one piece of code.
+# The trained weights are copied into our own machine without relation units. Both have the same
+# energy, so the same code scores both models.
 
 
 _HIDDEN = 200
-# Too high a rate makes persistent CD fall back to popularity, without any error.
+# At higher rates persistent CD degrades to class frequencies without an error.
 _LEARNING_RATES = (0.1, 0.2, 0.4)
 _EPOCHS = 60
 _BATCH = 32
@@ -263,16 +265,16 @@ _BATCH = 32
 def fit_annealed(
     v: Tensor, *, hidden: int, learning_rate: float, epochs: int, seed: int
 ) -> BoltzmannMachine:
-    """Train by scikit-learn's updates (`partial_fit`) while the rate falls linearly to 0.
+    """Train with scikit-learn's `partial_fit` while the learning rate falls linearly to 0.
 
-    Persistent chains follow a model that stands still in the end: on the indoor scenes' validation
-    part 40 passes so reach an MRR of .411; at a constant rate it is .377 after 10 passes and .378
-    after 20. Batches are drawn anew in each pass; what does not fill one waits for another pass.
+    Persistent chains are accurate only if the model changes slowly at the end. MRR on the indoor
+    validation part: .411 after 40 passes with the falling rate, .377 after 10 passes and .378 after
+    20 passes at a constant rate. Each pass shuffles the scenes and skips an incomplete last batch.
 
     Args:
         v: (N, V) binary presence.
         hidden: H1.
-        learning_rate: at the start.
+        learning_rate: initial learning rate.
         epochs: passes over the data.
     """
     size = min(_BATCH, len(v))
@@ -297,7 +299,7 @@ def _as_machine(rbm: BernoulliRBM) -> BoltzmannMachine:
 
 
 def bernoulli_rbm(train: SceneTensors, _structure: Tensor, seed: int) -> Proposals[ObjectScore]:
-    """Learning rates."""
+    """Yield a score for each learning rate."""
     for rate in _LEARNING_RATES:
         machine = fit_annealed(
             train.v, hidden=_HIDDEN, learning_rate=rate, epochs=_EPOCHS, seed=seed

@@ -1,4 +1,4 @@
-"""Baselines that score relations between classes, and classes at a place, by counts of triples."""
+"""Relation baselines, and baselines for objects at a place, from counts of triples."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from training.batches import Batch, SceneTensors
 from training.evaluation.missing import ObjectScore, PlacedScore, Places
 from training.evaluation.relations import RelationScore, transitive_closure
 
-# How often each relation held between each pair of classes, and tables of that size.
+# Counts of each relation per pair of classes, and score tables of that shape.
 
 
 @dataclass(frozen=True, eq=False)
 class TripleCounts:
-    """Scenes per (a, i, j); nothing is counted of structure classes and of i = j.
+    """Number of scenes per (a, i, j); structure classes and i = j are not counted.
 
     Attributes:
-        held: (A, V, V) scenes in which the relation held.
-        together: (V, V) scenes with annotated relations in which both classes were present.
+        held: (A, V, V) number of scenes in which the relation held.
+        together: (V, V) number of scenes with annotated relations that contain both classes.
     """
 
     held: Tensor
     together: Tensor
 
     def overall(self) -> Tensor:
-        """p(r) of a pair of classes, (A,); one case is added to both sides."""
+        """Return p(r) of a pair of classes, (A,), smoothed by one case on both sides."""
         return (self.held.sum((1, 2)) + 1.0) / (self.together.sum() + 2.0)
 
 
 def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
-    """Counts over the scenes with annotated relations.
+    """Count triples over the scenes with annotated relations.
 
-    What is not listed counts as off, as T1 counts it, even where the geometry left a pair
-    unobserved: rates among observed pairs alone overrate relations that are looked for only where
-    they hold (validation R-precision .323 against .343 on procthor, .10 against .34 on bedrooms).
+    A relation that is not listed counts as false, as in task T1, even if the geometry left the pair
+    unobserved. Rates among observed pairs overrate relations that are annotated only where they
+    hold. They lower the validation R-precision: .343 to .323 on procthor, .34 to .10 on bedrooms.
 
     Raises:
-        ValueError: no scene has any.
+        ValueError: all scenes lack observed relations.
     """
     V = scenes.v.shape[1]
     related = [scene.evidence for scene in scenes.scenes if scene.evidence.observed.any()]
     if not related:
-        raise ValueError(f"no relation was observed in {len(scenes)} training scenes")
+        raise ValueError(f"the {len(scenes)} training scenes contain no observed relation")
     A = related[0].holds.shape[0]
     held = np.zeros((A, V, V), dtype=np.float32)
     together = np.zeros((V, V), dtype=np.float32)
@@ -63,20 +63,20 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
 
 @dataclass(frozen=True, eq=False)
 class TripleTable:
-    """A relation score that is looked up: table[a, i, j] + g · log(n_i n_j).
+    """A relation score from a table: table[a, i, j] + g · log(n_i n_j).
 
-    It reads the classes and counts of a batch, never its relations.
+    It uses the classes and counts of a batch and ignores the relations.
 
     Attributes:
         log_odds: (A, V, V).
-        multiplicity: g, what more instances at either end add; 0 ignores counts.
+        multiplicity: g, weight of the instance counts; 0 ignores counts.
     """
 
     log_odds: Tensor
     multiplicity: float = 0.0
 
     def __call__(self, batch: Batch) -> Tensor:
-        """Log-odds (B, A, n, n), of no meaning where padded."""
+        """Return log-odds (B, A, n, n); padded entries are undefined."""
         index = batch.classes.clamp(min=0)
         values = self.log_odds[:, index[:, :, None], index[:, None, :]].movedim(0, 1)
         if self.multiplicity:
@@ -85,13 +85,13 @@ class TripleTable:
         return values
 
 
-# How often each relation holds at all, whatever its ends.
+# Frequency of each relation over all pairs of classes.
 
 
 def relation_popularity(
     train: SceneTensors, structure: Tensor, _seed: int
 ) -> Proposals[RelationScore]:
-    """One proposal: nothing to tune."""
+    """Yield the overall log-odds of each relation, the only grid point."""
     counts = count_triples(train, structure)
     overall = counts.overall().logit()[:, None, None]
     yield {}, TripleTable(overall.expand_as(counts.held))
@@ -100,8 +100,8 @@ def relation_popularity(
 # Smoothed frequency table p(r | i, j): the strong baseline for relations.
 #
 # R. Zellers et al., "Neural Motifs: Scene Graph Parsing with Global Context", CVPR 2018: the labels
-# of the two ends predict most relations. A pair seen rarely falls back on its ends, an end seen
-# rarely on p(r):
+# of the two ends predict most relations. A rare pair backs off to its two classes, and a rare class
+# backs off to p(r):
 #
 #     p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
 #     p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
@@ -113,11 +113,11 @@ _MULTIPLICITY = (0.0, 0.5, 1.0)
 
 
 def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
-    """logit p(r | i, j), (A, V, V).
+    """Return logit p(r | i, j), (A, V, V).
 
     Args:
-        pair: s > 0, cases of back-off added to a pair.
-        end: m > 0, cases of p(r) added to an end.
+        pair: s > 0, number of back-off cases added to a pair of classes.
+        end: m > 0, number of cases of p(r) added to a class.
     """
     overall = counts.overall()[:, None]
     subject = (counts.held.sum(2) + end * overall) / (counts.together.sum(1) + end)
@@ -127,9 +127,9 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
 
 
 def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[RelationScore]:
-    """Smoothing of pairs × of ends × weight of the instance counts.
+    """Yield a score for each pair smoothing, class smoothing and weight of the instance counts.
 
-    The weight moves nothing where counts are withheld (all 1).
+    The weight has no effect if all counts are set to 1.
     """
     counts = count_triples(train, structure)
     for pair in _PAIR:
@@ -140,12 +140,12 @@ def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Propo
                 yield parameters, TripleTable(table, weight)
 
 
-# ComplEx: relations between embedded classes, complex so that left differs from right.
+# ComplEx: class embeddings with complex numbers, because left(i, j) differs from left(j, i).
 #
 # T. Trouillon et al., "Complex Embeddings for Simple Link Prediction", ICML 2016, equation 11:
-# logit p(a, i, j) = d_a + Re sum_k S[i,k] R[a,k] conj(S[j,k]), fitted to all pairs of classes seen
-# together as binomials (held of together), with the nuclear 3-norm of T. Lacroix et al., ICML 2018,
-# as penalty.
+# logit p(a, i, j) = d_a + Re sum_k S[i,k] R[a,k] conj(S[j,k]). The model is fitted to all pairs of
+# classes that occur together, as binomials (held of together). The penalty is the nuclear 3-norm of
+# T. Lacroix et al., ICML 2018.
 
 
 _RANKS = (16, 64)
@@ -158,12 +158,12 @@ _LEARNING_RATE = 0.05
 def fit_complex(
     counts: TripleCounts, *, rank: int, penalty: float, seed: int, steps: int = _STEPS
 ) -> Tensor:
-    """Logits (A, V, V) of the fitted model.
+    """Fit ComplEx and return its logits (A, V, V).
 
     Args:
-        rank: complex dimensions.
+        rank: number of complex dimensions.
         penalty: weight of the mean cubed modulus of the factors of each pair.
-        steps: of Adam, each over all pairs, its rate falling to 0.
+        steps: number of Adam steps over all pairs; the learning rate falls to 0.
     """
     generator = torch.Generator().manual_seed(seed)
     A, V, _ = counts.held.shape
@@ -192,9 +192,9 @@ def fit_complex(
 
 
 def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
-    """d_a + Re <S_i, R_a, conj S_j> for bias (A,), relations (A, K) and classes (V, K)."""
+    """Return d_a + Re <S_i, R_a, conj S_j>; bias (A,), relations (A, K), classes (V, K)."""
     turned = classes * relations[:, None]
-    # Re(x conj(y)) = Re x Re y + Im x Im y: real products are the faster ones.
+    # Re(x conj(y)) = Re x Re y + Im x Im y: real products are faster.
     real = turned.real @ classes.real.T + turned.imag @ classes.imag.T
     return bias[:, None, None] + real
 
@@ -202,7 +202,7 @@ def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
 def complex_embedding(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[RelationScore]:
-    """Ranks × penalties × weight of the instance counts."""
+    """Yield a score for each rank, penalty and weight of the instance counts."""
     counts = count_triples(train, structure)
     for rank in _RANKS:
         for penalty in _PENALTIES:
@@ -212,16 +212,15 @@ def complex_embedding(
                 yield parameters, TripleTable(table, weight)
 
 
-# Completion by logic: the frequency table, moved by what follows from the given relations.
+# Completion by logic: the frequency table, changed by the consequences of the given relations.
 #
-# What a chain of given a(i, j), a(j, k) leads to follows transitively and gets a bonus; the mirror
-# image a(k, i) of what is given or follows gets a penalty. (That right is left read from the other
-# end, the inverse closure, is built into the canonical relations.) Both are soft: between classes
-# with several instances neither rule is strict, and on-top is no order among annotated supports.
+# A relation that follows from given a(i, j) and a(j, k) by transitivity gets a bonus. The reverse
+# a(k, i) of a given or following relation gets a penalty. The canonical relations already treat
+# right as left with exchanged ends (inverse closure). Bonus and penalty are soft for two reasons:
+# classes may have several instances, and annotated on-top is not always transitive.
 #
-# The score reads `holds` where `observed`, as GIVEN evidence: it must be handed a batch that marks
-# the given relations alone, as T1b does, never a scene's own
-# annotation.
+# The score reads the observed entries of `holds` as given relations. So its batch must mark only
+# the given relations as observed, as T1b does, not the full annotation of a scene.
 
 
 _CLOSURE_PAIR = (3.0, 10.0, 30.0)
@@ -233,11 +232,11 @@ _PENALTY = (0.0, 1.0, 3.0)
 
 @dataclass(frozen=True, eq=False)
 class ClosureScore:
-    """table + bonus · [follows] - penalty · [mirror of given or following].
+    """table + bonus · [follows] - penalty · [reverse of a given or following relation].
 
     Attributes:
         table: log-odds without evidence.
-        bonus, penalty: in log-odds, >= 0.
+        bonus, penalty: changes of the log-odds, >= 0.
     """
 
     table: TripleTable
@@ -245,7 +244,7 @@ class ClosureScore:
     penalty: float
 
     def __call__(self, batch: Batch) -> Tensor:
-        """Log-odds (B, A, n, n) given the observed relations of the batch."""
+        """Return log-odds (B, A, n, n) given the observed relations of the batch."""
         given = (batch.holds > 0) & batch.observed
         closed = transitive_closure(given)
         follows, mirror = closed & ~given, closed.mT & ~closed
@@ -255,7 +254,7 @@ class ClosureScore:
 def frequency_table_with_closure(
     train: SceneTensors, structure: Tensor, _seed: int
 ) -> Proposals[RelationScore]:
-    """Smoothing × weight of the counts × bonus × penalty."""
+    """Yield a score for each smoothing, weight of the counts, bonus and penalty."""
     counts = count_triples(train, structure)
     for pair in _CLOSURE_PAIR:
         log_odds = smoothed_log_odds(counts, pair, _CLOSURE_END)
@@ -267,15 +266,17 @@ def frequency_table_with_closure(
                     yield parameters | {"penalty": penalty}, ClosureScore(table, bonus, penalty)
 
 
-# Something on the desk: frequency table p(i | a, j), alone and times an object score.
+# Object at a place (a, j), such as "on-top of the desk": the frequency table p(i | a, j), alone and
+# times an object score.
 #
-#     p(i | a, j) = (held + s · p(i | a)) / (held by any + s),   p(i | a) likewise on p(i) with m
+#     p(i | a, j) = (held + s · p(i | a)) / (held by any + s)
 #
-# separately for i as subject and as object. The product adds log-odds of what else is in the scene,
+# p(i | a) is smoothed likewise towards p(i) with m. There are separate tables for i as subject and
+# i as object. The product adds the log-odds given the other objects of the scene,
 #
 #     score(i | rest) + w · log p(i | a, j) - u · log p(i),
 #
-# where the last term takes out a popularity that both factors hold.
+# where the last term corrects for the class frequency that both factors contain.
 
 
 _PLACE = (0.3, 1.0, 3.0, 10.0)
@@ -286,18 +287,18 @@ _CORRECTIONS = (0.0, 0.5, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class PlacedTable:
-    """The score: log_p (2, A, V, V), by outgoing, relation, anchor and missing class."""
+    """Score from a table: log_p (2, A, V, V), by outgoing, relation, anchor and removed class."""
 
     log_p: Tensor
 
     def __call__(self, places: Places) -> Tensor:
-        """log p(i | a, j), (B, V)."""
+        """Return log p(i | a, j), (B, V)."""
         return self.log_p[places.outgoing.long(), places.relation, places.anchor]
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedProduct:
-    """The score: objects(v) + weight · table - correction · log popularity (V,)."""
+    """Score: objects(v) + weight · table - correction · log popularity (V,)."""
 
     objects: ObjectScore
     table: PlacedTable
@@ -306,7 +307,7 @@ class PlacedProduct:
     correction: float
 
     def __call__(self, places: Places) -> Tensor:
-        """Scores (B, V)."""
+        """Return scores (B, V)."""
         added = self.weight * self.table(places) - self.correction * self.log_popularity
         return self.objects(places.v) + added
 
@@ -314,14 +315,14 @@ class PlacedProduct:
 def smoothed_log_p(
     counts: TripleCounts, popularity: Tensor, place: float, relation: float
 ) -> Tensor:
-    """log p(i | a, j), (2, A, V, V) as in `PlacedTable`.
+    """Return log p(i | a, j), (2, A, V, V) as in `PlacedTable`.
 
     Args:
-        popularity: p(i), (V,), need not sum to 1.
-        place: s > 0, cases of p(i | a) added to each (a, j).
-        relation: m > 0, cases of p(i) added to each a.
+        popularity: p(i), (V,); the function normalises it.
+        place: s > 0, number of cases of p(i | a) added to each (a, j).
+        relation: m > 0, number of cases of p(i) added to each a.
     """
-    # Index 1: the missing class is the subject, so that the anchor comes last in `held`.
+    # Index 1: the removed class is the subject, so `held` is transposed to put the anchor first.
     held = torch.stack([counts.held, counts.held.mT])
     share = popularity / popularity.sum()
     any_anchor = held.sum(2)
@@ -332,7 +333,7 @@ def smoothed_log_p(
 
 
 def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
-    """Smoothing of places × of relations."""
+    """Yield a score for each smoothing of places and of relations."""
     counts = count_triples(train, structure)
     for place in _PLACE:
         for relation in _RELATION:
@@ -343,7 +344,7 @@ def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposal
 def times(
     objects: ObjectScore, table: PlacedTable
 ) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
-    """Proposals for the product of a fitted object score and a fitted table."""
+    """Return a baseline that multiplies a fitted object score and a fitted table."""
 
     def placed_table(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v).log()

@@ -1,4 +1,4 @@
-"""Instances in images, in the layout of COCO (Lin et al., ECCV 2014): ``instances*.json``."""
+"""Reader for COCO instance annotations (Lin et al., ECCV 2014): ``instances*.json``."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SOURCE = "coco"
 
 
 def read_coco(path: Path) -> list[AnnotatedScene]:
-    """Read the images that show anything, with boxes in the image plane.
+    """Read each image with at least one object as a scene; boxes are in the image plane.
 
-    Boxes around crowds are left out: they are no single thing. Left and above follow from the boxes
-    when scenes are encoded (`derive_from_boxes`).
+    The reader skips boxes around crowds, because they hold several objects. The relations left and
+    above are derived from the boxes at encoding (`derive_from_boxes`).
 
     Raises:
-        DatasetError: the file is not in the layout of COCO.
+        DatasetError: the file does not follow the COCO layout.
     """
     content = load_json(path)
     categories: dict[int, str] = {}
@@ -47,7 +47,7 @@ def read_coco(path: Path) -> list[AnnotatedScene]:
     for image, objects in images.items():
         name = f"{SOURCE}-{image}"
         if len({thing.id for thing in objects}) < len(objects):
-            raise DatasetError(path, f"image {image}", "two annotations with one id")
+            raise DatasetError(path, f"image {image}", "two annotations have the same id")
         if objects:
             scenes.append(AnnotatedScene(name, SOURCE, name, None, tuple(objects)))
     return scenes

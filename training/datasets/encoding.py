@@ -1,4 +1,4 @@
-"""Annotated scenes to what a model sees: class indices and observed relations."""
+"""Encode annotated scenes as model input: class indices and observed relations."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ _IN_THE_IMAGE: Final = [CANONICAL.index("left"), CANONICAL.index("above")]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedScene:
-    """One scene in terms of a vocabulary; N instances, A canonical relations.
+    """One scene encoded with a vocabulary; N instances, A canonical relations.
 
     Attributes:
-        scene_id, source, group: as annotated.
-        room_type: index of the room type, -1 where none is known.
+        scene_id, source, group: copied from the annotated scene.
+        room_type: index of the room type; -1 if the room type is unknown.
         evidence: the classes of the scene and their relations.
         instance_classes: (N,) int64, the class of each instance.
-        instance_holds: (A, N, N) bool, relations between instances.
-        instance_observed: (A, N, N) bool, whether they were observed, on or off.
-        unknown: distinct labels outside the vocabulary, which are left out.
-        instance_positions: (N, 3) centres in metres in the viewer axes that the relations were
-            derived in, NaN where unknown; None where relations do not come from positions.
-        weight: what the scene counts for in object learning.
-        complete: its object list is nearly the whole scene, see `Meaning`.
+        instance_holds: (A, N, N) bool, True where the relation between two instances holds.
+        instance_observed: (A, N, N) bool, True where the relation is known to hold or not to hold.
+        unknown: number of distinct labels outside the vocabulary; their objects are left out.
+        instance_positions: (N, 3) centres in metres, in the viewer axes used to derive the
+            relations; NaN for an unknown centre. None if relations do not come from positions.
+        weight: weight of the scene in object learning.
+        complete: True if the object list covers nearly the whole scene, see `Meaning`.
     """
 
     scene_id: str
@@ -68,21 +68,22 @@ class EncodedScene:
 
 
 def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[EncodedScene]:
-    """Encode scenes.
+    """Encode scenes with a vocabulary.
 
-    Observed relations are known to hold or known not to hold. They come from the best annotation of
-    a scene:
+    An observed relation is known to hold or known not to hold. The best annotation of a scene
+    gives the relations:
 
-    - listed relations; a relation listed in both directions is unobserved;
-    - positions: the rules of `app.scene.geometry`, from `room_viewpoint` where the axes are not a
-      viewer's; a support link is on-top, and the other relations of its pair are off;
-    - boxes in an image: the rule of `scene_client.image_plane`, left and above;
-    - otherwise support links alone, or nothing.
+    - Listed relations. A relation listed in both directions is unobserved.
+    - Positions, by the rules of `app.scene.geometry`. `room_viewpoint` supplies the viewpoint if
+      the positions are not in viewer axes. A support link means on-top, and all other relations of
+      the pair are false.
+    - Boxes in an image, by the rule of `scene_client.image_plane`: left and above.
+    - Otherwise support links only.
 
-    `training.datasets.sources` says which unlisted relations of a source are off, and which of its
-    labels are left out as if they had not been annotated.
+    `training.datasets.sources` defines which relations are false if a scene does not list them. It
+    also defines which labels of a source are ignored.
 
-    Relations of structure classes are dropped: neither on nor off.
+    Relations of structure classes are unobserved.
     """
     encoder = _Encoder(vocabulary, curated_names())
     every = list(scenes)
@@ -93,11 +94,12 @@ def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[Enc
 def annotated_classes(
     scenes: Sequence[EncodedScene], vocabulary: Vocabulary
 ) -> dict[str, NDArray[np.bool_]]:
-    """Per source, (V,) the annotated classes: without the label the object is absent.
+    """Return, per source, a (V,) mask of the classes that the source annotates.
 
-    These are the classes that the source ever mentions, or all of them in a source of open
-    vocabulary, less those it leaves out. Initial biases are frequencies over the sources that
-    mention a class, and generated scenes are compared in these.
+    If an annotated class is missing from a scene, the object is absent. A source annotates the
+    classes that it mentions at least once; a source of open vocabulary annotates all classes.
+    Labels in `Source.left_out` are excluded. Initial biases are frequencies over the sources
+    that annotate a class. Generated scenes are compared in the annotated classes.
     """
     annotated: dict[str, NDArray[np.bool_]] = {}
     for scene in scenes:
@@ -112,7 +114,7 @@ def annotated_classes(
 
 
 def _left_out(source: str, vocabulary: Vocabulary) -> list[int]:
-    """The classes of the labels that a source annotates too incompletely."""
+    """Return the class indices of the labels in `Source.left_out`."""
     labels = SOURCES[source].left_out if source in SOURCES else ()
     return [index for label in labels if (index := vocabulary.index(label)) is not None]
 
@@ -132,7 +134,7 @@ class _Encoder:
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
         instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
-        # A wall is in every room and left of everything: its relations teach nothing.
+        # Relations of structure carry no information: every room has walls on all sides.
         structure = self.vocabulary.structure[instance_classes]
         for array in (holds, observed):
             array[:, structure] = False
@@ -174,7 +176,7 @@ class _Encoder:
 def _counts(
     evidence: ClassEvidence, classes: NDArray[np.int64], alike: Sequence[int]
 ) -> NDArray[np.int64]:
-    """Instances of each class, where one entry may stand for several."""
+    """Count the instances of each class; one entry may stand for several instances."""
     counts = np.zeros_like(evidence.counts)
     np.add.at(counts, np.searchsorted(evidence.classes, classes), alike)
     return counts
@@ -183,10 +185,10 @@ def _counts(
 def _relations(
     scene: AnnotatedScene, meaning: Meaning
 ) -> tuple[PoseRelations, NDArray[np.float64] | None]:
-    """Relations between all instances of a scene, by the best annotation there is.
+    """Derive the relations between all instances from the best annotation of the scene.
 
     Returns:
-        Them, and the positions (n, 3) that they were derived from, if they were.
+        The relations, and the positions (n, 3) used to derive them; None without positions.
     """
     positions = None
     if scene.relations is not None:
@@ -210,13 +212,13 @@ def _relations(
 def _from_lists(
     scene: AnnotatedScene, listed: Sequence[tuple[int, str, int]], meaning: Meaning
 ) -> PoseRelations:
-    """Listed and denied relations, and the unlisted ones that are off by the source's meaning."""
+    """Combine listed relations, denied relations, and the source's rule for unlisted relations."""
     n = len(scene.objects)
     holds, denied = np.zeros((2, A, n, n), dtype=np.bool_)
     for relations, array in ((listed, holds), (scene.false_relations, denied)):
         for subject, relation, anchor in relations:
             array[canonicalise(subject, relation, anchor)] = True
-    # Two opposite statements cancel: both directions, or listed and denied.
+        # Contradictory annotations are unobserved: both directions listed, or listed and denied.
     contradicted = (holds & holds.swapaxes(1, 2)) | (holds & denied)
     related = holds.any(0)
     masks = {
@@ -234,7 +236,7 @@ def _from_lists(
 def _close_poses(
     found: PoseRelations, objects: Sequence[AnnotatedObject], meaning: Meaning
 ) -> None:
-    """Extend or restrict the observed relations of neighbours to the source's meaning."""
+    """Apply the source's rule for unlisted relations to relations derived from positions."""
     located = np.array([thing.position is not None for thing in objects])
     sized = located & np.array([thing.size is not None for thing in objects])
     for relation, unlisted in enumerate(meaning.unlisted):
@@ -258,7 +260,7 @@ def _from_poses(scene: AnnotatedScene) -> tuple[PoseRelations, NDArray[np.float6
 
 
 def _add_supports(found: PoseRelations, objects: Sequence[AnnotatedObject]) -> None:
-    """What lies in a drawer is on its dresser, whatever the boxes say."""
+    """Set on-top for each support link; an object in a drawer is on-top of its dresser."""
     place = {thing.id: index for index, thing in enumerate(objects)}
     for index, thing in enumerate(objects):
         if thing.supported_by is None or (support := place[thing.supported_by]) == index:
@@ -270,14 +272,14 @@ def _add_supports(found: PoseRelations, objects: Sequence[AnnotatedObject]) -> N
 
 
 def room_viewpoint(scene_id: str, positions: NDArray[np.float64]) -> Viewpoint:
-    """Somebody who stands at the middle of one side of the room and looks straight in.
+    """Return a viewpoint at the middle of one side of the room, facing inwards.
 
-    The room is the bounding box of the object centres; a hash of the scene's id draws the side, so
-    that a scene is always seen from the same place and a collection from all sides.
+    The room is the bounding box of the object centres. A hash of the scene id selects the side.
+    So the viewpoint of a scene is fixed, and a collection of scenes covers all four sides.
 
     Args:
-        scene_id: the scene.
-        positions: (n, 3) centres in metres; rows with NaN do not count.
+        scene_id: id of the scene.
+        positions: (n, 3) centres in metres; rows with NaN are ignored.
 
     Raises:
         ValueError: no object has a position.
@@ -296,13 +298,13 @@ def room_viewpoint(scene_id: str, positions: NDArray[np.float64]) -> Viewpoint:
 
 
 def derive_from_boxes(boxes: ArrayLike) -> PoseRelations:
-    """Relations between n boxes of an image, left and above: `scene_client.image_plane`.
+    """Derive the relations left and above between n image boxes (`scene_client.image_plane`).
 
     Args:
-        boxes: (n, 4) rows (xmin, ymin, xmax, ymax), y downwards; a row with NaN is unseen.
+        boxes: (n, 4) rows (xmin, ymin, xmax, ymax), y downwards; NaN marks an object without a box.
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: ``boxes`` has a wrong shape.
     """
     corners = np.asarray(boxes, dtype=np.float64)
     n = len(corners)

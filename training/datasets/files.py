@@ -1,4 +1,4 @@
-"""Reading files that others wrote, within bounds, with errors that say where."""
+"""Read data files with size limits and with errors that name the position."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ MAX_DIGITS: Final = 30
 
 
 def read_lines(path: Path, limit: int) -> Iterator[bytes]:
-    """The lines of a file, gzipped where its name says so, undecoded.
+    """Iterate over the raw lines of a file; a file named ``*.gz`` is decompressed.
 
-    A line that is not UTF-8 is then one bad line. The limit keeps a small compressed file from
-    filling the memory.
+    Lines stay undecoded, so that invalid UTF-8 affects one line only. The limit keeps a small
+    compressed file from filling the memory.
 
     Args:
         path: the file.
-        limit: bytes of a line, its end included.
+        limit: maximum length of a line in bytes, including the line end.
 
     Raises:
-        DatasetError: the file cannot be read, or has a longer line.
+        DatasetError: the file cannot be read, or a line exceeds the limit.
     """
     opener = gzip.open if path.suffix == ".gz" else open
     try:
@@ -42,10 +42,10 @@ def read_lines(path: Path, limit: int) -> Iterator[bytes]:
 
 
 def load_json(path: Path) -> Any:
-    """The content of a JSON file.
+    """Read a JSON file.
 
     Raises:
-        DatasetError: it cannot be read, or is not JSON.
+        DatasetError: the file cannot be read or is not JSON.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"), parse_int=bounded_int)
@@ -58,19 +58,19 @@ def load_json(path: Path) -> Any:
 
 
 def bounded_int(digits: str) -> int:
-    """An integer of a JSON file, for ``parse_int``.
+    """Parse an integer of a JSON file, for ``parse_int``.
 
     Raises:
-        ValueError: it has more than `MAX_DIGITS` digits; longer ones overflow where floats are due.
+        ValueError: more than `MAX_DIGITS` digits; larger integers overflow on conversion to float.
     """
     if len(digits.lstrip("-")) > MAX_DIGITS:
-        raise ValueError(f"a number of {len(digits)} digits starts with {digits[:10]}")
+        raise ValueError(f"an integer of {len(digits)} digits is too long: {digits[:10]}…")
     return int(digits)
 
 
 @contextmanager
 def located(path: Path, where: str) -> Iterator[None]:
-    """Errors of what is built within become DatasetErrors that say where."""
+    """Turn a TypeError or ValueError of the block into a DatasetError with path and position."""
     try:
         yield
     except DatasetError:
@@ -80,10 +80,10 @@ def located(path: Path, where: str) -> Iterator[None]:
 
 
 def take(path: Path, where: str, values: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """The field ``name`` of the JSON object at ``where``, of the given type.
+    """Return the field ``name`` of the JSON object at ``where`` after a check of its type.
 
     Raises:
-        DatasetError: it is missing or of another type.
+        DatasetError: the field is missing or has another type.
     """
     if not isinstance(values, dict):
         raise DatasetError(path, where, f"must be an object, not {type(values).__name__}")

@@ -1,11 +1,14 @@
-"""Scenes as JSON lines, plain or gzipped: the product's own format.
+"""Scenes as JSON lines, plain or gzipped: the native format of this project.
 
-One scene a line: ``scene_id``, ``source``, ``group``, ``room_type`` (or null), ``objects``
-[{``id``, ``label``, ``position``?, ``size``?, ``yaw``?, ``supported_by``?, ``box2d``?}],
-``relations`` [[subject id, predicate, object id]] or null where nobody annotated any,
-``false_relations``? (the same form: relations that do not hold), ``counts``? {label: instances}
-where one object stands for all instances of its label, and ``viewer_frame``? (true where positions
-are in viewer axes: x away, y left, z up).
+Each line holds one scene, a JSON object with these fields ("?" marks an optional field):
+
+- ``scene_id``, ``source``, ``group``, ``room_type`` (may be null);
+- ``objects``: [{``id``, ``label``, ``position``?, ``size``?, ``yaw``?, ``supported_by``?,
+  ``box2d``?}];
+- ``relations``: [[subject id, predicate, object id]], or null if relations were not annotated;
+- ``false_relations``?: relations that do not hold, in the same form;
+- ``counts``?: {label: number of instances} where one object stands for all instances of a label;
+- ``viewer_frame``?: true if positions are in viewer axes (x away, y left, z up).
 
 A line has at most `MAX_LINE` bytes.
 """
@@ -32,7 +35,7 @@ _SCENE_FIELDS = {
 }
 _OBJECT_FIELDS = {"id", "label", "position", "size", "yaw", "supported_by", "box2d"}
 
-# Sources recorded in viewer axes before the format could say so.
+# These sources are in viewer axes; their files predate the field ``viewer_frame``.
 _VIEWER_SOURCES = frozenset({"sunrgbd-bedroom-3d"})
 
 
@@ -51,7 +54,7 @@ def read_jsonl(path: Path) -> list[AnnotatedScene]:
 
 
 def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
-    """Every line of a file as its scene, or as what is wrong with it; blank ones say nothing.
+    """Iterate over the lines of a file: a scene, or the error of the line. Skip blank lines.
 
     Raises:
         DatasetError: the file cannot be read.
@@ -77,7 +80,7 @@ def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
 
 
 def write_jsonl(scenes: Iterable[AnnotatedScene], path: Path) -> None:
-    """Write scenes as `read_jsonl` reads them; gzipped where the name says so."""
+    """Write scenes in the format of `read_jsonl`; gzip a file named ``*.gz``."""
     opener = gzip.open if path.suffix == ".gz" else open
     with opener(path, "wt", encoding="utf-8") as file:
         for scene in scenes:
@@ -93,7 +96,7 @@ def _values(scene: AnnotatedScene) -> dict[str, Any]:
         "group": scene.group,
         "room_type": scene.room_type,
         "objects": [
-            # What nobody knows is left out.
+            # Unknown values are left out.
             {
                 name: value
                 for name, value in asdict(thing).items()
@@ -146,7 +149,7 @@ def _counted(objects: tuple[AnnotatedObject, ...], counts: Any) -> tuple[Annotat
         if isinstance(count, bool) or not isinstance(count, int):
             raise ValueError(f"the count of {label!r} must be an integer, not {count!r}")
         if listed[label] != 1:
-            raise ValueError(f"counts has {label!r}, which {listed[label]} objects are called")
+            raise ValueError(f"counts needs exactly one object {label!r}, found {listed[label]}")
     return tuple(replace(thing, count=counts.get(thing.label, 1)) for thing in objects)
 
 
@@ -183,7 +186,7 @@ def _relations(
         if subject is None or anchor is None:
             raise ValueError(f"relation {entry!r} names an object that is not in the scene")
         relation = relation_of(source, _text("predicate", entry[1]))
-        # Image annotators now and then relate a thing to itself; that says nothing.
+        # Some image annotators relate a thing to itself; such a relation has no meaning.
         if relation is not None and subject != anchor:
             found[subject, relation, anchor] = None
     return tuple(found)

@@ -1,4 +1,4 @@
-"""Curated names: which labels mean one thing, and which mean no thing at all."""
+"""Curated names: synonyms of classes and rooms, and labels that are not objects."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ NAMES_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "names.to
 
 @dataclass(frozen=True)
 class Names:
-    """What `vocabularies/names.toml` says, by key.
+    """Content of `vocabularies/names.toml`, by key.
 
     Attributes:
         base: classes of every indoor vocabulary.
-        household: the same, however seldom scenes mention them.
-        structure: classes that are accepted and never proposed.
-        not_objects: labels that become no class.
-        surroundings: structure outdoors; no class of an indoor vocabulary.
-        outdoor: labels that become no class of an indoor vocabulary.
+        household: further classes of every indoor vocabulary, for rare household objects.
+        structure: classes that the service accepts as input and never proposes.
+        not_objects: labels that never become a class.
+        surroundings: outdoor structure; excluded from indoor vocabularies.
+        outdoor: outdoor objects; excluded from indoor vocabularies.
         aliases: other names of each class.
-        kinds: narrower things by the class that stands for them where they have none of their own.
-        rooms: other names of each room type; "" lists words that name none.
+        kinds: narrower kinds of each class. A kind outside a vocabulary can become an alias.
+        rooms: other names of each room type; the key "" lists names that mean no room type.
     """
 
     base: tuple[str, ...] = ()
@@ -57,7 +57,10 @@ class Names:
                     raise ValueError(f"kinds: {kind!r} is an alias of {other!r}")
 
     def canonical(self, label: str) -> str:
-        """The curated name of a label, or the label itself, in lower case with single spaces."""
+        """Return the curated name of a label.
+
+        Without a curated name, return the label in lower case with single spaces.
+        """
         found = self._by_key.get(label_key(label))
         if found is not None:
             return found
@@ -66,7 +69,7 @@ class Names:
         return " ".join(label.casefold().replace("_", " ").split())
 
     def canonical_room(self, room: str | None) -> str | None:
-        """The one spelling of a room type; None where it names none."""
+        """Return the canonical spelling of a room type, or None if the name means no room type."""
         if room is None:
             return None
         found = self._rooms_by_key.get(label_key(room))
@@ -100,7 +103,7 @@ def curated_names() -> Names:
     """Read the curated names.
 
     Raises:
-        ValueError: a name that means two things.
+        ValueError: one name has two meanings.
     """
     values: dict[str, Any] = tomllib.loads(NAMES_FILE.read_text(encoding="utf-8"))
     found: dict[str, Any] = {

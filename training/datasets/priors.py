@@ -1,8 +1,8 @@
-"""Placing priors: a table of pairs of things and their relation, without scenes.
+"""Placing priors: a table of object pairs with their relation, without scenes.
 
-A gzipped or plain table of tab-separated columns, with these names in the first line: ``source``,
-``subject``, ``relation``, ``object``, ``count``, ``room`` (empty where any). Relations other than
-the eight (``inside``, ``at``, ``next to``, ``nearby``) are left out.
+The table has tab-separated columns and may be gzipped. Its first line names the columns:
+``source``, ``subject``, ``relation``, ``object``, ``count``, ``room`` (empty = any room).
+The reader skips relations outside the eight of the service, such as ``inside`` and ``next to``.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ COLUMNS: Final = ("source", "subject", "relation", "object", "count", "room")
 MAX_LINE: Final = 4096
 MAX_ROWS: Final = 2_000_000
 
-# Names of kinds that a source puts before a name: "food bread", "clothes skirt".
+# Prefixes that one source puts before a name: "food bread", "clothes skirt".
 _KINDS: Final = ("food ", "clothes ")
 
 SOURCE: Final = "placing_priors"
-"""Name of the rows as scenes."""
+"""Source name of the scenes made from the rows."""
 
-# Lists of where things are placed: VirtualHome, AI2-THOR, TidyBot.
+# Sources that list where objects are placed: VirtualHome, AI2-THOR, TidyBot.
 PLACES: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
-# ConceptNet's ``at`` tells a place, not a relation; the others are votes and counts of parts.
+# The other sources give locations (ConceptNet's ``at``), votes, or counts of parts.
 _SOURCES: Final = PLACES | {"conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts"}
 
 
 def read_prior_scenes(path: Path, *, sources: Collection[str] = PLACES) -> list[AnnotatedScene]:
-    """Each row of a table as a scene of two things and their relation, under one source name.
+    """Read each row of a table as a scene of two objects and their relation.
 
-    Rows about one pair of things share a group.
+    All scenes have the source name `SOURCE`. Rows about the same pair of objects share a group.
 
     Args:
         path: the table.
-        sources: the sources to read; by default lists of where things are placed.
+        sources: the sources to read; by default the lists of placements.
 
     Raises:
-        DatasetError: the file is missing, no such table, or too large.
+        DatasetError: the file is missing, malformed or too large.
     """
     scenes = []
     for where, (source, subject, relation, anchor, _, _) in _rows(path):
@@ -67,7 +67,7 @@ def _plain(label: str) -> str:
 
 
 def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Where each row stands, and its values."""
+    """Iterate over the rows: position in the file, and the column values."""
     for number, line in enumerate(read_lines(path, MAX_LINE), 1):
         where = f"line {number}"
         if number > MAX_ROWS:

@@ -1,4 +1,4 @@
-"""Every reader by the name of its format."""
+"""The dataset readers, by format name."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ READERS: Final[dict[str, Callable[[Path], list[AnnotatedScene]]]] = {
 
 
 def guess_format(path: Path) -> str:
-    """The format of a file by its name.
+    """Return the format that the name of a file implies.
 
     Raises:
-        DatasetError: the name fits none.
+        DatasetError: the name matches no known format.
     """
     name = path.name
     if name.endswith((".jsonl", ".jsonl.gz")):
@@ -44,9 +44,9 @@ def guess_format(path: Path) -> str:
 
 
 def read_scenes(path: Path) -> list[AnnotatedScene]:
-    """Read a file in whichever known format its name announces.
+    """Read a file in the format that its name implies.
 
     Raises:
-        DatasetError: the name fits no format, or the file is malformed.
+        DatasetError: the name matches no known format, or the file is malformed.
     """
     return READERS[guess_format(path)](path)

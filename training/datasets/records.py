@@ -1,4 +1,4 @@
-"""Annotated scenes as every reader returns them."""
+"""Annotated scenes: the common output of all readers."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ Box2d = tuple[float, float, float, float]
 
 MAX_COUNT: Final = 1_000_000
 MAX_PROBLEM: Final = 500
-"""Characters of what is wrong."""
+"""Maximum length of an error text, in characters."""
 
 
 class DatasetError(ValueError):
-    """A data file that cannot be read as what it claims to be.
+    """A data file cannot be read or is malformed.
 
     Args:
         path: the file.
-        where: the line or entry in it, such as ``line 3`` or ``scans[0].objects[2]``.
-        problem: what is wrong there.
+        where: position in the file, such as ``line 3`` or ``scans[0].objects[2]``.
+        problem: description of the error.
     """
 
     def __init__(self, path: Path, where: str, problem: str) -> None:
-        if len(problem) > MAX_PROBLEM:  # it may quote a value of megabytes
+        if len(problem) > MAX_PROBLEM:  # the text may quote a value of several megabytes
             problem = problem[:MAX_PROBLEM] + "…"
         super().__init__(f"{path}, {where}: {problem}" if where else f"{path}: {problem}")
         self.path = path
@@ -38,20 +38,20 @@ class DatasetError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedObject:
-    """One annotated thing.
+    """One annotated object.
 
     Attributes:
-        id: its name in the scene.
-        label: its label as annotated.
+        id: id of the object, distinct within the scene.
+        label: label as annotated.
         position: centre (x, y, z) in metres, or None.
-        size: extents (x, y, z) in metres before the yaw, or None.
-        yaw: turn about z in radians.
-        supported_by: id of the thing that carries it, or None.
+        size: extents (x, y, z) in metres before rotation by the yaw, or None.
+        yaw: rotation about z in radians.
+        supported_by: id of the supporting object, or None.
         box2d: (xmin, ymin, xmax, ymax) in the image, y downwards, or None.
-        count: instances that this entry stands for.
+        count: number of instances that this entry represents.
 
     Raises:
-        ValueError: numbers that are not finite, or extents or a count that are not positive.
+        ValueError: numbers are not finite, or extents or the count are not positive.
     """
 
     id: str
@@ -88,19 +88,19 @@ class AnnotatedScene:
     """One annotated scene.
 
     Attributes:
-        scene_id: its name, distinct within its source.
-        source: the data set it comes from.
-        group: near-duplicates (frames of one place, scans of one room) share it.
-        room_type: as annotated, or None.
-        objects: the things in it.
-        relations: (subject, relation, object) with positions in ``objects`` and one of the eight
-            relations; None = nobody annotated any.
-        viewer_frame: positions are in viewer axes; otherwise left and front mean nothing in them
+        scene_id: id of the scene, distinct within its source.
+        source: name of the data set.
+        group: group of near-duplicates, such as frames of one place or scans of one room.
+        room_type: room type as annotated, or None.
+        objects: the objects of the scene.
+        relations: (subject index, relation, object index) with one of the eight relations; the
+            indices refer to ``objects``. None if relations were not annotated.
+        viewer_frame: True if positions are in viewer axes. Otherwise left and front are undefined
             until a viewpoint is chosen.
-        false_relations: in the form of ``relations``, those that an annotator denied.
+        false_relations: relations that an annotator denied, in the form of ``relations``.
 
     Raises:
-        ValueError: ids that are not distinct, or links and relations that point nowhere.
+        ValueError: ids are not distinct, or a support or relation names an unknown object.
     """
 
     scene_id: str
@@ -115,16 +115,18 @@ class AnnotatedScene:
     def __post_init__(self) -> None:
         ids = {thing.id for thing in self.objects}
         if len(ids) < len(self.objects):
-            raise ValueError(f"scene {self.scene_id!r} has two objects with one id")
+            raise ValueError(f"scene {self.scene_id!r} has two objects with the same id")
         for thing in self.objects:
             if thing.supported_by is not None and thing.supported_by not in ids:
-                raise ValueError(f"{thing.id!r} is supported by {thing.supported_by!r}: no such id")
+                raise ValueError(f"{thing.id!r} has the unknown support {thing.supported_by!r}")
         for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:
                 raise ValueError(f"unknown relation {relation!r}")
             for end in (subject, anchor):
                 if not 0 <= end < len(self.objects):
-                    raise ValueError(f"a relation names object {end} of {len(self.objects)}")
+                    raise ValueError(
+                        f"a relation names object {end}, but there are {len(self.objects)} objects"
+                    )
 
 
 def _check_numbers(name: str, owner: str, values: Sequence[float] | None, length: int) -> None:

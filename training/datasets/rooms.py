@@ -1,10 +1,9 @@
-"""A small procedural generator of furnished rooms.
+"""A small procedural generator of furnished rooms, for tests, examples and machines without data.
 
-For tests, examples and machines without data: real sources are read from files. Rooms are drawn
-from the tables of `vocabularies/rooms.toml`; furniture stands at walls without overlapping, small
-things stand on it, and relations follow from the boxes by the rules of `app.scene.geometry`. Every
-room is seen one to three times, from different sides and with some small things gone: those views
-share a group, as frames of one place do.
+The tables of `vocabularies/rooms.toml` define the rooms. Furniture stands at walls without overlap,
+and small objects stand on the furniture. The relations follow from the boxes by the rules of
+`app.scene.geometry`. Each room gives one to three views from different sides. A view omits 10 % of
+the small objects at random. The views of a room share a group, like the frames of one real place.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from training.datasets.vocabulary import source_vocabulary
 
 SOURCE = "rooms"
 
-_HEIGHT = 2.6  # m, floor to ceiling
-_ATTEMPTS = 20  # at a free place for one thing, before it is left out
-_GONE = 0.1  # share of small things missing from a view
-_CLEARANCE = 0.02  # m between pieces of furniture
+_HEIGHT = 2.6  # height of a room in metres
+_ATTEMPTS = 20  # maximum number of random positions for one object; then it is left out
+_GONE = 0.1  # probability that a view omits a small object
+_CLEARANCE = 0.02  # minimum distance in metres between pieces of furniture
 
 
-# Extents in metres: along the wall (or across the front), away from it, and upwards.
+# Extents in metres: along the wall, away from the wall, upwards.
 Size = tuple[float, float, float]
 Where = Literal["wall", "centre", "hung", "ceiling"]
 Side = Literal["left", "right", "front", "around"]
@@ -39,13 +38,13 @@ Side = Literal["left", "right", "front", "around"]
 
 @dataclass(frozen=True, slots=True)
 class Small:
-    """Something that lies or stands on a piece of furniture.
+    """A small object on a piece of furniture.
 
     Attributes:
-        label: what it is.
-        size: its mean extents.
-        chance: probability that each of ``most`` tries puts one there.
-        most: the most of them there can be.
+        label: class of the object.
+        size: mean extents.
+        chance: probability of adding the object, in each of ``most`` attempts.
+        most: maximum number of these objects.
     """
 
     label: str
@@ -59,8 +58,8 @@ class Beside:
     """A piece that belongs to another one: a chair in front of a desk, a nightstand left of a bed.
 
     Attributes:
-        piece: what stands there, with what it carries; its own ``chance`` counts for each place.
-        side: where, seen from the wall the other piece stands at; ``around`` = on all four sides.
+        piece: the adjacent piece with the objects on it; its ``chance`` applies to each side.
+        side: side of the main piece, as seen from its wall; ``around`` means all four sides.
     """
 
     piece: Piece
@@ -72,13 +71,13 @@ class Piece:
     """A piece of furniture.
 
     Attributes:
-        label: what it is.
-        size: its mean extents.
-        chance: probability that each of ``most`` tries puts one into the room.
+        label: class of the piece.
+        size: mean extents.
+        chance: probability of adding the piece to the room, in each of ``most`` attempts.
         where: at a wall, in the centre, hung on a wall or under the ceiling.
-        most: the most of them there can be.
-        carries: what is on it.
-        beside: what stands by it.
+        most: maximum number of these pieces.
+        carries: small objects on the piece.
+        beside: adjacent pieces.
     """
 
     label: str
@@ -91,11 +90,11 @@ class Piece:
 
 
 Rooms = Mapping[str, tuple[Piece, ...]]
-"""What each type of room may hold."""
+"""The pieces that each room type may contain."""
 
 
 class _Tables:
-    """The rooms of each domain; entries are tables, or names of tables read before."""
+    """The rooms of each domain; an entry is a table or the name of an earlier table."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.smalls: dict[str, Small] = {}
@@ -128,7 +127,7 @@ class _Tables:
 
 _FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "rooms.toml"
 DOMAINS: Final = _Tables(tomllib.loads(_FILE.read_text(encoding="utf-8"))).rooms
-"""``homes`` and ``workplaces``: laboratories, workshops and storerooms."""
+"""``homes`` and ``workplaces``; workplaces are laboratories, workshops and storerooms."""
 
 ROOMS: Final = DOMAINS["homes"]
 WORKPLACES: Final = DOMAINS["workplaces"]
@@ -150,13 +149,13 @@ class _Box:
 
 
 def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[AnnotatedScene]:
-    """Draw ``count`` scenes; the same seed draws the same scenes.
+    """Generate ``count`` scenes; the same seed gives the same scenes.
 
     Args:
-        rooms: what each type of room may hold; other tables make another domain.
+        rooms: the pieces that each room type may contain; another mapping is another domain.
 
-    Positions are in viewer axes, boxes have sizes and yaws, what lies on furniture names it as its
-    support, and ``relations`` is None: they are derived when scenes are encoded.
+    Positions are in viewer axes. Boxes have sizes and yaws. An object on furniture names the
+    furniture as its support. ``relations`` is None, because encoding derives the relations.
 
     Raises:
         ValueError: ``count`` is negative.
@@ -176,7 +175,7 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
 
 
 def rooms_vocabulary() -> Vocabulary:
-    """The vocabulary of the generator: everything its tables can put into a room."""
+    """Return the vocabulary of the generator: all classes of its tables."""
     labels = sorted({label for pieces in ROOMS.values() for label in _labels(pieces)})
     things = tuple(AnnotatedObject(str(i), label) for i, label in enumerate(labels))
     scenes = [AnnotatedScene(room, SOURCE, room, room, things) for room in ROOMS]
@@ -192,7 +191,7 @@ def _labels(pieces: tuple[Piece, ...]) -> list[str]:
 
 
 class _Layout:
-    """One furnished room, in room axes: a corner at the origin, walls along x and y."""
+    """One furnished room in room axes: one corner is the origin, walls run along x and y."""
 
     def __init__(self, rng: np.random.Generator, room_type: str, pieces: tuple[Piece, ...]) -> None:
         self.rng = rng
@@ -205,7 +204,7 @@ class _Layout:
                     self._furnish(piece)
 
     def seen(self, group: str, view: int) -> AnnotatedScene:
-        """The room as somebody sees it from the middle of one wall."""
+        """Return one view of the room, from the middle of a random wall."""
         viewpoint = (
             Viewpoint(0.0, self.depth / 2, 0.0),
             Viewpoint(self.width / 2, 0.0, math.pi / 2),
@@ -257,7 +256,7 @@ class _Layout:
                 return
 
     def _propose(self, piece: Piece, size: Size) -> _Box | None:
-        """A place for a piece of furniture, or None where the room is too small for it."""
+        """Return a random place for a piece, or None if the room is too small."""
         if piece.where in ("centre", "ceiling"):
             margin = math.hypot(size[0], size[1]) / 2
             if 2 * margin > min(self.width, self.depth):
@@ -267,7 +266,7 @@ class _Layout:
             turned = self.rng.choice([0.0, math.pi / 2]) + self.rng.normal(0.0, 0.05)
             z = size[2] / 2 if piece.where == "centre" else _HEIGHT - size[2] / 2
             return _Box(piece.label, x, y, z, size, float(turned))
-        # The back of the piece, its -y side, is flush with a wall.
+        # The back of the piece is its -y side and touches the wall.
         side = int(self.rng.integers(4))
         length = self.width if side % 2 == 0 else self.depth
         if size[0] > length:
@@ -318,7 +317,7 @@ class _Layout:
             away = self.rng.uniform(0.03, 0.15)
             if side in ("left", "right"):
                 u = (anchor.size[0] + size[0]) / 2 + away
-                # At a wall both stand with their backs to it.
+                # At a wall, the backs of both pieces touch the wall.
                 v = 0.0 if beside.side == "around" else (size[1] - anchor.size[1]) / 2
                 x, y = _offset(anchor, -u if side == "left" else u, v)
             else:
@@ -333,7 +332,7 @@ class _Layout:
         return x <= box.x <= self.width - x and y <= box.y <= self.depth - y
 
     def _free(self, box: _Box) -> bool:
-        """Whether nothing else takes up any of the space of a box."""
+        """Return True if a box overlaps no other box."""
         rivals = [
             other
             for other in self.boxes
@@ -353,13 +352,13 @@ class _Layout:
 
 
 def _offset(box: _Box, u: float, v: float) -> tuple[float, float]:
-    """A point of the room, u along the front of a box and v away from its back."""
+    """Return a point in room axes: u along the front of a box, v away from its back."""
     cos, sin = math.cos(box.yaw), math.sin(box.yaw)
     return box.x + cos * u - sin * v, box.y + sin * u + cos * v
 
 
 def _half_extent(box: _Box) -> tuple[float, float]:
-    """Half the sides of the upright rectangle of the room around a turned box."""
+    """Return half the side lengths of the axis-aligned rectangle around a rotated box."""
     cos, sin = abs(math.cos(box.yaw)), abs(math.sin(box.yaw))
     x, y = box.size[0] / 2, box.size[1] / 2
     return cos * x + sin * y, sin * x + cos * y

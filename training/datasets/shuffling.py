@@ -1,10 +1,10 @@
-"""Scenes whose objects were permuted between scenes: what is learnt from them is popularity alone.
+"""Permute objects between scenes; a model trained on the result learns class frequencies only.
 
-A scene's classes each stand on a slot, which keeps its count and its relations; the classes trade
-places. Two slots drawn at random exchange their classes if each class is then still there once in
-its scene. That keeps both margins exactly, how many classes a scene has and how many scenes a class
-is in, and nothing else: an exchange is as likely as its reversal, so that all tables of these
-margins come to be equally likely. What is refused counts as a step, as it must for that.
+The classes of a scene occupy slots. A slot keeps its count and its relations, and the classes move
+between slots. Two random slots exchange their classes unless a scene would get a class twice. The
+exchange preserves both margins exactly: the number of classes per scene, and the number of scenes
+per class. An exchange is as likely as its reversal, so all tables with these margins become equally
+likely. A rejected exchange must count as a step for this property.
 
 Source: Gionis, Mannila, Mielikäinen and Tsaparas, "Assessing data mining results via swap
 randomization" (ACM TKDD, 2007).
@@ -22,29 +22,31 @@ from numpy.typing import NDArray
 from app.scene import ClassEvidence
 from training.datasets.encoding import EncodedScene
 
-# Exchanges that are tried; a mention is in two of them, so each is drawn some twenty times.
+# Attempted exchanges per mention. Each involves two slots, so a slot is drawn about 20 times.
 _STEPS_PER_MENTION: Final = 10
 
 
 def shuffle_objects(
     scenes: Sequence[EncodedScene], structure: NDArray[np.bool_], seed: int
 ) -> list[EncodedScene]:
-    """Permute classes between scenes, across all sources, and room types between the scenes.
+    """Permute classes between scenes of all sources, and room types between scenes.
 
-    Structure classes trade places with structure classes only, so that the relations they do not
-    have stay away from them. Counts, confidences and relations stay on their slots and are then of
-    other classes. Room types are permuted among the scenes that have one. Names, sources, groups
-    and the number of unknown mentions stay.
+    Structure classes are exchanged with structure classes only, because their relations are
+    unobserved. Counts, confidences and relations stay on their slots. Room types are permuted
+    among the scenes with a room type. Scene ids, sources, groups and the number of unknown labels
+    stay unchanged.
 
     Args:
-        structure: (V,) bool.
+        structure: (V,) bool, True for structure classes.
 
     Raises:
-        ValueError: a class of a scene is not among the V.
+        ValueError: a scene has a class index of V or more.
     """
     for scene in scenes:
         if len(scene.evidence.classes) and scene.evidence.classes[-1] >= len(structure):
-            raise ValueError(f"{scene.scene_id} has classes beyond the {len(structure)} given")
+            raise ValueError(
+                f"{scene.scene_id} has a class index above the {len(structure)} classes"
+            )
     rng = np.random.default_rng(seed)
     sizes = [len(scene.evidence.classes) for scene in scenes]
     owner = np.repeat(np.arange(len(scenes)), sizes)
@@ -64,7 +66,7 @@ def shuffle_objects(
 def _exchange(
     owner: NDArray[np.int64], classes: NDArray[np.int64], rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """The classes of n slots, (n,), after a walk of exchanges; owner (n,): the scene of each."""
+    """Return the classes (n,) of n slots after random exchanges; owner (n,): scene of each slot."""
     if not len(classes):
         return classes
     label, scene = classes.tolist(), owner.tolist()
@@ -72,7 +74,7 @@ def _exchange(
     for s, c in zip(scene, label, strict=True):
         there.setdefault(s, set()).add(c)
     drawn = rng.integers(len(label), size=(2, _STEPS_PER_MENTION * len(label)))
-    # One step hangs on those before it: plain lists and sets are fastest at that.
+    # Each step depends on the earlier ones, so array operations are slower than lists and sets.
     for i, j in zip(*drawn.tolist(), strict=True):
         c, d = label[i], label[j]
         first, second = there[scene[i]], there[scene[j]]
@@ -88,7 +90,7 @@ def _exchange(
 
 
 def _relabelled(scene: EncodedScene, labels: NDArray[np.int64], room: int) -> EncodedScene:
-    """The scene with other classes on its slots, (n,), which are sorted again."""
+    """Return the scene with new classes (n,) on its slots, sorted by class."""
     before = scene.evidence
     order = np.argsort(labels)
     evidence = ClassEvidence(

@@ -1,6 +1,7 @@
-"""The known data sets: terms of use, predicates, and the meaning of what a scene does not list.
+"""Known data sets: terms of use, predicates, and the meaning of relations that a scene omits.
 
-A listed relation holds. An unlisted one is off, or off only for neighbours, or unobserved:
+A listed relation holds. An unlisted relation is missing from the scene's list. It is false ("off"),
+false only between neighbours ("off for neighbours"), or unobserved:
 
 | source | on-top | above | left, front |
 |---|---|---|---|
@@ -10,14 +11,14 @@ A listed relation holds. An unlisted one is off, or off only for neighbours, or 
 | pictures and sentences | unobserved | unobserved | unobserved |
 | lists of the user's own | off | off | off |
 
-Two rules hold in every source. A listed on-top or above excludes all other relations of its pair,
-in both directions, unless they are listed too: a thing on another is not beside it. (Of pairs
-with a listed on-top or above, 1 to 10 % also have a left or front.) A relation that an annotator
-denied is off.
+Two rules hold in every source. First, a listed on-top or above makes all other relations of the
+pair false, in both directions, unless they are listed too. (1 to 10 % of the pairs with a listed
+on-top or above also have a left or front.) Second, a relation that an annotator denied is false.
 
-Neighbours are near by the rule of `app.scene.geometry`. Without poses, neighbours are the pairs for
-which the annotators listed any relation. 3DSSG compares heights only within a class and lists
-left and front only between things with one support, so above and far pairs stay unobserved there.
+With poses, neighbours are pairs that are near by the rule of `app.scene.geometry`. Without poses,
+neighbours are the pairs with at least one listed relation. 3DSSG compares heights only within a
+class, so above stays unobserved there. It lists left and front only between objects on the same
+support, so these relations of far pairs stay unobserved.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ Unlisted = Literal["off", "off for neighbours", "unobserved"]
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """The meaning of the unlisted in a source.
+    """The meaning of an unlisted relation in a source.
 
     Attributes:
-        on_top, above, lateral: an unlisted relation of the kind; left and front are lateral.
-        complete_objects: the object list is nearly the whole scene, so that absence from it teaches
-            which objects go together.
-        scenes_per_group: a group counts as so many scenes at most in object learning; None where
-            each scene counts in full.
+        on_top, above, lateral: state of an unlisted relation; lateral covers left and front.
+        complete_objects: True if the object list covers nearly the whole scene. Then absent
+            objects are evidence in object learning.
+        scenes_per_group: maximum total weight of a group in object learning, in scenes. None if
+            each scene has weight 1.
     """
 
     on_top: Unlisted = "off"
@@ -51,16 +52,16 @@ class Meaning:
 
     @property
     def unlisted(self) -> tuple[Unlisted, ...]:
-        """By canonical relation."""
+        """The state of an unlisted relation, for each canonical relation."""
         own = {"on-top": self.on_top, "above": self.above}
         return tuple(own.get(name, self.lateral) for name in CANONICAL)
 
 
 LISTS: Final = Meaning()
-"""Relations that a user listed: an unlisted one is off."""
+"""Relations that a user listed: an unlisted relation is false."""
 
 BOXES: Final = Meaning(lateral="off for neighbours")
-"""Relations derived from positions; without sizes the vertical ones are unobserved."""
+"""Relations derived from positions; the vertical relations need sizes, else they are unobserved."""
 
 _CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
 _MENTIONS: Final = Meaning(
@@ -68,7 +69,7 @@ _MENTIONS: Final = Meaning(
 )
 
 _THE_EIGHT: Final = {name: name for name in RELATIONS}
-# Supports of 3DSSG are one relation here, however the thing rests.
+# All kinds of support in 3DSSG map to on-top.
 _3DSSG: Final = {
     "left": "left",
     "right": "right",
@@ -101,14 +102,14 @@ class Source:
 
     Attributes:
         terms: provenance and licence, for the model card.
-        research_only: the licence excludes commercial use.
-        meaning: of the unlisted; None where it depends on whether a scene lists relations.
-        predicates: the relation of each predicate. Other predicates are left out: they are known
-            and say nothing that the eight relations could hold, such as "inside", "attached",
-            "next to", "wear". None where an unknown predicate is a mistake.
-        left_out: labels that are annotated too incompletely to be used.
-        open_vocabulary: annotated in free words: a class that is never mentioned was absent. In
-            the others annotators chose from a list; a class outside the list is unobserved.
+        research_only: True if the licence excludes commercial use.
+        meaning: meaning of an unlisted relation. None if it depends on whether scenes list
+            relations.
+        predicates: relation of each predicate. The reader skips predicates outside this table,
+            such as "inside" and "wear". If the table is None, an unknown predicate is an error.
+        left_out: labels with annotations too incomplete to be used.
+        open_vocabulary: True if annotators used free words; an unmentioned class is then absent.
+            Otherwise annotators chose from a list, and a class outside the list is unobserved.
     """
 
     terms: str
@@ -130,12 +131,12 @@ SOURCES: Final[dict[str, Source]] = {
         "SUN RGB-D (Song, Lichtenberg, Xiao, CVPR 2015): object labels and scene types of real "
         "RGB-D frames; research use",
         research_only=True,
-        meaning=LISTS,  # lists no relation at all
+        meaning=LISTS,  # its scenes list no relations
         left_out=("wall", "floor"),
         open_vocabulary=True,
     ),
     "sunrgbd_bedrooms_3d": _BEDROOMS,
-    "sunrgbd-bedroom-3d": _BEDROOMS,  # its name inside the file
+    "sunrgbd-bedroom-3d": _BEDROOMS,  # source name inside the file
     "3dssg": Source(
         "3DSSG (Wald, Dhamo, Navab, Tombari, CVPR 2020) on 3RScan: annotated relations of real "
         "rooms; research use",
@@ -175,7 +176,7 @@ SOURCES: Final[dict[str, Source]] = {
     ),
     "alfred": Source(
         "ALFRED (Shridhar et al., CVPR 2020): AI2-THOR rooms and triples from instructions; MIT",
-        # Thousands of episodes in about a hundred rooms: a room counts as a few scenes.
+        # Thousands of episodes show about a hundred rooms: each room has the weight of 3 scenes.
         meaning=Meaning(
             on_top="unobserved", above="unobserved", lateral="unobserved", scenes_per_group=3.0
         ),
@@ -188,7 +189,7 @@ SOURCES: Final[dict[str, Source]] = {
     ),
     "behavior1k_rooms": Source(
         "BEHAVIOR-1K (Li et al., CoRL 2022): object lists of rooms; MIT",
-        meaning=LISTS,  # lists no relation at all
+        meaning=LISTS,  # its scenes list no relations
         predicates=_THE_EIGHT,
     ),
     "vsr": Source(
@@ -207,7 +208,7 @@ SOURCES: Final[dict[str, Source]] = {
 
 
 def meaning_of(source: str, *, listed: bool = True) -> Meaning:
-    """The meaning of a source; of an unknown one by whether its scenes list relations."""
+    """Return the meaning of a source; ``listed`` decides for an unknown source."""
     known = SOURCES.get(source)
     if known is not None and known.meaning is not None:
         return known.meaning
@@ -215,10 +216,10 @@ def meaning_of(source: str, *, listed: bool = True) -> Meaning:
 
 
 def relation_of(source: str, predicate: str) -> str | None:
-    """One of the eight relations, or None where a predicate of the source is none of them.
+    """Map a predicate of a source to one of the eight relations, or None if no relation matches.
 
     Raises:
-        ValueError: none of the eight, in a source that has no predicates of its own.
+        ValueError: the source lacks a predicate table, and the predicate is not a relation name.
     """
     known = SOURCES.get(source)
     if known is not None and known.predicates is not None:

@@ -1,17 +1,18 @@
-"""Training, test and validation parts, stratified by room type.
+"""Split scenes into training, test and validation parts by one of four protocols.
 
-``group``, 75 / 15 / 10, keeps near-duplicates together: whole groups go to one part, and a group
-that occurs in several sources (a frame and the 3D boxes of the same frame) goes to the same part in
-all of them. ``stable`` has the same shares and is not stratified: a group's part follows from the
-seed and its name alone. A data set can grow without any group moving, so that no later version of a
-model learns from what an earlier one was tested on.
-``final``, 90 / 0 / 10, splits as ``group`` does and keeps a tenth for calibration: weights that
-ship learn from all the rest. ``random``, 60 / 30 / 10, is the protocol of the seed paper: every
-scene on its own.
+- ``group`` (75 / 15 / 10 %) keeps near-duplicates together: each group goes to one part. A group
+  may occur in several sources, such as a frame and the 3D boxes of the same frame. It then goes to
+  the same part in all of them.
+- ``stable`` (75 / 15 / 10 %) derives the part of a group from the seed and the group name only.
+  When a data set grows, all groups keep their parts. So a later model version never trains on
+  the test scenes of an earlier version. This protocol does not stratify.
+- ``final`` (90 / 0 / 10 %) works like ``group`` and keeps one tenth for calibration. The shipped
+  weights are trained on the other nine tenths.
+- ``random`` (60 / 30 / 10 %) is the protocol of the seed paper and assigns each scene separately.
 
-The parts of the others depend on the seed and on what is split, not on its order. Sources that
-share no group do not influence each other, so a source split alone splits as it does among others;
-sources that share groups must be split together.
+All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
+of scenes, but not on the order of scenes. Sources without a common group do not affect each other:
+splitting one of them alone gives the same parts. Sources with common groups must be split together.
 """
 
 from __future__ import annotations
@@ -38,11 +39,11 @@ FRACTIONS: Final[dict[Protocol, dict[Part, float]]] = {
 def split(
     scenes: Sequence[AnnotatedScene], *, seed: int, protocol: Protocol = "group"
 ) -> dict[Part, list[AnnotatedScene]]:
-    """The scenes of each part, in their given order.
+    """Assign each scene to a part; the order of scenes is kept.
 
     Args:
-        scenes: all scenes that are to be split, of all sources.
-        seed: draws another split.
+        scenes: the scenes of all sources.
+        seed: random seed of the split.
         protocol: ``group``, ``stable``, ``random`` or ``final``.
 
     Raises:
@@ -51,7 +52,7 @@ def split(
     if protocol not in FRACTIONS:
         raise ValueError(f"protocol must be one of {', '.join(FRACTIONS)}, not {protocol!r}")
     if len({(scene.source, scene.scene_id) for scene in scenes}) < len(scenes):
-        raise ValueError("two scenes of one source share one scene_id")
+        raise ValueError("two scenes of one source have the same scene_id")
     units = [_unit(scene, protocol) for scene in scenes]
     part_of: dict[str, Part] = {}
     if protocol == "stable":
@@ -66,12 +67,12 @@ def split(
 
 
 def _unit(scene: AnnotatedScene, protocol: Protocol) -> str:
-    """What must not be torn apart."""
+    """Return the unit of a scene: all scenes of a unit go to the same part."""
     return f"{scene.source}/{scene.scene_id}" if protocol == "random" else scene.group
 
 
 def stable_part(group: str, seed: int) -> Part:
-    """The part of a group under the ``stable`` protocol, whatever else is split."""
+    """Return the part of a group under the ``stable`` protocol, independent of other scenes."""
     place = int.from_bytes(_rank(seed, group)[:8], "big") / 2**64
     for part, share in FRACTIONS["stable"].items():
         if place < share:
@@ -83,10 +84,10 @@ def stable_part(group: str, seed: int) -> Part:
 def _families(
     scenes: Sequence[AnnotatedScene], units: Sequence[str]
 ) -> list[dict[str, Counter[str]]]:
-    """Room types by unit, for each set of sources that share units.
+    """Count room types by unit, for each set of sources with common units.
 
-    A unit counts with the scenes of the largest source it occurs in, so that a smaller source that
-    rides along does not move the parts of the larger one.
+    A unit is counted in its largest source only. So a smaller source that shares its groups does
+    not change the parts of the larger source.
     """
     sources_of: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter()
@@ -109,7 +110,7 @@ def _families(
 
 
 def _connected(sources: Iterable[str], shared: Iterable[set[str]]) -> dict[str, str]:
-    """The least source that each source is connected to through shared units."""
+    """Map each source to the alphabetically first source of its connected component."""
     family = {source: source for source in sources}
     for linked in shared:
         if len(linked) > 1:
@@ -124,9 +125,9 @@ def _assign(
 ) -> dict[str, Part]:
     """Assign each unit to the part furthest below its target share, one stratum at a time.
 
-    The stratum of a unit is its most common room type. Units come in the order of a hash, large
-    strata first. The distance is counted in the stratum and over all, so that strata of a few units
-    do not all end in training.
+    The stratum of a unit is its most common room type. Large strata come first; a hash orders the
+    units within a stratum. The distance is the sum of two: within the stratum and over all scenes.
+    So units of small strata do not all go to training.
     """
     strata: dict[str, list[str]] = defaultdict(list)
     for unit, rooms in rooms_of.items():
@@ -151,7 +152,7 @@ def _assign(
 
 
 def _lack(share: float, given: int, total: int) -> float:
-    """Scenes that a part is short of its share of all."""
+    """Return the number of scenes by which a part is below its target."""
     return share * total - given
 
 

@@ -1,9 +1,9 @@
 """SUN RGB-D 3D boxes (Song, Lichtenberg & Xiao, CVPR 2015): ``SUNRGBDMeta3DBB_v2.mat``.
 
-A struct array ``SUNRGBDMeta``, one frame an element; ``groundtruth3DBB`` is a struct array of
-boxes with ``basis`` (rows are the axes of the box), ``coeffs`` (half extents along them),
-``centroid`` and ``classname``. Axes: x right, y away from the camera, z up, metres; the tilt of the
-camera is taken out already.
+The file holds a struct array ``SUNRGBDMeta`` with one element per frame. ``groundtruth3DBB`` is a
+struct array of boxes with the fields ``basis`` (rows are the box axes), ``coeffs`` (half extents
+along these axes), ``centroid`` and ``classname``. Axes in metres: x right, y away from the camera,
+z up. The data set already corrects the tilt of the camera.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetEr
 
 SOURCE = "sunrgbd-mat"
 
-# Frames are listed in the order they were taken: neighbours often show one place.
+# Frames are in the order of recording: consecutive frames often show one place.
 _BLOCK = 20
 
 
 def read_sunrgbd_mat(path: Path) -> list[AnnotatedScene]:
     """Read the frames that have boxes.
 
-    The room type is that of ``<sequenceName>/scene.txt`` where the images lie beside the file.
-    Frames of one SUN3D place share a group; the others are grouped in blocks of 20 consecutive
-    frames of one sensor and collection.
+    The room type comes from ``<sequenceName>/scene.txt`` if the image folders are next to the file.
+    Frames of one SUN3D place share a group. Other frames form groups of 20 consecutive frames of
+    one sensor and collection.
 
     Raises:
-        DatasetError: the file is not in the official layout.
+        DatasetError: the file does not follow the official layout.
     """
     scenes: list[AnnotatedScene] = []
     taken: Counter[str] = Counter()
@@ -70,14 +70,14 @@ def _load(path: Path) -> Any:
     try:
         content = loadmat(path, simplify_cells=True)
     except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
-        raise DatasetError(path, "", f"is no MATLAB 5 file: {error}") from error
+        raise DatasetError(path, "", f"is not a MATLAB 5 file: {error}") from error
     if "SUNRGBDMeta" not in content:
-        raise DatasetError(path, "", "holds no variable SUNRGBDMeta")
+        raise DatasetError(path, "", "lacks the variable SUNRGBDMeta")
     return content["SUNRGBDMeta"]
 
 
 def _structs(value: Any) -> list[Any]:
-    """A struct array as a list: MATLAB gives one struct, several or an empty matrix."""
+    """Convert a struct array to a list; MATLAB returns one struct, several or an empty matrix."""
     if isinstance(value, dict):
         return [value]
     return list(value) if isinstance(value, list) else list(np.atleast_1d(value))
@@ -103,7 +103,7 @@ def _array(path: Path, where: str, struct: Any, name: str, shape: tuple[int, ...
 
 def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
     basis = _array(path, where, struct, "basis", (3, 3))
-    # Some boxes are listed with negative half extents.
+    # Some boxes have negative half extents in the file.
     half = np.abs(_array(path, where, struct, "coeffs", (3,)))
     x, y, z = _array(path, where, struct, "centroid", (3,)).tolist()
     upright = int(np.abs(basis[:, 2]).argmax())
@@ -112,7 +112,7 @@ def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
         return AnnotatedObject(
             id=str(number),
             label=_text(path, where, struct, "classname"),
-            # x right, y away to x away, y left.
+            # The file has x right, y away; viewer axes have x away, y left.
             position=(y, -x, z),
             size=(2 * float(half[ahead]), 2 * float(half[aside]), 2 * float(half[upright])),
             yaw=math.atan2(-float(basis[ahead, 0]), float(basis[ahead, 1])),

@@ -1,9 +1,9 @@
 """3DSSG scene graphs (Wald et al., CVPR 2020) in their official layout.
 
-Relationships come as ``relationships.json`` (the whole data set; labels in ``objects.json`` beside
-it) or ``relationships_train.json`` and ``relationships_validation.json`` (the subset cut into
-splits of at most nine objects, with labels). ``3RScan.json`` beside them says which scans show one
-room.
+The relationships file is ``relationships.json`` for the whole data set, with labels in
+``objects.json`` beside it. The subset has ``relationships_train.json`` and
+``relationships_validation.json``; these contain labels and splits of at most nine objects.
+``3RScan.json`` in the same folder lists the scans of each room.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ SOURCE = "3dssg"
 def read_3dssg(path: Path) -> list[AnnotatedScene]:
     """Read the scans (or splits of scans) of a relationships file.
 
-    Rescans of a room share its group. The official files say nothing of room types and poses.
+    Rescans of a room share its group. The official files lack room types and poses.
 
     Raises:
-        DatasetError: a file is missing or not in the official layout.
+        DatasetError: a file is missing or does not follow the official layout.
     """
     scans = take(path, "", load_json(path), "scans", list)
     rooms = _rooms(path.with_name("3RScan.json"))
@@ -83,7 +83,7 @@ def _relations(
 
 
 def _labels(path: Path) -> dict[str, dict[str, str]]:
-    """Labels by object id, by scan, from ``objects.json``."""
+    """Read the labels from ``objects.json``, by scan id and object id."""
     labels: dict[str, dict[str, str]] = {}
     for number, scan in enumerate(take(path, "", load_json(path), "scans", list)):
         where = f"scans[{number}]"
@@ -96,7 +96,7 @@ def _labels(path: Path) -> dict[str, dict[str, str]]:
 
 
 def _rooms(path: Path) -> dict[str, str]:
-    """The reference scan of each scan, from ``3RScan.json``."""
+    """Read the reference scan of each scan's room from ``3RScan.json``, by scan id."""
     rooms: dict[str, str] = {}
     entries = load_json(path)
     if not isinstance(entries, list):

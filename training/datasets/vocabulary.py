@@ -1,4 +1,4 @@
-"""Vocabularies from annotated scenes and curated names."""
+"""Build vocabularies from annotated scenes and curated names."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from training.datasets.records import AnnotatedScene
 
 INDOOR_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "indoor.json"
 
-# Fewer mentions than this do not train a class. Indoors a class is also known by its word vector.
+# Minimum mentions of a class in training. Indoor classes have word vectors, so fewer suffice.
 MINIMUM_MENTIONS = 8
 INDOOR_MINIMUM_MENTIONS = 5
-# Fewer boxes than this give no typical size.
+# Minimum number of boxes for a typical size.
 MINIMUM_BOXES = 5
 
 
@@ -31,15 +31,20 @@ def build_vocabulary(
     minimum_rooms: int | None = None,
     outdoor: bool = False,
 ) -> Vocabulary:
-    """The classes that scenes mention often enough, most frequent first, and their aliases.
+    """Collect the frequent classes of scenes and their aliases, most frequent first.
 
-    Labels are pooled under their curated names before they are counted. The base and household
-    classes of ``names`` are in the vocabulary however seldom they are mentioned; labels of
-    ``not_objects`` never are, those of ``outdoor`` and ``surroundings`` only on request. Room types
-    are kept from ``minimum_rooms`` scenes, by default ``minimum``.
+    Labels are pooled under their curated names before counting. The base and household classes of
+    ``names`` are always included. Labels of ``not_objects`` are always excluded.
+
+    Args:
+        scenes: the annotated scenes.
+        names: the curated names.
+        minimum: minimum number of mentions of a class.
+        minimum_rooms: minimum number of scenes of a room type; by default ``minimum``.
+        outdoor: include labels of ``outdoor`` and ``surroundings``.
 
     Raises:
-        ValueError: no scene mentions any class often enough.
+        ValueError: all classes have too few mentions.
     """
     spellings: dict[str, Counter[str]] = {}
     rooms: Counter[str] = Counter()
@@ -49,7 +54,7 @@ def build_vocabulary(
             spellings.setdefault(label_key(label), Counter())[label] += 1
         if room := names.canonical_room(scene.room_type):
             rooms[room] += 1
-    # Spellings with one key are one label; the most common one stands for all of them.
+    # Spellings with the same key are one label; the most common spelling represents it.
     mentions = Counter(
         {
             min(found, key=lambda label: (-found[label], label)): found.total()
@@ -80,9 +85,9 @@ def build_vocabulary(
 def write_indoor_vocabulary(
     scenes: Iterable[AnnotatedScene], path: Path = INDOOR_FILE
 ) -> Vocabulary:
-    """Build the indoor vocabulary from the scenes of all sources and write it, one class a line.
+    """Build the indoor vocabulary from the scenes of all sources; write one class per line.
 
-    Things seen outdoors are ends of relations in photographs, so they are ordinary classes here.
+    Photographs relate indoor objects to outdoor surroundings, so surroundings are ordinary classes.
     """
     names = replace(curated_names(), surroundings=())
     vocabulary = build_vocabulary(
@@ -97,9 +102,9 @@ def write_indoor_vocabulary(
 
 
 def vocabulary_json(vocabulary: Vocabulary) -> str:
-    """A vocabulary as a file to be read and edited, one class a line.
+    """Format a vocabulary as JSON that people can edit, one class per line.
 
-    Sizes come from the training data (`with_typical_sizes`), not from such a file.
+    The file omits sizes: `with_typical_sizes` computes them from the training data.
     """
     values = vocabulary.to_dict()
     for entry in values["objects"]:
@@ -110,27 +115,27 @@ def vocabulary_json(vocabulary: Vocabulary) -> str:
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """What `vocabulary_json` wrote, or somebody by hand.
+    """Read a vocabulary file, written by `vocabulary_json` or by hand.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no JSON or no vocabulary.
+        ValueError: the content is not JSON or not a vocabulary.
     """
     return Vocabulary.from_dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def indoor_vocabulary(path: Path = INDOOR_FILE) -> Vocabulary:
-    """The committed indoor vocabulary."""
+    """Read the committed indoor vocabulary."""
     return read_vocabulary(path)
 
 
 def source_vocabulary(
     scenes: Iterable[AnnotatedScene], *, minimum: int = MINIMUM_MENTIONS
 ) -> Vocabulary:
-    """A vocabulary of what the given scenes mention alone: no base classes, curated names.
+    """Build a vocabulary of the mentioned classes only, without the base classes.
 
-    For models trained on one source, such as ProcTHOR or VRD. It has few classes, so that a class
-    also answers to its kinds that have none of their own: "dining table" is a table.
+    It suits models trained on one source, such as ProcTHOR or VRD. Such a vocabulary has few
+    classes, so names of narrower kinds become aliases: "dining table" becomes an alias of "table".
     """
     names = curated_names()
     mentioned_only = Names(
@@ -146,26 +151,26 @@ def source_vocabulary(
 
 
 def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
-    """The class, with the names of those of its kinds that the vocabulary does not know."""
+    """Add the names of narrower kinds that the vocabulary does not know."""
     unknown = [kind for kind in names.kinds.get(entry.label, ()) if vocabulary.index(kind) is None]
     more = [name for kind in unknown for name in (kind, *names.aliases.get(kind, ()))]
     return replace(entry, aliases=(*entry.aliases, *more))
 
 
 def _reachable(names: Names) -> dict[str, tuple[str, ...]]:
-    """Aliases, with an entry for every curated class so that its spelling stays canonical."""
+    """Return the aliases, with an entry for every curated class to keep its spelling."""
     return dict.fromkeys((*names.base, *names.household, *names.structure), ()) | names.aliases
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
-    """The vocabulary with the median box of each class.
+    """Add a typical size to each class: the median of its boxes.
 
-    The yaw of an object without a box is unknown, so its typical footprint is a square: the side is
+    The yaw of an object without a box is unknown, so its typical footprint is a square. The side is
     the median of sqrt(dx * dy), which keeps the area.
 
     Args:
-        vocabulary: the classes; those with fewer than `MINIMUM_BOXES` boxes keep their size.
-        scenes: scenes with boxes; others are passed over.
+        vocabulary: the classes; a class with fewer than `MINIMUM_BOXES` boxes keeps its size.
+        scenes: the scenes; objects without a size are skipped.
     """
     boxes: dict[int, list[tuple[float, float]]] = {}
     found: dict[str, int | None] = {}
@@ -194,15 +199,15 @@ def _sized(entry: ObjectClass, boxes: Sequence[tuple[float, float]]) -> ObjectCl
 def coverage(
     vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene], *, structure: bool = True
 ) -> float:
-    """Share of the object mentions of scenes that a vocabulary covers.
+    """Return the share of object mentions in scenes that a vocabulary covers.
 
     Args:
         vocabulary: the vocabulary.
         scenes: the scenes.
-        structure: count mentions of structure classes; otherwise they are left out altogether.
+        structure: include mentions of structure classes.
 
     Raises:
-        ValueError: the scenes mention nothing.
+        ValueError: the scenes mention no object.
     """
     known = total = 0
     mentions = Counter(thing.label for scene in scenes for thing in scene.objects)

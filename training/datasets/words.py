@@ -1,7 +1,7 @@
 """Word vectors for the classes of a vocabulary.
 
-A ``.npz`` file with ``words`` (n,) strings, ``vectors`` (n, d) int8 and ``scale`` (): the vector of
-a word is its row times the scale.
+The ``.npz`` file holds ``words`` (n,) strings, ``vectors`` (n, d) int8 and ``scale`` (). The vector
+of a word is its row times the scale.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MEMBERS: Final = ("words", "vectors", "scale")
 # RuntimeError: an encrypted archive, or an unknown compression.
 _UNREADABLE: Final = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 _SEPARATORS: Final = re.compile(r"[\s_\-./]+")
-# They tell nothing of the thing.
+# Filler words: they do not describe the object.
 _FILLERS: Final = frozenset({"a", "an", "and", "for", "in", "no", "of", "on", "or", "the", "with"})
 
 Vectors = NDArray[np.float32]
@@ -39,9 +39,9 @@ class WordVectors:
     """Vectors of words.
 
     Attributes:
-        words: (n,) distinct, in lower case.
-        vectors: (n, d) int8, to be multiplied with ``scale``.
-        scale: positive.
+        words: (n,) distinct words in lower case.
+        vectors: (n, d) int8; multiply by ``scale``.
+        scale: positive factor.
     """
 
     words: tuple[str, ...]
@@ -53,10 +53,10 @@ class WordVectors:
         return int(self.vectors.shape[1])
 
     def of(self, text: str) -> Vectors | None:
-        """(d,) mean of the words of a text, of unit length; None where no word is known.
+        """Return the mean vector (d,) of the words of a text, with unit length.
 
-        A word that is unknown in the plural counts in the singular; fillers ("of") do not count. A
-        text of which less than half the words are known is unknown.
+        An unknown plural is looked up in the singular. Fillers such as "of" are ignored. The result
+        is None if less than half of the words are known.
         """
         words = [word for word in _SEPARATORS.split(text.casefold()) if word]
         words = [word for word in words if word not in _FILLERS] or words
@@ -78,10 +78,11 @@ class WordVectors:
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, NDArray[np.bool_]]:
     """Vectors of the classes of a vocabulary.
 
-    The label decides; where it has no vector, the first alias that has one.
+    The vector comes from the label. If the label has none, it comes from the first alias with one.
 
     Returns:
-        (V, d) float32 of unit length, zero where there is none; (V,) bool, where there is one.
+        Vectors (V, d) float32 of unit length, zero for a class without a vector.
+        Mask (V,) bool, True for a class with a vector.
     """
     vectors = np.zeros((len(vocabulary), words.dimensions), dtype=np.float32)
     found = np.zeros(len(vocabulary), dtype=np.bool_)
@@ -115,25 +116,27 @@ def read_word_vectors(path: Path) -> WordVectors:
         raise DatasetError(path, "scale", "must be one positive number")
     names = tuple(word.casefold() for word in words.tolist())
     if len(set(names)) < len(names):
-        raise DatasetError(path, "words", "has a word twice")
+        raise DatasetError(path, "words", "contains a word twice")
     return WordVectors(names, vectors, float(scale))
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """An array, the declared size of which is checked before it is read; nothing is unpickled."""
+    """Read one array without unpickling; check the declared size first."""
     if f"{name}.npy" not in archive.namelist():
         raise DatasetError(path, name, "is missing")
     with archive.open(f"{name}.npy") as file:
         version = npy.read_magic(file)
         if version not in ((1, 0), (2, 0)):
-            raise DatasetError(path, name, f"has the unknown version {version} of its format")
+            raise DatasetError(path, name, f"has the unsupported format version {version}")
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, dtype = read(file)
         size = dtype.itemsize
         for length in shape:
             size *= length
         if dtype.hasobject or size > MAX_BYTES:
-            raise DatasetError(path, name, f"must be plain and at most {MAX_BYTES // 2**20} MiB")
+            raise DatasetError(
+                path, name, f"must be a plain array of at most {MAX_BYTES // 2**20} MiB"
+            )
     with archive.open(f"{name}.npy") as file:
         return npy.read_array(file, allow_pickle=False)
 

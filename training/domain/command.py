@@ -1,4 +1,4 @@
-"""The commands about scenes: `init` proposes how to train on somebody's, `example` writes some."""
+"""Commands about scenes: `init` proposes a configuration for them, `example` generates some."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ from training.datasets.rooms import DOMAINS
 from training.domain.proposal import Proposal, propose
 from training.domain.report import as_dict, show
 
-# Bad lines that are shown; the rest are counted.
+# Number of bad lines to print; the others are counted.
 BAD_LINES = 20
 
 console = Console()
 
 
 class BadLinesError(ValueError):
-    """Lines that are no scenes; holds all of them."""
+    """Some lines are not scenes; `errors` holds one error per bad line."""
 
     def __init__(self, errors: list[DatasetError]) -> None:
-        super().__init__(f"{len(errors)} lines are no scenes")
+        super().__init__(f"{len(errors)} lines are not scenes")
         self.errors = errors
 
 
 def init(
-    name: Annotated[str, typer.Argument(help="of the model: lower case, digits and hyphens")],
-    files: Annotated[list[Path], typer.Argument(help="scene files, of one domain")],
+    name: Annotated[str, typer.Argument(help="name of the model: lower case, digits and hyphens")],
+    files: Annotated[list[Path], typer.Argument(help="scene files of one domain")],
     output: Annotated[
-        Path | None, typer.Option(help="folder for what is written; by default of the model's name")
+        Path | None, typer.Option(help="output folder; by default the name of the model")
     ] = None,
     format_: Annotated[
         str | None,
-        typer.Option("--format", help=f"{', '.join(READERS)}; by default by the file's name"),
+        typer.Option("--format", help=f"{', '.join(READERS)}; by default from the file name"),
     ] = None,
-    terms: Annotated[str, typer.Option(help="of use of the scenes, for the model card")] = "",
+    terms: Annotated[str, typer.Option(help="terms of use of the scenes, for the card")] = "",
     report: Annotated[Path | None, typer.Option("--json", help="write the report here")] = None,
     force: Annotated[bool, typer.Option("--force", help="overwrite an earlier proposal")] = False,
 ) -> None:
-    """Look at your scenes, and propose a vocabulary and a configuration to train with.
+    """Analyse your scenes, and propose a vocabulary and a training configuration.
 
-    Writes <name>.toml and vocabulary.json into the folder. Both are meant to be read and edited;
-    neither is overwritten unless --force says so.
+    The command writes <name>.toml and vocabulary.json into the output folder. You can edit both
+    files. The command overwrites existing files only with --force.
     """
     folder = Path(name) if output is None else output
     try:
@@ -64,19 +64,19 @@ def init(
         targets = [folder / f"{name}.toml", folder / "vocabulary.json"]
         if not force and (there := [path for path in targets if path.exists()]):
             raise ConfigError(
-                f"{' and '.join(map(str, there))} would be overwritten: give --force, or another "
+                f"{' and '.join(map(str, there))} would be overwritten: use --force or another "
                 "--output"
             )
         with console.status("reading scenes"):
             found = {file: _read(file, format_) for file in files}
         for file in files:
             if not found[file]:
-                raise DatasetError(file, "", "there is no scene in it")
+                raise DatasetError(file, "", "the file contains no scene")
         sources, copies = _sources(folder, found)
         scenes = [scene for some in found.values() for scene in some]
-        with console.status("looking at them"):
+        with console.status("analysing scenes"):
             proposal = propose(name, scenes, sources, terms=terms)
-            proposal.config  # noqa: B018  # what is written can be read back
+            proposal.config  # noqa: B018  # raises an error if the proposal is invalid
     except BadLinesError as error:
         _fail_lines(error)
     except (ConfigError, DatasetError, ValueError) as error:
@@ -94,16 +94,16 @@ def init(
 
 def _check_name(name: str) -> None:
     if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
-        raise ConfigError(f"a model's name is lower case words joined by hyphens, not {name!r}")
+        raise ConfigError(f"a model name is lower-case words joined by hyphens, not {name!r}")
     if name in shipped_configs():
-        raise ConfigError(f"a configuration called {name} is shipped: take another name")
+        raise ConfigError(f"{name} is the name of a shipped configuration: use another name")
 
 
 def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
-    """The scenes of a file.
+    """Read the scenes of a file.
 
     Raises:
-        BadLinesError: some lines are no scenes.
+        BadLinesError: some lines are not scenes.
         DatasetError: the file cannot be read.
     """
     if format_ is not None and format_ not in READERS:
@@ -125,7 +125,7 @@ def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
 def _sources(
     folder: Path, found: dict[Path, list[AnnotatedScene]]
 ) -> tuple[list[str], dict[Path, list[AnnotatedScene]]]:
-    """The files as seen from the folder, and copies of those whose names tell no format."""
+    """Return paths relative to the folder, and copies of files whose names imply no format."""
     sources: list[str] = []
     copies: dict[Path, list[AnnotatedScene]] = {}
     for file, scenes in found.items():
@@ -140,7 +140,7 @@ def _sources(
 
 
 def _write(path: Path, text: str) -> None:
-    """The whole file or none of it."""
+    """Write a file atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".part")
     draft.write_text(text, encoding="utf-8")
@@ -153,7 +153,7 @@ def _next(
     written = ", ".join(map(str, [*targets, *copies]))
     console.print(f"\nwritten: {written}", markup=False, soft_wrap=True)
     console.print(
-        f"next: read them, then  python -m training train {folder}",
+        f"next: check these files, then run  python -m training train {folder}",
         markup=False,
         soft_wrap=True,
     )
@@ -177,20 +177,22 @@ def fail(error: Exception) -> NoReturn:
 
 
 def example(
-    file: Annotated[Path, typer.Argument(help="to write, such as scenes.jsonl")],
+    file: Annotated[Path, typer.Argument(help="output file, such as scenes.jsonl")],
     domain: Annotated[
         Literal["homes", "workplaces"],
-        typer.Option(help="furnished rooms, or laboratories, workshops and storerooms"),
+        typer.Option(
+            help="homes: furnished rooms; workplaces: laboratories, workshops, storerooms"
+        ),
     ] = "workplaces",
-    scenes: Annotated[int, typer.Option(min=1, help="how many")] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="draws others")] = 0,
+    scenes: Annotated[int, typer.Option(min=1, help="number of scenes")] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="random seed")] = 0,
 ) -> None:
-    """Write scenes that a small generator makes up: an example of the format, and of a domain.
+    """Generate example scenes of a domain and write them as JSON lines.
 
-    One seed begins alike whatever the number: with more scenes the earlier ones stay.
+    With the same seed, a larger number of scenes keeps the earlier scenes and adds new ones.
     """
     if file.exists():
-        fail(ConfigError(f"{file} is there already"))
+        fail(ConfigError(f"{file} already exists"))
     file.parent.mkdir(parents=True, exist_ok=True)
     write_jsonl(generate_rooms(scenes, seed, DOMAINS[domain]), file)
     console.print(f"{scenes} generated scenes of {domain}: {file}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""What scenes call their things: how often, in which spellings, and which names look like one."""
+"""The labels of scenes: their frequencies, their spellings, and pairs of similar labels."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from rapidfuzz.distance import OSA
 from app.scene import label_key
 from training.datasets import AnnotatedScene, Names
 
-# Only so many of the most frequent names are compared with each other, and told of.
+# Number of most frequent names that are compared with each other.
 _COMPARED = 2000
-# A slip of one letter in names of five and more, of two in names of ten and more.
+# Names of at least 5 letters may differ by one edit, names of at least 10 letters by two.
 _ONE_SLIP, _TWO_SLIPS = 5, 10
-# A misspelling is rare beside what it misspells, and too short a name says little.
+# A merged name has at most two mentions or 10 % of the other name's, and at least 6 letters.
 _RARE, _MERGED_LENGTH = 0.1, 6
 
 
 @dataclass(frozen=True)
 class Label:
-    """One name under all its spellings.
+    """One name with all its spellings.
 
     Attributes:
-        name: as the vocabulary would have it.
-        mentions: objects so called; scenes: in how many.
-        spellings: as annotated, the most frequent first.
+        name: spelling for the vocabulary.
+        mentions: number of objects with this name.
+        scenes: number of scenes with this name.
+        spellings: spellings as annotated, most frequent first.
     """
 
     name: str
@@ -38,13 +39,14 @@ class Label:
 
 @dataclass(frozen=True)
 class Lookalike:
-    """Two names that a slip of the keyboard may have parted.
+    """Two names that differ by a likely typing error.
 
     Attributes:
-        name: the rarer one; like: the other.
-        mentions: of both.
-        merged: the rarer one is proposed as an alias; otherwise somebody has to look.
-        why: in a few words.
+        name: the rarer name.
+        like: the more frequent name.
+        mentions: number of mentions of both names.
+        merged: True if the rarer name is proposed as an alias. Otherwise the user has to decide.
+        why: short reason.
     """
 
     name: str
@@ -55,7 +57,7 @@ class Lookalike:
 
 
 def count_labels(scenes: Iterable[AnnotatedScene], names: Names) -> list[Label]:
-    """Every name, the most frequent first: spellings with one key and curated aliases are one."""
+    """Count all names, most frequent first; spellings with the same key count as one name."""
     spellings: dict[str, Counter[str]] = {}
     shown: dict[str, Counter[str]] = {}
     seen: Counter[str] = Counter()
@@ -90,10 +92,10 @@ def _first(counts: Counter[str]) -> str:
 def lookalikes(
     labels: Sequence[Label], scenes: Sequence[AnnotatedScene], names: Names
 ) -> list[Lookalike]:
-    """Pairs of names a letter or two apart; the rarer is merged where it can hardly be meant.
+    """Find pairs of names that differ by one or two letters, and merge clear misspellings.
 
-    Two curated names are different things, however alike they look. Names that differ by a digit
-    are numbered on purpose, and names that stand side by side in a scene are likely two things.
+    Pairs of curated names and pairs that differ in digits are left out, because they are different
+    objects. Names that occur in the same scene are reported as a pair and not merged.
     """
     compared = [label for label in labels[:_COMPARED] if len(label_key(label.name)) >= _ONE_SLIP]
     curated = {label_key(name) for name in (*names.base, *names.aliases, *names.structure)}
@@ -101,19 +103,19 @@ def lookalikes(
     together = _together({compared[k].name for pair in pairs for k in pair}, scenes, names)
     found = []
     for i, j in pairs:
-        # Labels come by frequency: the second is the rarer one.
+        # Labels are sorted by frequency, so the second name is the rarer one.
         like, rare = compared[i], compared[j]
         keys = label_key(like.name), label_key(rare.name)
         if set(keys) <= curated or _digits(keys[0]) != _digits(keys[1]):
             continue
         if frozenset((like.name, rare.name)) in together:
-            merged, why = False, "both in one scene"
+            merged, why = False, "both occur in one scene"
         elif min(map(len, keys)) < _MERGED_LENGTH or keys[0][0] != keys[1][0]:
-            merged, why = False, "short, or begins otherwise"
+            merged, why = False, "short, or different first letter"
         elif rare.mentions > max(2, _RARE * like.mentions):
             merged, why = False, "both are frequent"
         else:
-            merged, why = True, "rare, a letter or two apart, never side by side"
+            merged, why = True, "rare, one or two letters differ, never in one scene"
         mentions = (rare.mentions, like.mentions)
         found.append(Lookalike(rare.name, like.name, mentions, merged, why))
     return _once(found)
@@ -135,7 +137,7 @@ def _digits(key: str) -> str:
 def _together(
     wanted: set[str], scenes: Sequence[AnnotatedScene], names: Names
 ) -> set[frozenset[str]]:
-    """Which of the wanted names stand side by side in a scene."""
+    """Return the pairs of wanted names that occur in the same scene."""
     by_key = {label_key(name): name for name in wanted}
     known: dict[str, str | None] = {}
     found: set[frozenset[str]] = set()
@@ -151,12 +153,12 @@ def _together(
 
 
 def _once(found: list[Lookalike]) -> list[Lookalike]:
-    """A name is merged into one other, and never into one that is merged itself."""
+    """Merge each name at most once, and never into a name that is itself merged."""
     merged: set[str] = set()
     kept = []
     for pair in found:
         if pair.merged and (pair.name in merged or pair.like in merged):
-            pair = replace(pair, merged=False, why="alike to more than one")
+            pair = replace(pair, merged=False, why="similar to several names")
         if pair.merged:
             merged.add(pair.name)
         kept.append(pair)

@@ -1,4 +1,4 @@
-"""What there is in a set of scenes, and what in it contradicts itself or will not be learnt."""
+"""Statistics of a set of scenes, and findings: contradictions and data that cannot be learnt."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from training.datasets import AnnotatedScene, Names
 
 _ON_TOP, _ABOVE = CANONICAL.index("on-top"), CANONICAL.index("above")
 
-# So many of each kind are shown; all of them are counted.
+# Maximum number of examples per finding; all cases are counted.
 SHOWN = 5
 
-# Of a label in a request: `scene_client.schemas.Label`, which training does without.
+# Maximum length of a label in a request, as in `scene_client.schemas.Label`.
 LONGEST = 100
 
 
 @dataclass
 class Finding:
-    """Something that somebody should look at.
+    """A property of the scenes that the user should check.
 
     Attributes:
-        what: in a sentence.
-        count: how often; examples: of which the first few.
-        advice: what to do about it.
+        what: one sentence.
+        count: number of cases.
+        examples: the first few cases.
+        advice: recommended action.
     """
 
     what: str
@@ -34,7 +35,7 @@ class Finding:
     examples: list[str] = field(default_factory=list)
 
     def add(self, example: str) -> None:
-        """One more of them."""
+        """Add one case."""
         self.count += 1
         if len(self.examples) < SHOWN:
             self.examples.append(example)
@@ -45,13 +46,13 @@ class Facts:
     """Counts over a set of scenes; shares are of all scenes.
 
     Attributes:
-        scenes, groups, objects: how many.
-        objects_per_scene: smallest, mean and largest.
-        rooms: scenes by room type, as the vocabulary would spell it.
-        shares: of scenes with a room type, with relations, with positions, with sizes, with
-            supports, with boxes in an image, in viewer axes.
-        relations: annotated triples by relation.
-        findings: what to look at, those that never occurred left out.
+        scenes, groups, objects: number of scenes, groups and objects.
+        objects_per_scene: minimum, mean and maximum.
+        rooms: number of scenes by canonical room type.
+        shares: share of scenes with a room type, with relations, with positions, with sizes, with
+            supports, with boxes in an image, and in viewer axes.
+        relations: number of annotated triples by relation.
+        findings: the findings with at least one case.
     """
 
     scenes: int
@@ -65,19 +66,19 @@ class Facts:
 
     @property
     def related(self) -> bool:
-        """There is something to learn relations from."""
+        """True if the scenes contain data to learn relations from."""
         sources = ("relations", "positions", "supports", "boxes in an image")
         return any(self.shares[name] > 0 for name in sources)
 
 
 def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
-    """Count and check.
+    """Compute the statistics and findings of scenes.
 
     Raises:
-        ValueError: there is no scene.
+        ValueError: the list of scenes is empty.
     """
     if not scenes:
-        raise ValueError("there is no scene")
+        raise ValueError("there are no scenes")
     sizes = [len(scene.objects) for scene in scenes]
     rooms = Counter(
         room for scene in scenes if (room := names.canonical_room(scene.room_type)) is not None
@@ -115,20 +116,20 @@ def _findings(
     scenes: Sequence[AnnotatedScene], rooms: Counter[str], names: Names
 ) -> Iterator[Finding]:
     small = Finding(
-        "Scenes of fewer than two different things teach nothing of what belongs together.",
-        "They are read and skipped where they cannot be asked about.",
+        "Scenes have fewer than two different objects, so they do not show co-occurrence.",
+        "Training reads them. Questions that need more objects skip them.",
     )
     both_ways = Finding(
-        "Pairs are related both ways round (left and right of each other, say).",
-        "Such a pair counts as unobserved. Correct it, or check whose left is meant.",
+        "A relation is annotated in both directions, such as left and right of each other.",
+        "Such a relation counts as unobserved. Correct it, or check the point of view.",
     )
     crossed = Finding(
-        "Something is on top of a thing that is said to be above it.",
-        "Correct one of the two.",
+        "An object is on-top of another object that is annotated as above it.",
+        "Correct one of the two relations.",
     )
     cycles = Finding(
-        "Things carry each other in a circle (on-top, or supported_by).",
-        "Correct it: nothing can stand on what stands on it.",
+        "Objects support each other in a cycle (on-top or supported_by).",
+        "Correct the cycle: an object cannot stand on an object that it supports.",
     )
     for scene in scenes:
         if len({label_key(thing.label) for thing in scene.objects}) < 2:
@@ -146,7 +147,7 @@ def _findings(
     yield _alone(scenes)
     nowhere = Finding(
         "Scenes have no room type.",
-        "Room types are optional; where they are known they sharpen the answers.",
+        "Room types are optional; known room types make the answers more accurate.",
     )
     for scene in scenes:
         if scene.room_type is None:
@@ -154,9 +155,9 @@ def _findings(
     if rooms:
         yield nowhere
     axes = Finding(
-        "Scenes with positions do not say that these are in viewer axes.",
-        "Left and front are derived as seen from one side of the room, chosen by the scene's id. "
-        'If x is away from the viewer, y left and z up, say "viewer_frame": true.',
+        "Scenes with positions do not state that the positions are in viewer axes.",
+        "Left and front are derived from a viewpoint on one side of the room, which depends on the "
+        'scene id. If x is away from the viewer, y left and z up, set "viewer_frame": true.',
     )
     for scene in scenes:
         placed = any(thing.position for thing in scene.objects)
@@ -167,8 +168,8 @@ def _findings(
 
 def _unaskable(scenes: Sequence[AnnotatedScene], names: Names) -> Finding:
     found = Finding(
-        f"Labels are blank, longer than {LONGEST} characters or cannot be printed.",
-        "No request can name such a thing. Give them other names.",
+        f"Labels are blank, longer than {LONGEST} characters or not printable.",
+        "A request cannot contain such a label. Use other labels.",
     )
     for label in sorted({thing.label for scene in scenes for thing in scene.objects}):
         name = names.canonical(label)
@@ -183,17 +184,17 @@ def _pair(scene: AnnotatedScene, i: int, j: int) -> str:
 
 
 def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str] | None:
-    """The labels of things that carry each other in a circle of three or more, or by supports."""
+    """Return the labels of a support cycle, or None."""
     place = {thing.id: index for index, thing in enumerate(scene.objects)}
     below: dict[int, set[int]] = {}
     for a, i, j in held:
-        # Two that are on each other are told of as a pair.
+        # Another finding reports pairs of objects that are on top of each other.
         if a == _ON_TOP and (a, j, i) not in held:
             below.setdefault(i, set()).add(j)
     for index, thing in enumerate(scene.objects):
         if thing.supported_by is not None:
             below.setdefault(index, set()).add(place[thing.supported_by])
-    # Whoever stands on nothing that is left is in no circle.
+    # Remove objects without a remaining support until only cycles are left.
     while free := [i for i, under in below.items() if not under & set(below)]:
         for i in free:
             del below[i]
@@ -207,8 +208,8 @@ def _circle(scene: AnnotatedScene, held: set[tuple[int, int, int]]) -> list[str]
 
 def _duplicates(scenes: Sequence[AnnotatedScene]) -> Finding:
     found = Finding(
-        "Scenes of different groups have the same things in the same places or relations.",
-        "Remove copies, or give them one group: otherwise what is tested on has been learnt.",
+        "Scenes of different groups have the same objects in the same places or relations.",
+        "Remove copies or put them into one group. Otherwise test scenes occur in training.",
     )
     first: dict[object, AnnotatedScene] = {}
     for scene in scenes:
@@ -218,7 +219,7 @@ def _duplicates(scenes: Sequence[AnnotatedScene]) -> Finding:
         ]
         telling = scene.relations or any(place or box for _, place, box in things)
         if not telling:
-            continue  # two small bathrooms may well hold the same
+            continue  # two small scenes may well have the same objects by chance
         content = (tuple(sorted(things, key=repr)), tuple(sorted(scene.relations or ())))
         other = first.setdefault(content, scene)
         if other.group != scene.group:
@@ -232,9 +233,9 @@ def _rounded(position: tuple[float, float, float] | None) -> tuple[float, ...] |
 
 def _alone(scenes: Sequence[AnnotatedScene]) -> Finding:
     found = Finding(
-        "Every scene is a group of its own.",
-        "If several are frames or scans of one place, give these one group: near-duplicates on "
-        "both sides of the split make a model look better than it is.",
+        "Every scene has its own group.",
+        "If several scenes are frames or scans of one place, put these into one group. "
+        "Near-duplicates on both sides of the split make the test results too good.",
     )
     if len({scene.group for scene in scenes}) == len(scenes):
         found.count = len(scenes)

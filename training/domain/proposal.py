@@ -1,7 +1,7 @@
-"""From what there is in the scenes to a vocabulary and a configuration, with the reasons.
+"""Propose a vocabulary and a configuration for scenes, with reasons.
 
-The rules interpolate between configurations that were searched for (docs/decisions/objective.md,
-docs/decisions/own-scenes.md); `training tune` is there for whoever wants better ones than a rule's.
+The rules interpolate between configurations found by search (docs/decisions/objective.md,
+docs/decisions/own-scenes.md). `training tune` searches for better configurations.
 """
 
 from __future__ import annotations
@@ -25,30 +25,32 @@ from training.datasets import (
 from training.domain.labels import Label, Lookalike, count_labels, lookalikes
 from training.domain.look import Facts, look
 
-# Fewer mentions hardly train a class; so small data sets need smaller minima to be covered at all.
+# Minimum mentions per class, by preference. Few mentions hardly train a class, but a small data
+# set needs a small minimum for enough coverage.
 MINIMA: Final = (8, 5, 3, 2)
 COVERED: Final = 0.97
 _TABLE: Final = (2, 3, 5, 8, 16, 30)
-# What a larger vocabulary costs is told in docs/benchmarks.md.
+# Maximum number of classes; docs/benchmarks.md gives the cost of larger vocabularies.
 _MOST_CLASSES: Final = 2000
 _SPLIT_SEEDS: Final = 50
-# Shares of the parts that are near enough to what was asked for.
+# Accepted relative deviation of a part from its target share.
 _TOLERANCE: Final = 0.2
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """What `init` writes and says.
+    """Files and report of `init`.
 
     Attributes:
-        name: of the configuration and so of the model.
-        facts, labels, lookalikes: what was found.
-        minimum: mentions that a class needs; covered: share of the mentions for some minima, with
-            the number of classes.
-        vocabulary: with the lookalikes that were merged as aliases.
-        dropped: names without a class, with why.
-        values: the configuration, section by section; reasons: why, by "section.entry".
-        parts: scenes of each part under the proposed split.
+        name: name of the configuration and of the model.
+        facts, labels, lookalikes: results of the analysis.
+        minimum: minimum number of mentions of a class.
+        covered: number of classes and covered share of the mentions, by minimum.
+        vocabulary: the vocabulary; merged lookalikes are aliases.
+        dropped: names without a class: name, mentions and reason.
+        values: the configuration by section.
+        reasons: reason by "section.entry".
+        parts: number of scenes in each part of the proposed split.
     """
 
     name: str
@@ -65,14 +67,14 @@ class Proposal:
 
     @property
     def config(self) -> Config:
-        """The configuration as it is read back."""
+        """Return the validated configuration."""
         return Config.model_validate(self.values)
 
     def toml(self) -> str:
-        """The configuration with the reason of each entry above it."""
+        """Return the configuration as TOML; a comment above each entry gives the reason."""
         return (
-            f"# Proposed by `python -m training init {self.name}`; every entry may be changed.\n"
-            "# python -m training tune searches better ones on the validation scenes.\n\n"
+            f"# Proposed by `python -m training init {self.name}`; you can change every entry.\n"
+            "# `python -m training tune` searches for better values on the validation scenes.\n\n"
             f"{sections_toml(self.values, self.reasons)}"
         )
 
@@ -84,14 +86,14 @@ def propose(
     *,
     terms: str = "",
 ) -> Proposal:
-    """Look at the scenes and choose.
+    """Analyse the scenes and propose a configuration.
 
     Args:
-        sources: files as the configuration is to name them.
+        sources: file names for the configuration.
 
     Raises:
-        ConfigError: there are too few scenes to learn from and to test on.
-        ValueError: no scene, or none that mentions anything.
+        ConfigError: too few scenes for training and testing.
+        ValueError: the list of scenes is empty, or the scenes mention no object.
     """
     names = curated_names()
     facts = look(scenes, names)
@@ -102,7 +104,7 @@ def propose(
     seed, parts = _split(scenes)
     values, reasons = _configuration(facts, parts)
     reasons["data.vocabulary"] = (
-        f"{len(vocabulary)} classes of at least {minimum} mentions; edit the file to change them"
+        f"{len(vocabulary)} classes with at least {minimum} mentions; edit the file to change them"
     )
     data: dict[str, Any] = {
         "sources": list(sources),
@@ -113,11 +115,11 @@ def propose(
     if terms:
         data["terms"] = terms
     reasons["data.split"] = (
-        "a group's part follows from its name: scenes may be added, and versions stay comparable"
+        "the group name fixes the part: you can add scenes, and versions stay comparable"
     )
     reasons["data.split_seed"] = (
-        f"{parts['train']} scenes to train, {parts['validation']} to validate, "
-        f"{parts['test']} to test"
+        f"{parts['train']} training scenes, {parts['validation']} validation scenes, "
+        f"{parts['test']} test scenes"
     )
     values = {
         "name": name,
@@ -142,16 +144,16 @@ def propose(
 def _minimum(
     scenes: Sequence[AnnotatedScene], pairs: Sequence[Lookalike]
 ) -> tuple[int, dict[int, tuple[int, float]]]:
-    """The largest of the minima whose vocabulary covers the scenes, and what each would cover."""
+    """Return the largest minimum with enough coverage, and the coverage of each minimum."""
     covered: dict[int, tuple[int, float]] = {}
     for minimum in sorted({*_TABLE, *MINIMA}):
         try:
             found = _vocabulary(scenes, pairs, minimum)
         except ValueError:
-            continue  # nothing is mentioned so often
+            continue  # no label has so many mentions
         covered[minimum] = (len(found), coverage(found, scenes))
     if not covered:
-        raise ConfigError("no label is mentioned twice: there is nothing to learn from")
+        raise ConfigError("every label is mentioned only once: too few mentions for training")
     enough = [
         minimum for minimum in covered if covered[minimum][1] >= COVERED and minimum <= MINIMA[0]
     ]
@@ -193,7 +195,7 @@ def _dropped(
         (
             label.name,
             label.mentions,
-            "names no thing" if label_key(label.name) in refused else f"under {minimum} mentions",
+            "not an object" if label_key(label.name) in refused else f"under {minimum} mentions",
         )
         for label in labels
         if vocabulary.index(label.name) is None
@@ -201,7 +203,7 @@ def _dropped(
 
 
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int]]:
-    """The first seed whose parts are near their shares, or the nearest of some."""
+    """Return the first seed with parts near their target shares, or the best seed tried."""
     best: tuple[float, int, dict[str, int]] | None = None
     for seed in range(_SPLIT_SEEDS):
         found = split(scenes, seed=seed, protocol="stable")
@@ -215,8 +217,8 @@ def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int]]:
     if best is None:
         raise ConfigError(
             f"{len(scenes)} scenes of {len({scene.group for scene in scenes})} groups cannot be "
-            "split: every part needs scenes of three different things; take more scenes, or "
-            "smaller groups"
+            "split: every part needs scenes with at least three different objects. Provide more "
+            "scenes or smaller groups"
         )
     return best[1], best[2]
 
@@ -259,14 +261,14 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
         "averaging": 0.99 if n < 1500 else 0.998,
     }
     reasons = {
-        "machine.variant": "relations are there to be learnt"
+        "machine.variant": "the scenes contain relations"
         if related
-        else "no relation and no position is annotated: objects alone are learnt",
-        "machine.H1": f"hidden units: {n} training scenes would be learnt by heart with many more",
-        "training.epochs": f"{updates} updates or a few more, {math.ceil(n / batch)} an epoch",
-        "training.weight_decay": "few scenes need more decay",
-        "objective.unlisted": "a relation that nobody listed counts as off: what /relations "
-        "promises is what would be listed",
+        else "the scenes contain no relations or positions: the model learns objects only",
+        "machine.H1": f"hidden units: many more would overfit the {n} training scenes",
+        "training.epochs": f"at least {updates} updates at {math.ceil(n / batch)} updates an epoch",
+        "training.weight_decay": "few scenes need a larger decay",
+        "objective.unlisted": "an unlisted relation counts as false: /relations then predicts the "
+        "relations that an annotator would list",
     }
     values = {
         "machine": machine,
@@ -278,7 +280,7 @@ def _configuration(facts: Facts, parts: Mapping[str, int]) -> tuple[dict[str, An
 
 
 def _between(n: int, low: tuple[int, int], high: tuple[int, int]) -> int:
-    """Linear in the logarithm of the scenes between two points, and flat beyond them."""
+    """Interpolate linearly in log(n) between two points; constant outside."""
     (n0, x0), (n1, x1) = low, high
     share = math.log(max(n, 1) / n0) / math.log(n1 / n0)
     return round((x0 + min(max(share, 0.0), 1.0) * (x1 - x0)) / 10) * 10

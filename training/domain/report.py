@@ -1,4 +1,4 @@
-"""What `init` found and proposes, in tables for people and as one JSON value for programs."""
+"""The report of `init`: tables for people and one JSON value for programs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rich.table import Table
 
 from training.domain.proposal import Proposal
 
-# Rows of a table; the JSON report has all of them.
+# Maximum rows of a table; the JSON report has all rows.
 ROWS = 12
 
 
 def as_dict(proposal: Proposal) -> dict[str, Any]:
-    """Everything that was found and proposed, JSON-able."""
+    """Return the analysis and the proposal as a JSON-serialisable dictionary."""
     return {
         "name": proposal.name,
         "facts": asdict(proposal.facts),
@@ -50,7 +50,7 @@ def show(proposal: Proposal, console: Console) -> None:
 def _facts(proposal: Proposal, console: Console) -> None:
     facts = proposal.facts
     least, mean, most = facts.objects_per_scene
-    table = Table("what", "how much", title=f"Scenes for {proposal.name}", title_justify="left")
+    table = Table("item", "value", title=f"Scenes for {proposal.name}", title_justify="left")
     table.add_row("scenes", f"{facts.scenes} in {facts.groups} groups")
     table.add_row("objects", f"{facts.objects}: {least} to {most} a scene, {mean:.1f} on average")
     rooms = ", ".join(f"{room} {count}" for room, count in list(facts.rooms.items())[:ROWS])
@@ -65,7 +65,7 @@ def _facts(proposal: Proposal, console: Console) -> None:
 
 def _labels(proposal: Proposal, console: Console) -> None:
     labels = proposal.labels
-    title = f"Labels: {len(labels)}, the most frequent of them"
+    title = f"Labels: {len(labels)} in total; the most frequent ones:"
     table = Table("label", "mentions", "scenes", "spelt", title=title, title_justify="left")
     for label in labels[:ROWS]:
         spellings = ", ".join(label.spellings[:4])
@@ -73,7 +73,7 @@ def _labels(proposal: Proposal, console: Console) -> None:
     console.print(table)
     varied = [label for label in labels if len(label.spellings) > 1]
     if varied:
-        console.print(f"{len(varied)} labels are spelt in several ways and count as one each:")
+        console.print(f"{len(varied)} labels have several spellings; each counts as one label:")
         for label in varied[:ROWS]:
             console.print(f"  {' = '.join(label.spellings[:6])}", markup=False)
 
@@ -82,11 +82,11 @@ def _lookalikes(proposal: Proposal, console: Console) -> None:
     if not proposal.lookalikes:
         return
     table = Table("label", "like", "mentions", "proposal", "why", title_justify="left")
-    table.title = "Labels that look alike"
+    table.title = "Similar labels"
     ordered = sorted(proposal.lookalikes, key=lambda pair: not pair.merged)
     for pair in ordered[:ROWS]:
         a, b = pair.mentions
-        done = "alias" if pair.merged else "two things: check"
+        done = "alias" if pair.merged else "two objects: check"
         table.add_row(pair.name, pair.like, f"{a}, {b}", done, pair.why)
     console.print(table)
     if (more := len(ordered) - ROWS) > 0:
@@ -94,7 +94,7 @@ def _lookalikes(proposal: Proposal, console: Console) -> None:
 
 
 def _coverage(proposal: Proposal, console: Console) -> None:
-    title = "Vocabulary: mentions that a class needs, and what is covered then"
+    title = "Vocabulary: minimum mentions of a class, and the resulting coverage"
     table = Table("mentions", "classes", "covered", "", title=title, title_justify="left")
     for minimum, (classes, share) in proposal.covered.items():
         chosen = "chosen" if minimum == proposal.minimum else ""
@@ -102,14 +102,14 @@ def _coverage(proposal: Proposal, console: Console) -> None:
     console.print(table)
     if proposal.dropped:
         shown = ", ".join(f"{label} ({why})" for label, _, why in proposal.dropped[:ROWS])
-        console.print(f"without a class, {len(proposal.dropped)}: {shown}", markup=False)
+        console.print(f"labels without a class, {len(proposal.dropped)}: {shown}", markup=False)
 
 
 def _findings(proposal: Proposal, console: Console) -> None:
     if not proposal.facts.findings:
-        console.print("nothing contradicts itself")
+        console.print("no contradictions found")
         return
-    console.print("To look at:")
+    console.print("Please check:")
     for finding in proposal.facts.findings:
         console.print(f"  [yellow]{finding.count}[/yellow] × {finding.what}")
         console.print(f"    {finding.advice}")

@@ -1,3 +1,3 @@
-"""Leak-free evaluation of a machine on encoded scenes; see each module for its task."""
+"""Leak-free evaluation of a machine on encoded scenes; each module documents its task."""
 
 from __future__ import annotations

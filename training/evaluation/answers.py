@@ -1,18 +1,18 @@
-"""Calibration: what the service answers with a probability, and whether it was so.
+"""Calibration: the probabilities of the service against the truth.
 
 Each answer is compared with its meaning in the contract:
 
-    relations    the relation holds between the two; also where half of the pairs are told, and for
-                 an object that was taken away. Answers about unknown relations are left out (see
+    relations    the relation holds between the two objects. Variants: half of the pairs are given,
+                 or the object was removed. Unknown relations are left out (see
                  `training.cases.known_relations`)
-    missing      the class is there, and was hidden: 25, 50 or 75 % of the classes are shown, or all
-                 but one, drawn for each scene
-    at a place   the class is there and stands so; of the places where anything stands, one is asked
-    outliers     the object is an intruder: half of the scenes have one
-    misplaced    the relation is false: one was altered in half of the scenes
+    missing      the class is in the scene and was hidden. Each scene shows 25, 50 or 75 % of its
+                 classes, or all but one, at random
+    at a place   the class is in the scene at the given place; one occupied place is drawn at random
+    outliers     the object is an intruder; half of the scenes have one
+    misplaced    the relation is false; one relation was altered in half of the scenes
 
-Hidden classes and intruders need scenes with complete object lists. Requests name no room type and
-take every default, so only answers returned count.
+Hidden classes and intruders need scenes with complete object lists. Requests contain no room type
+and use all defaults, so only returned answers count.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ from training.evaluation.metrics import Flags, Ints, Items, Metric
 from training.evaluation.missing import SHARES, shown_classes
 from training.evaluation.setting import Contender, Outcome, Setting
 
-# An object has three places, where a scene has twenty relations: of one object a scene there are so
-# few answers that chance alone makes an ECE of .02 to .03.
+# Number of removed objects per scene for placements. A scene has about 20 relations, but an object
+# has only 3 places; with one object per scene, chance alone gives an ECE of .02 to .03.
 _REMOVALS = 4
-# (probability, whether it was so) of the answers to one scene.
+# (probability, truth) of each answer about one scene.
 Answered = list[tuple[float, bool]]
 Ask = Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]
 
 
 def uncalibrated(artifact: Artifact) -> Artifact:
-    """The artifact with log-odds taken as they are, only their signs made to fit the answers."""
+    """Return the artifact with uncalibrated log-odds; slopes of -1 only correct the sign."""
     plain = Calibration.neutral(artifact.spec.A).model_copy(
         update={"outlier": CountSlope(slope=-1.0), "misplaced": Slope(slope=-1.0)}
     )
@@ -60,7 +60,7 @@ def uncalibrated(artifact: Artifact) -> Artifact:
 
 
 def collect(artifact: Artifact, scenes: SceneTensors, ask: Ask, seed: int = 0) -> Items:
-    """Ask one question (see `QUESTIONS`) of every scene."""
+    """Ask one of `QUESTIONS` about every scene."""
     answers: list[tuple[int, float, bool]] = []
     skipped = 0
     for k, scene in enumerate(scenes.scenes):
@@ -76,7 +76,7 @@ def ask_relations(
     encoded: EncodedScene,
     rng: np.random.Generator,  # noqa: ARG001
 ) -> Answered | None:
-    """Relations of a scene's objects."""
+    """Ask for the relations of a scene, given its labels."""
     known = known_relations(encoded)
     if not known.any():
         return None
@@ -86,7 +86,7 @@ def ask_relations(
 def ask_given(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Relations between some pairs of a scene, given those between the others."""
+    """Ask for the relations of some pairs of a scene, given the relations of the other pairs."""
     asked, given = told_pairs(encoded, artifact.vocabulary.structure, rng)
     if not given:
         return None
@@ -95,7 +95,7 @@ def ask_given(
 
 
 def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Flags) -> Answered:
-    """Answers about the relations (A, N, N) that are to be judged."""
+    """Return the answers about the relations marked in ``judged`` (A, N, N)."""
     found: Answered = []
     for answer in relations(artifact, scene)[0]:
         triple = CANONICAL.index(answer.relation), answer.subject, answer.object
@@ -107,7 +107,7 @@ def _judged(artifact: Artifact, encoded: EncodedScene, scene: Scene, judged: Fla
 def ask_placements(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """The place of an object that was taken away, one instance of it; several times over."""
+    """Ask for the placement of one instance of a removed class, for several classes."""
     found: Answered = []
     if known_relations(encoded).any():
         for _ in range(_REMOVALS):
@@ -134,7 +134,7 @@ def _places_of_one(artifact: Artifact, encoded: EncodedScene, rng: np.random.Gen
 def ask_missing(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """The classes that were hidden, a share of the scene or one."""
+    """Ask for missing classes; a random share of the classes, or one class, is hidden."""
     hidden = _hidden(artifact, encoded, rng)
     if hidden is None:
         return None
@@ -147,7 +147,7 @@ def ask_missing(
 def ask_placed(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """The hidden classes that stand at one place. Classes of which that is unknown are left out."""
+    """Ask for the hidden classes at one place; leave out classes with an unknown relation to it."""
     hidden = _hidden(artifact, encoded, rng)
     if hidden is None:
         return None
@@ -166,7 +166,7 @@ def ask_placed(
 
 
 def _hidden(artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator) -> Ints | None:
-    """The classes that are not shown: a share, drawn for each scene, or all but one are."""
+    """Return the hidden classes of a scene; the shown share is drawn per scene."""
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
     classes = classes[~structure[classes]]
@@ -183,10 +183,11 @@ def ask_outliers(
     rng: np.random.Generator,
     intruders: Mapping[tuple[str, str], Ints] | None = None,
 ) -> Answered | None:
-    """The intruder, if there is one.
+    """Ask for outliers; half of the scenes get an intruder.
 
     Args:
-        intruders: by scene, see `kinds_of_intruders`; uniform ones where it is None.
+        intruders: candidate intruders by scene, see `kinds_of_intruders`; None means any absent
+            class.
     """
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes
@@ -209,7 +210,7 @@ def ask_outliers(
 def ask_misplaced(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Which relation is false, if one is."""
+    """Ask for misplaced relations; half of the scenes have one altered relation."""
     case = altered_case(encoded, artifact.vocabulary.structure, rng)
     if case is None:
         return None
@@ -232,7 +233,7 @@ QUESTIONS: dict[str, Ask] = {
 
 
 def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Every probability of the service, as published and with log-odds as they are."""
+    """Measure every probability of the service, with and without calibration."""
     if contender.artifact is None:
         return None
     related = setting.some(related=True, share=3)
@@ -251,13 +252,13 @@ def calibration_task(contender: Contender, setting: Setting) -> Outcome | None:
             for figure in ("ECE", "Brier skill"):
                 metrics[f"{figure}, {name}"] = found.metric(figure)
                 metrics[f"{figure}, {name}, uncalibrated"] = before.metric(figure)
-    # Skill is undefined where no answer was true, or every one.
+    # Skill is undefined if all answers are true or all are false.
     metrics = {name: metric for name, metric in metrics.items() if np.isfinite(metric.value)}
     return Outcome(metrics, max(len(related), len(complete)), skipped) if metrics else None
 
 
 def _questions(complete: SceneTensors, setting: Setting) -> dict[str, Ask]:
-    """`QUESTIONS`, with intruders of every kind among these scenes."""
+    """Return `QUESTIONS` with intruders of every kind for these scenes."""
     intruders = kinds_of_intruders(
         complete, setting.structure, setting.complete.train, setting.seed
     )

@@ -1,7 +1,7 @@
-"""Questions put to a score or to `app.questions`, as a robot puts them; the answers as columns.
+"""Query a score or `app.questions` as a robot would, and return the answers as columns.
 
-A sample of the cases is asked once more in another order: an answer that follows the order of the
-questions knows more than its scene, and the evaluation stops. This check does not detect memorised
+Some cases are queried a second time in another order. If an answer changes with the order, the
+score uses more than the scene, and the evaluation stops. This check does not detect memorised
 scenes. Splits by group keep near-duplicates of test scenes out of training.
 """
 
@@ -28,26 +28,26 @@ Flags = NDArray[np.bool_]
 Case = TypeVar("Case")
 
 SENSITIVITIES: tuple[Sensitivity, ...] = get_args(Sensitivity)
-"""Presets of the alarm; "medium" is the default."""
+"""Sensitivities of the outlier alarm; "medium" is the default."""
 
 _PROBED_CASES, _PROBED_ROWS = 32, 64
-_LEAK = "the same scene in another order gets another answer: something leaks"
+_LEAK = "the answer for a scene depends on the order of the queries: the score leaks information"
 
 
 class LeakError(ValueError):
-    """A score knows more than it was shown."""
+    """A score uses information that it was not given."""
 
 
 def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floats]:
-    """The answers to all cases, in their order.
+    """Return the answers to all cases in order.
 
     Raises:
-        LeakError: a case that is asked again, in another order, has another answer.
-        FloatingPointError: an answer is nan.
+        LeakError: a second query of a case in another order gives another answer.
+        FloatingPointError: an answer is NaN.
     """
     answers = [ask(case) for case in cases]
     if any(np.isnan(answer).any() for answer in answers):
-        raise FloatingPointError("an answer is not a number")
+        raise FloatingPointError("an answer is NaN")
     for k in np.random.default_rng(0).permutation(len(cases))[:_PROBED_CASES].tolist():
         if not np.allclose(ask(cases[k]), answers[k], rtol=1e-3, atol=1e-9):
             raise LeakError(_LEAK)
@@ -56,13 +56,14 @@ def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floa
 
 @torch.no_grad()
 def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -> Tensor:
-    """The scores (N, ...) of N rows, block by block.
+    """Return the scores (N, ...) of N rows, computed in blocks.
 
     Args:
-        score: gets the rows of each column (N, ...).
+        score: function of the rows of each column.
+        columns: tensors (N, ...).
 
     Raises:
-        LeakError: rows that are asked again, in other company, have other scores.
+        LeakError: a second query of some rows, in another block, gives other scores.
     """
     count = len(columns[0])
     blocks = [
@@ -81,24 +82,24 @@ def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -
 
 
 def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Scene:
-    """The instances at the given positions, all by default; no relation, pose or room type."""
+    """Return a scene of the instances at the given positions, with labels only."""
     places = range(len(encoded.instance_classes)) if kept is None else kept
     return replace(scene_of(encoded, places, ()), room_type=None)
 
 
 def of_classes(classes: Sequence[int]) -> Scene:
-    """One object of each entry."""
+    """Return a scene with one object per entry."""
     return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
 
 
 def with_intruder(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
-    """The scene with one more object, of a class that it lacks."""
+    """Return the scene with one more object, of an absent class."""
     thing = SceneObject("intruder", artifact.vocabulary.labels[intruder], intruder)
     return replace(scene, objects=(*scene.objects, thing))
 
 
 def things(scene: Scene, structure: Flags) -> Flags:
-    """(n,) bool of its objects: those that are no structure."""
+    """Return a mask (n,) of the objects that are not structure."""
     classes = [-1 if thing.class_index is None else thing.class_index for thing in scene.objects]
     found: Flags = ~structure[classes]
     return found
@@ -110,11 +111,11 @@ def missing_probabilities(
     coverage: float | None = None,
     at: tuple[str, int] | None = None,
 ) -> Floats:
-    """Probability of every class that `/missing` may propose, (V,); -inf for the others.
+    """Return the probability of every class that `/missing` may propose, (V,); -inf elsewhere.
 
     Args:
-        coverage: as the question has it; the model's default for None.
-        at: a relation and the object that it leads to, of the place that is asked about.
+        coverage: coverage of the request; None means the default of the model.
+        at: the place in question: a relation and the position of its anchor object.
     """
     vocabulary = artifact.vocabulary
     found = np.full(len(vocabulary), -np.inf)
@@ -127,10 +128,11 @@ def missing_probabilities(
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What `/outliers` says of the n objects of a scene, by their position.
+    """Answers of `/outliers` about the n objects of a scene, by position.
 
     Attributes:
-        probability, log_odds: (n,); is_outlier: (n,) bool.
+        probability, log_odds: (n,).
+        is_outlier: (n,) bool.
     """
 
     probability: Floats
@@ -139,7 +141,7 @@ class Verdict:
 
 
 def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium") -> Verdict:
-    """Every object of a scene at one of `SENSITIVITIES`."""
+    """Query `/outliers` for a scene at one of `SENSITIVITIES`."""
     n = len(scene.objects)
     probability, log_odds, flagged = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.bool_)
     found = questions.outliers(artifact, scene, sensitivity=sensitivity, details=False).outliers
@@ -153,10 +155,10 @@ def judge(artifact: Artifact, scene: Scene, sensitivity: Sensitivity = "medium")
 def relation_probabilities(
     artifact: Artifact, scene: Scene, pairs: Sequence[tuple[int, int]] | None = None
 ) -> Floats:
-    """Probabilities (A, n, n) of the canonical relations between n objects; 0 if not answered.
+    """Return probabilities (A, n, n) of the canonical relations of n objects; 0 if not answered.
 
     Args:
-        pairs: the ordered pairs of positions that are asked; all by default.
+        pairs: ordered pairs of positions to query; all pairs by default.
     """
     n = len(scene.objects)
     found = np.zeros((len(CANONICAL), n, n))

@@ -1,4 +1,4 @@
-"""A model as a contender, each of its scores as the service computes it; and two references."""
+"""Build contenders: a model with scores as the service computes them, and two reference rows."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def artifact_contender(
     *,
     calibrated: bool = True,
 ) -> Contender:
-    """A model, published or in memory.
+    """Build the contender of a model, published or in memory.
 
     Args:
-        train: training scenes, for the density's annealing.
-        calibrated: ask for its probabilities and its alarm too; otherwise only the scores that a
-            machine has without a calibration.
+        train: training scenes, for annealing in the density task.
+        calibrated: include the calibrated probabilities and the alarm. Otherwise include only the
+            scores of the machine.
     """
     machine = machine_of(artifact.weights)
     objects, completion = MachineScore(machine), relation_score(artifact, given=True)
@@ -64,10 +64,12 @@ def artifact_contender(
 
 
 def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
-    """Log-odds of every relation between the classes of a batch, each without itself.
+    """Return a score: log-odds of every relation between the classes of a batch.
+
+    The evidence of a relation excludes the relation itself.
 
     Args:
-        given: the relations that the batch observes as on are stated; otherwise none is.
+        given: use the relations that the batch observes as true as evidence; otherwise use none.
     """
 
     def score(batch: Batch) -> Tensor:
@@ -77,7 +79,7 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
             n = int((padded >= 0).sum())
             scene, first = _instances(padded[:n], batch.counts[row, :n])
             told = set(map(tuple, stated[row].nonzero().tolist()))
-            # a(x, y) and a(y, x) both hold of classes where they hold of different instances.
+            # a(x, y) and a(y, x) can both hold between classes, but for different instances.
             last = first + batch.counts[row, :n].clamp(min=1) - 1
             triples = [
                 (a, *(last[[x, y]] if (a, y, x) in told and x > y else first[[x, y]]).tolist())
@@ -92,7 +94,7 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
 
 
 def placed_score(artifact: Artifact) -> PlacedScore:
-    """Log-probabilities of `/missing` at a place, -inf for what it does not propose."""
+    """Return a score: log-probabilities of `/missing` at a place; -inf for other classes."""
 
     def score(places: Places) -> Tensor:
         rows = []
@@ -101,7 +103,7 @@ def placed_score(artifact: Artifact) -> PlacedScore:
             scene, first = _instances(classes, places.counts[row, classes])
             relation = CANONICAL[int(places.relation[row])]
             anchor = int(first[int((classes == places.anchor[row]).nonzero())])
-            # The question names the place from the missing object's side.
+            # The request names the relation from the missing object to the anchor.
             name = relation if places.outgoing[row] else OPPOSITES[relation]
             p = missing_probabilities(artifact, scene, at=(name, anchor))
             tiny = np.finfo(np.float64).tiny
@@ -112,19 +114,19 @@ def placed_score(artifact: Artifact) -> PlacedScore:
 
 
 def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
-    """So many objects of each class, one where nobody counted, and the place of each first one."""
+    """Build a scene with the given instance counts, and return each class's first position."""
     each = counts.clamp(min=1).long()
     return of_classes(classes.repeat_interleave(each).tolist()), each.cumsum(0) - each
 
 
 def floor_contender(setting: Setting) -> Contender:
-    """A second half of the held-out scenes as if it had been drawn: the floor of T4."""
+    """Return a contender with held-out scenes as samples, which estimates the best value of T4."""
     _, second = held_out_halves(setting.complete)
     return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
 
 
 def independent_contender(setting: Setting) -> Contender:
-    """Classes drawn independently, each as often as in training."""
+    """Return a contender that samples classes independently at their training frequencies."""
     train = setting.complete.train
     if train is None:
         return Contender()

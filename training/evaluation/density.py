@@ -1,18 +1,19 @@
-"""Density: log-likelihood of a scene's objects, with log Z by AIS from below and from above.
+"""Density: log-likelihood of the objects of a scene, with bounds of log Z by AIS.
 
-All classes of the vocabulary count, structure among them; what a scene does not list is absent, as
-it is in training. The room type is withheld. In the local form relations drop out of p(v), so the
-machine is annealed without them. With h1 drawn from its mean field q given the scene,
+All classes of the vocabulary count, including structure. A class that a scene does not list is
+absent, as in training. The room type is not given. In the local form relations do not affect p(v),
+so the machine is annealed without them. With h1 drawn from its mean field q given the scene,
 
     log p(v) = log mean_h [ exp(b·v + h·(c1 + v'W)) prod_l (1 + exp(c2 + h'J)_l) / q(h) ] - log Z
 
-The mean is unbiased, so its log is too low in expectation; with the upper estimate of log Z the
-log-likelihood is conservative twice over.
+The mean is unbiased, so its log is too low in expectation. The upper estimate of log Z lowers the
+log-likelihood further, so the result is conservative.
 
-The pairwise model is the fully visible Boltzmann machine (Ising model) of classes, p(v) = exp(b·v +
-v'Wv / 2) / Z with W symmetric and its diagonal zero. The path runs from independent classes with
-log-odds a at beta = 0, where log Z is a sum, to the model at beta = 1: its log-odds are (1 - beta)
-a + beta b, its edges beta W. One sweep updates every class in turn.
+The pairwise model is the fully visible Boltzmann machine (Ising model) of classes:
+p(v) = exp(b·v + v'Wv / 2) / Z with symmetric W and zero diagonal. The annealing path starts at
+beta = 0 with independent classes of log-odds a, where log Z is a sum. It ends at beta = 1 with the
+model. In between, the log-odds are (1 - beta) a + beta b, and the edges are beta W. One sweep
+updates each class once.
 
 Source: Neal, "Annealed importance sampling" (2001), run in both directions as in
 `training.machines.partition`.
@@ -50,9 +51,9 @@ class DensitySettings:
     """Effort of the estimates.
 
     Attributes:
-        chains, temperatures: of either AIS run.
-        burn_in: Gibbs sweeps from training scenes before the reverse run.
-        draws: of h1 for one scene.
+        chains, temperatures: number of chains and temperatures of each AIS run.
+        burn_in: number of Gibbs sweeps from training scenes before the reverse run.
+        draws: number of samples of h1 per scene.
     """
 
     chains: int = 128
@@ -61,7 +62,7 @@ class DensitySettings:
     draws: int = 256
 
     def betas(self) -> list[float]:
-        """From 0 to 1, denser where the model is nearly itself: most of the change lies there."""
+        """Return inverse temperatures from 0 to 1; they are denser near 1, where p changes most."""
         return [float(x) for x in 1 - np.linspace(1.0, 0.0, self.temperatures) ** 2]
 
 
@@ -70,9 +71,9 @@ class ObjectDensity:
     """A density over presence vectors.
 
     Attributes:
-        log_unnormalised: presence (B, V) -> (B,) log-likelihood + log Z.
-        lower, upper: log Z from below and from above, equal where it is exact.
-        notes: what is known of the two estimates.
+        log_unnormalised: function of presence (B, V); returns log-likelihood + log Z, (B,).
+        lower, upper: lower and upper estimate of log Z; equal if log Z is exact.
+        notes: details of the two estimates.
     """
 
     log_unnormalised: Callable[[Tensor], Tensor]
@@ -82,7 +83,7 @@ class ObjectDensity:
 
 
 def independent_density(train: SceneTensors) -> ObjectDensity:
-    """Independent classes at their smoothed frequency."""
+    """Return the density of independent classes at their smoothed frequencies."""
     logits = _log_odds(train)
 
     def log_p(v: Tensor) -> Tensor:
@@ -98,10 +99,10 @@ def ising_density(
     settings: DensitySettings = DensitySettings(),
     seed: int = 0,
 ) -> ObjectDensity:
-    """The density of a pairwise model with biases b (V,) and edges W (V, V).
+    """Return the density of a pairwise model with biases b (V,) and edges W (V, V).
 
     Raises:
-        ValueError: see `Ising`.
+        ValueError: invalid shapes or edges, see `Ising`.
     """
     model = Ising(b.double().numpy(), W.double().numpy())
     generator = torch.Generator().manual_seed(seed)
@@ -119,17 +120,17 @@ def machine_density(
     settings: DensitySettings = DensitySettings(),
     seed: int = 0,
 ) -> ObjectDensity:
-    """The density of a machine of the local form.
+    """Return the density of a machine of the local form.
 
     Args:
-        train: where the annealing starts (independent at these frequencies) and the samples of the
-            reverse run come from.
+        train: training scenes. Annealing starts at independent classes of their frequencies, and
+            the reverse run starts its Gibbs chains at these scenes.
 
     Raises:
-        ValueError: the machine is of the seed form, whose relations do not drop out.
+        ValueError: the machine is of the seed form, in which relations affect p(v).
     """
     if machine.relations_act:
-        raise ValueError("objects have a density of their own in the local form alone")
+        raise ValueError("the density of objects needs a machine of the local form")
     objects = object_part(machine)
     below, above = log_partition(objects, train, settings, seed)
 
@@ -148,12 +149,12 @@ def _density(
         "log Z, reverse AIS": above.log_z,
         "standard error, reverse AIS": above.standard_error,
     }
-    # The means of the log weights: bounds in expectation whatever the spread of the weights.
+    # The mean log weights are bounds of log Z in expectation for any spread of the weights.
     return ObjectDensity(log_unnormalised, below.bound, above.bound, notes)
 
 
 def object_part(machine: BoltzmannMachine) -> BoltzmannMachine:
-    """The machine without relation units: p(v) is the same in the local form."""
+    """Return the machine without relation units; in the local form p(v) is the same."""
     spec = machine.spec
     part = build(MachineSpec("gbm", V=spec.V, A=1, H1=spec.H1, H2=spec.H2, form="local"))
     with torch.no_grad():
@@ -166,7 +167,7 @@ def object_part(machine: BoltzmannMachine) -> BoltzmannMachine:
 def log_partition(
     machine: BoltzmannMachine, train: SceneTensors, settings: DensitySettings, seed: int = 0
 ) -> tuple[LogPartition, LogPartition]:
-    """(forward, reverse) AIS of a machine without relation units."""
+    """Run forward and reverse AIS for a machine without relation units."""
     generator = torch.Generator().manual_seed(seed)
     betas = settings.betas()
     base = independent_base(machine, _log_odds(train))
@@ -179,7 +180,7 @@ def log_partition(
 
 @torch.no_grad()
 def _log_sum(machine: BoltzmannMachine, v: Tensor, draws: int) -> Tensor:
-    """log of the sum over h1 and h2, (B,)."""
+    """Return the log of the sum over h1 and h2, (B,)."""
     if not machine.spec.H2:
         return -machine.free_energy(v)
     y = mean_field(machine, Evidence(v)).y
@@ -195,7 +196,7 @@ def _log_odds(train: SceneTensors) -> Tensor:
 
 
 def density_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Log-likelihood of the objects in nats; claims rest on the upper estimate of log Z."""
+    """Measure the log-likelihood of the objects in nats, with both estimates of log Z."""
     if contender.density is None or setting.train is None:
         return None
     scenes = setting.some()
@@ -240,7 +241,7 @@ class Ising:
             raise ValueError("W must be symmetric with a zero diagonal")
 
     def log_unnormalised(self, v: Tensor) -> Tensor:
-        """b·v + v'Wv / 2, (B,), of presence (B, V)."""
+        """Return b·v + v'Wv / 2, (B,), for presence (B, V)."""
         x = v.double()
         W = torch.from_numpy(self.W)
         return x @ torch.from_numpy(self.b) + ((x @ W) * x).sum(1) / 2
@@ -248,12 +249,14 @@ class Ising:
     def log_partition(
         self, a: Floats, start: Tensor, betas: Sequence[float], burn_in: int, seed: int
     ) -> tuple[LogPartition, LogPartition]:
-        """(forward, reverse) annealing with as many chains as `start` has rows.
+        """Run forward and reverse annealing with one chain per row of `start`.
 
         Args:
             a: (V,) log-odds of the independent classes at beta = 0.
-            start: (chains, V) presence, from where `burn_in` sweeps lead to samples of the model.
-            betas: rising from 0 to 1.
+            start: (chains, V) initial presence of the reverse chains.
+            betas: inverse temperatures, increasing from 0 to 1.
+            burn_in: number of sweeps of the reverse chains at beta = 1 before annealing.
+            seed: seed of the random numbers.
         """
         rng = np.random.default_rng(seed)
         log_base = float(np.logaddexp(0, a).sum())
@@ -275,7 +278,7 @@ class Ising:
 
 
 class State:
-    """Chains (V, chains), classes first so that one class of all chains lies together."""
+    """Chains (V, chains); the class axis comes first, so a class of all chains is contiguous."""
 
     def __init__(self, model: Ising, v: Floats) -> None:
         self.model = model
@@ -283,12 +286,12 @@ class State:
         self.field = model.W @ v
 
     def gain(self, a: Floats) -> Floats:
-        """Log density less that of the independent classes, both without Z, (chains,)."""
+        """Return the log density ratio of model and independent classes without Z, (chains,)."""
         linear = (self.model.b - a) @ self.v
         return np.asarray(linear + (self.field * self.v).sum(0) / 2)
 
     def sweep(self, a: Floats, beta: float, rng: np.random.Generator) -> None:
-        """Every class once in turn, given the others, at `beta`."""
+        """Sample every class once, given the others, at `beta`."""
         uniform = rng.random(self.v.shape)
         logits = np.log(uniform) - np.log1p(-uniform)
         bias = (1 - beta) * a + beta * self.model.b

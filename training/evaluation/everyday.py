@@ -1,8 +1,8 @@
-"""Everyday facts: questions whose answers a person would not dispute, for acceptance alone.
+"""Everyday facts: questions with answers that people agree on, for acceptance tests only.
 
-The facts were written by hand before any model was asked. No training, tuning or special case may
-read them; no other module of this package does. They are asked as a client of the service would
-ask, with its defaults, labels outside the vocabulary ignored.
+People wrote the facts by hand before any model was evaluated. Training, tuning and special cases
+must never read them; no other module of this package does. The questions use the defaults of the
+service and ignore labels outside the vocabulary.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from training.evaluation.metrics import Metric, Ratio
 from training.evaluation.setting import Contender, Outcome, Setting
 
 EVERYDAY = DATA.parent / "everyday"
-"""Where the facts are looked for."""
+"""Default folder of the facts."""
 
 SOURCE = "facts"
 
@@ -41,7 +41,7 @@ LINES = (
     "generate: the scene has what never belongs",
     "generate: scenes of fewer than three classes",
 )
-"""What is counted; of the alarm and the last two, less is better."""
+"""Names of the counts. Lower is better for alarms in plain scenes and for the last two."""
 
 _VERTICAL = ("on-top", "under", "above", "below")
 _RELATIONS = 50
@@ -49,27 +49,27 @@ _LISTED = 5
 _DRAWN = 8
 _FEW = 3
 
-# By line, (hits, questions) of each fact.
+# By line: (hits, questions) of each fact.
 Lines = dict[str, list[tuple[int, int]]]
 
 
 def facts_file(folder: Path = EVERYDAY) -> Path | None:
-    """The facts in a folder, if there are any."""
+    """Return the path of the facts in a folder, or None without such a file."""
     path = folder / "facts.json"
     return path if path.is_file() else None
 
 
 def facts_digest(folder: Path) -> str:
-    """sha256 of the facts; empty where there are none."""
+    """Return the sha256 of the facts, or an empty string without facts."""
     path = facts_file(folder)
     return "" if path is None else sha256(path.read_bytes()).hexdigest()
 
 
 def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> dict[str, tuple[int, int]]:
-    """The eleven lines: hits, of how many.
+    """Return (hits, questions) of each of the eleven lines.
 
     Raises:
-        FileNotFoundError: the folder has no facts.
+        FileNotFoundError: the folder contains no facts.
     """
     return {
         line: (sum(hits for hits, _ in found), sum(asked for _, asked in found))
@@ -78,7 +78,7 @@ def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> dict[str, tuple
 
 
 def everyday_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Everyday facts, asked once, whatever the scenes; a fact stands where a scene does."""
+    """Ask the everyday facts once, independent of the scenes; each fact counts as one scene."""
     artifact, folder = contender.artifact, setting.everyday
     if artifact is None or folder is None or facts_file(folder) is None:
         return None
@@ -95,7 +95,7 @@ def everyday_task(contender: Contender, setting: Setting) -> Outcome | None:
 def _lines(artifact: Artifact, folder: Path) -> Lines:
     path = facts_file(folder)
     if path is None:
-        raise FileNotFoundError(f"there is no facts.json in {folder}")
+        raise FileNotFoundError(f"{folder} contains no facts.json")
     facts: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return (
         _relations(artifact, facts["relations"])
@@ -107,7 +107,7 @@ def _lines(artifact: Artifact, folder: Path) -> Lines:
 
 
 def _scene(artifact: Artifact, labels: Sequence[str]) -> Scene:
-    """The known objects, named as the service names them: by label, numbered where that repeats."""
+    """Build a scene of known objects with ids as in the service: the label, or label_number."""
     objects = []
     taken: set[str] = set()
     for label in labels:
@@ -136,7 +136,7 @@ def _relations(artifact: Artifact, facts: list[dict[str, str]]) -> Lines:
 
 
 def _of_eight(artifact: Artifact, subject: str, other: str) -> dict[str, float]:
-    """Probability of each relation of the subject to the other, in the order of the answer."""
+    """Return the probability of each relation of the subject to the other object."""
     scene = _scene(artifact, [subject, other])
     names = [thing.id for thing in scene.objects]
     if not names:
@@ -159,7 +159,7 @@ def _missing(artifact: Artifact, name: str, facts: list[dict[str, Any]]) -> Line
 
 
 def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[questions.MissingAnswer, ...]:
-    """The first five; none where the service would refuse the question."""
+    """Return the first five answers, or none if the service would reject the question."""
     scene = _scene(artifact, fact["objects"])
     at = None
     if "at" in fact:
@@ -172,7 +172,7 @@ def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[questions.MissingAn
 
 
 def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
-    """The object of that id, or the only one of the class that it names."""
+    """Return the object with that id, or the only object of that class."""
     index = artifact.vocabulary.index(name)
     named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
     places = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]

@@ -1,17 +1,17 @@
-"""What more evidence changes: relations, poses and the room type, against labels alone.
+"""The effect of additional evidence: relations, poses and the room type, against labels only.
 
-Each question is put twice to the same model about the same scenes: with labels alone, and with one
-kind of evidence more. The change is paired, with its interval over scenes.
+Each question is asked twice about the same scene: with labels only, and with one additional kind of
+evidence. The change is paired, with a confidence interval over scenes.
 
-    T2   one class is left out with all its instances; the relations among what stays are stated
-         (or shown by poses), or the room type is told: change of MRR over the absent classes
-    T3   a uniformly drawn intruder is added, of which no relation is known: change of hit@1
-    T1   the relations between the instances of half of the classes are stated (or shown by poses):
-         change of R-precision on all other ordered pairs of instances, as many predictions as
+    T2   one class is removed with all its instances. The evidence is the relations (or poses) of
+         the remaining instances, or the room type. Metric: change of MRR over absent classes
+    T3   a uniformly drawn intruder is added; its relations are unknown. Metric: change of hit@1
+    T1   the evidence is the relations (or poses) between the instances of half of the classes.
+         Metric: change of R-precision on all other ordered pairs, with as many predictions as
          listed relations; an unlisted relation counts as wrong
 
-Poses also show what does not hold; only sources with positions have them. Scenes without a relation
-among the instances that stay are left out. What is asked is never stated.
+Poses also show which relations do not hold; only sources with positions have poses. Scenes without
+a relation among the remaining instances are left out. The answer is never part of the evidence.
 """
 
 from __future__ import annotations
@@ -44,19 +44,20 @@ from training.evaluation.setting import Contender, Outcome, Setting
 
 KINDS = ("relations", "poses", "room type")
 
-# Removed classes a scene: of one, chance alone moves the change of a small source by .01.
+# Removed classes per scene: with one, the change of a small source varies by .01 by chance.
 _REMOVALS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One question, asked with and without evidence.
+    """One question, asked with and without additional evidence.
 
     Attributes:
-        place: of the scene; scenes: the labels alone, and with evidence.
-        target: the removed class in T2, the place of the intruder in T3.
-        truth, asked: (A, n, n) of the relations in T1, empty elsewhere.
-        items: listed relations in T1; 1 elsewhere.
+        place: position of the scene.
+        scenes: the scene with labels only, and with evidence.
+        target: the removed class in T2, the position of the intruder in T3.
+        truth, asked: (A, n, n) relations in T1, empty elsewhere.
+        items: number of listed relations in T1; 1 elsewhere.
     """
 
     place: int
@@ -70,11 +71,11 @@ class Case:
 def told(
     encoded: EncodedScene, kept: list[int], kind: str, between: Flags | None = None
 ) -> tuple[Scene, Scene] | None:
-    """A scene as labels alone and with one of `KINDS`; None where it has no such evidence.
+    """Return a scene with labels only and with one of `KINDS`; None without such evidence.
 
     Args:
-        kept: positions of the instances that stay.
-        between: (n, n) of these, the pairs of which something is told; all by default.
+        kept: positions of the remaining instances.
+        between: (n, n) mask of the pairs with evidence; all pairs by default.
     """
     bare = replace(scene_of(encoded, kept, ()), room_type=None)
     if kind == "room type":
@@ -94,7 +95,7 @@ def told(
 def removals(
     scenes: SceneTensors, structure: NDArray[np.bool_], kind: str, seed: int = 0
 ) -> Iterator[Case]:
-    """T2: up to two classes of every scene, each left out with all its instances."""
+    """Generate T2 cases: up to two classes of every scene are removed, one at a time."""
     for place, encoded in enumerate(scenes.scenes):
         classes = encoded.evidence.classes
         removable = classes[~structure[classes]]
@@ -112,7 +113,7 @@ def intrusions(
     intruders: NDArray[np.int64],
     kind: str,
 ) -> Iterator[Case]:
-    """T3: every scene with its intruder, (N,) classes, -1 where there is none."""
+    """Generate T3 cases: every scene with its intruder, (N,) classes; -1 skips a scene."""
     for place, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
         both = told(encoded, list(range(len(encoded.instance_classes))), kind)
         if intruder < 0 or both is None:
@@ -122,7 +123,7 @@ def intrusions(
 
 
 def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
-    """With one more object, of which nothing is known but its label."""
+    """Return the scene with one more object; only the label of the object is known."""
     if scene.poses is not None:
         pad = ((0, 0), (0, 1), (0, 1))
         poses = PoseRelations(np.pad(scene.poses.holds, pad), np.pad(scene.poses.observed, pad))
@@ -134,7 +135,7 @@ def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
 def halves(
     scenes: SceneTensors, structure: NDArray[np.bool_], kind: str, seed: int = 0
 ) -> Iterator[Case]:
-    """T1: half of the classes, at least two, are told about; the other pairs are asked."""
+    """Generate T1 cases: half of the classes, at least two, have evidence; query other pairs."""
     for place, encoded in enumerate(scenes.scenes):
         own, classes = encoded.instance_classes, encoded.evidence.classes
         usable = classes[~structure[classes]]
@@ -152,14 +153,14 @@ def halves(
 
 
 def reciprocal_rank(artifact: Artifact, scene: Scene, target: int) -> float:
-    """Of a removed class among all absent ones; ties in expectation."""
+    """Return the reciprocal rank of a removed class among absent ones; expectation over ties."""
     p = missing_probabilities(artifact, scene)
     above, ties = int((p > p[target]).sum()), int((p == p[target]).sum())
     return float((1.0 / np.arange(above + 1, above + ties + 1)).mean())
 
 
 def missing_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T2 with evidence."""
+    """Measure T2 with additional evidence."""
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
         return reciprocal_rank(artifact, scene, case.target)
@@ -174,7 +175,7 @@ def missing_evidence_task(contender: Contender, setting: Setting) -> Outcome | N
 
 
 def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T3 with evidence."""
+    """Measure T3 with additional evidence."""
     structure = setting.structure.numpy()
 
     def cases(artifact: Artifact, scenes: SceneTensors, kind: str) -> Iterator[Case]:
@@ -189,7 +190,7 @@ def outliers_evidence_task(contender: Contender, setting: Setting) -> Outcome | 
 
 
 def relations_evidence_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T1 with evidence."""
+    """Measure T1 with additional evidence."""
 
     def value(artifact: Artifact, scene: Scene, case: Case) -> float:
         p, truth = relation_probabilities(artifact, scene)[case.asked], case.truth[case.asked]
@@ -213,11 +214,11 @@ def _changes(
     value: Callable[[Artifact, Scene, Case], float],
     kinds: tuple[str, ...] = KINDS,
 ) -> Outcome | None:
-    """The change by each kind of evidence, and the metric on both sides, pooled over items.
+    """Return the change by kind of evidence, and the metric on both sides, pooled over items.
 
     Args:
-        cases_of: the cases of some scenes and one kind of evidence.
-        value: of one scene of a case, summed over its items.
+        cases_of: function of the artifact, scenes and a kind of evidence; yields the cases.
+        value: function that returns the metric of one scene of a case, summed over its items.
     """
     artifact = contender.artifact
     if artifact is None:

@@ -1,17 +1,17 @@
-"""T4: drawn scenes against held-out ones.
+"""T4: generated scenes against held-out scenes.
 
-Only the classes that may be asked for count (no structure; in one source, those it annotates).
-Intervals resample the held-out scenes, with the drawn ones as they are.
+The metrics use only annotated classes without structure. Intervals resample the held-out scenes and
+keep the generated scenes fixed.
 
     MMD²        squared maximum mean discrepancy, unbiased, kernel exp(-Hamming distance/bandwidth);
-                the bandwidth is the median distance of the held-out scenes unless it is given
-    marginals   sum_i |p_i - q_i| / sum_i q_i over classes, q held out
-    pairs       Pearson r over pairs of classes of cov(v_i, v_j), drawn and held out
-    copies      share of drawn scenes whose set of classes is that of a training scene
-    mirrored    share of related pairs where a(x, y) and a(y, x) are both on; with several instances
-                of a class that can be true, so held-out scenes have some as well
-    cycles      share of the scenes with anything on top of another class in which following on-top
-                leads back to where it began; the same holds
+                by default the bandwidth is the median distance of the held-out scenes
+    marginals   sum_i |p_i - q_i| / sum_i q_i over classes; p generated, q held-out frequency
+    pairs       Pearson r over pairs of classes of cov(v_i, v_j), generated against held-out
+    copies      share of generated scenes with the same set of classes as a training scene
+    mirrored    share of related pairs with both a(x, y) and a(y, x). Several instances of a class
+                can make both true, so held-out scenes have a share above 0 too
+    cycles      share of scenes with an on-top cycle, among scenes with on-top relations. Several
+                instances of a class can form a true cycle of classes
 
 Sources: Gretton et al., "A kernel two-sample test" (2012), eq. 3.
 """
@@ -40,7 +40,7 @@ from training.machines.edges import present_classes
 from training.machines.gibbs import Clamp, State, gibbs_step, run
 
 _RESAMPLES = 200
-# The bandwidth is taken from so many held-out scenes, and covariances over so many classes.
+# Number of held-out scenes for the bandwidth, and number of classes for covariances.
 _BANDWIDTH_SCENES = 1000
 _COMMON_CLASSES = 200
 _CHAINS = 256
@@ -49,13 +49,13 @@ _ON_TOP = CANONICAL.index("on-top")
 
 @dataclass(frozen=True, eq=False)
 class Contradictions:
-    """What the relations of B scenes say twice, between different classes.
+    """Contradictory relations in B scenes, between different classes.
 
     Attributes:
-        related: (B,) unordered pairs × canonical relations with one direction on at least.
-        mirrored: (B,) those with both on.
-        stacked: (B,) bool, something is on top of something.
-        cyclic: (B,) bool, following on-top leads back.
+        related: (B,) number of unordered pairs × canonical relations with at least one direction.
+        mirrored: (B,) number of these pairs with both directions.
+        stacked: (B,) bool, the scene has an on-top relation.
+        cyclic: (B,) bool, the scene has an on-top cycle.
     """
 
     related: Tensor
@@ -65,7 +65,7 @@ class Contradictions:
 
     @classmethod
     def of(cls, holds: Tensor) -> Contradictions:
-        """Of relations (B, A, n, n)."""
+        """Count the contradictions of relations (B, A, n, n)."""
         n = holds.shape[-1]
         on = (holds > 0) & ~torch.eye(n, dtype=torch.bool)
         upper = torch.ones(n, n, dtype=torch.bool).triu(1)
@@ -83,15 +83,15 @@ class Contradictions:
 
     @classmethod
     def joined(cls, parts: Sequence[Contradictions]) -> Contradictions:
-        """Of all scenes of the parts."""
+        """Concatenate the scenes of all parts."""
         return cls(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
     def at(self, index: Tensor) -> Contradictions:
-        """Of the scenes at the given positions."""
+        """Select the scenes at the given positions."""
         return Contradictions(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def metrics(self) -> dict[str, Metric]:
-        """Shares, where there is anything to contradict."""
+        """Return the shares, if any scene has relations."""
         shares = {
             "mirrored relations": (self.mirrored, self.related),
             "on-top cycles": (self.cyclic, self.stacked),
@@ -105,11 +105,11 @@ class Contradictions:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """B scenes.
+    """B generated scenes.
 
     Attributes:
         v: (B, V) presence.
-        contradictions: of their relations; None where these were not drawn.
+        contradictions: contradictions of the relations; None if relations were not generated.
     """
 
     v: Tensor
@@ -117,19 +117,19 @@ class Drawn:
 
 
 class Sampler(Protocol):
-    """Draws one scene for each row.
+    """Generate one scene per row.
 
     Args:
-        given: (B, V) bool, classes that must be there.
-        room: (B,) int64 room types, -1 where none is given.
-        seed: of the random numbers.
+        given: (B, V) bool, classes that the scene must contain.
+        room: (B,) int64 room types; -1 if the room type is not given.
+        seed: seed of the random numbers.
     """
 
     def __call__(self, given: Tensor, room: Tensor, seed: int) -> Drawn: ...
 
 
 def drawn_of(scenes: SceneTensors, block: int = 64) -> Drawn:
-    """Held-out scenes as if they had been drawn."""
+    """Return held-out scenes in the form of generated scenes."""
     parts = [
         Contradictions.of(scenes.batch(index).holds)
         for index in torch.arange(len(scenes)).split(block)
@@ -138,7 +138,7 @@ def drawn_of(scenes: SceneTensors, block: int = 64) -> Drawn:
 
 
 def independent_sampler(train: SceneTensors) -> Sampler:
-    """Classes drawn independently with their frequency in training; no relations."""
+    """Return a sampler of independent classes at training frequencies, without relations."""
     frequency = train.v.mean(0)
 
     def sample(given: Tensor, room: Tensor, seed: int) -> Drawn:  # noqa: ARG001
@@ -150,13 +150,13 @@ def independent_sampler(train: SceneTensors) -> Sampler:
 
 
 def scene_sampler(scenes: SceneTensors) -> Sampler:
-    """Real scenes as if they had been drawn: the floor.
+    """Return a sampler of real scenes, which estimates the best possible value of a metric.
 
-    Where no class is given, each row gets the scene in its place if the room type fits; otherwise
-    any one that has what is asked for.
+    Without given classes, row k returns scene k if its room type fits. Otherwise the sampler
+    returns a random scene that satisfies the row.
 
     Raises:
-        ValueError: there is none.
+        ValueError: no scene satisfies a row.
     """
     real = drawn_of(scenes)
 
@@ -170,7 +170,7 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
                 fits &= scenes.room == room[row]
             places = fits.nonzero().squeeze(1).numpy()
             if not len(places):
-                raise ValueError(f"no scene has what row {row} asks for")
+                raise ValueError(f"no scene satisfies the conditions of row {row}")
             own = free and row in places
             chosen.append(row if own else int(rng.choice(places)))
         index = torch.tensor(chosen)
@@ -181,12 +181,12 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
 
 
 def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler:
-    """Gibbs chains as the service runs them, but with relations as the machine draws them.
+    """Return a sampler with the Gibbs chains of the service and the relations of the machine.
 
-    The service keeps one of a(x, y) and a(y, x); here both may be on.
+    The service keeps only one of a(x, y) and a(y, x); here both may hold.
 
     Args:
-        steps: sweeps of a chain.
+        steps: number of sweeps of a chain.
     """
     samples = ChainSamples(machine)
 
@@ -207,22 +207,22 @@ def machine_sampler(machine: BoltzmannMachine, *, steps: int = STEPS) -> Sampler
 def _sweep(
     machine: BoltzmannMachine, state: State, generator: torch.Generator, clamp: Clamp, steps: int
 ) -> State:
-    """Gibbs sweeps. In the local form relations do not act on the rest: the last one draws them."""
+    """Run Gibbs sweeps; in the local form only the last sweep samples relations."""
     always = machine.relations_act
     state = run(machine, state, generator, steps - 1, clamp, relations=always)
     return gibbs_step(machine, state, generator, clamp)
 
 
 def _grid(machine: BoltzmannMachine, state: State) -> Tensor:
-    """Relations between present classes, (B, A, n, n)."""
+    """Return the relations between present classes, (B, A, n, n)."""
     r = state.r * state.edges.ends_present(state.v)
     return machine.between(state.edges, r, present_classes(state.v)).clamp(min=0)
 
 
 def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
-    """Scenes to compare drawn ones with, and a second half, the floor, each within the limit.
+    """Split held-out scenes into reference scenes and scenes that serve as the best sample.
 
-    A group stays together.
+    A group stays in one half. The limit of the setting applies to each half.
     """
     scenes = setting.scenes
     odd = torch.tensor([crc32(scene.group.encode()) % 2 for scene in scenes.scenes]).bool()
@@ -234,21 +234,21 @@ def held_out_halves(setting: Setting) -> tuple[SceneTensors, SceneTensors]:
 
 
 def hamming(x: Tensor, y: Tensor) -> Tensor:
-    """Distances (N, M) of binary rows (N, V), (M, V)."""
+    """Return Hamming distances (N, M) of binary rows (N, V) and (M, V)."""
     return (x.sum(1, keepdim=True) + y.sum(1) - 2 * x @ y.T).clamp(min=0)
 
 
 def median_distance(v: Tensor) -> float:
-    """Median Hamming distance between two scenes, at least 1."""
+    """Return the median Hamming distance between two scenes, at least 1."""
     v = v[:_BANDWIDTH_SCENES]
     row, column = torch.triu_indices(len(v), len(v), 1)
     return max(1.0, float(hamming(v, v)[row, column].median()))
 
 
 def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[Floats], float]:
-    """MMD² as a function of how often each held-out scene counts.
+    """Return MMD² as a function of the weights of the held-out scenes.
 
-    Pairs of a scene with itself, or with a copy of itself in a resample, are left out.
+    The statistic excludes pairs of a scene with itself or with its copy in a resample.
     """
 
     def kernel(x: Tensor, y: Tensor) -> Floats:
@@ -271,7 +271,7 @@ def discrepancy(held_out: Tensor, drawn: Tensor, bandwidth: float) -> Callable[[
 
 
 def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """sum |p - q| / sum q as a function of the held-out scenes' weights."""
+    """Return sum |p - q| / sum q as a function of the weights of the held-out scenes."""
     p = drawn.mean(0)
 
     def at(weight: Floats) -> float:
@@ -284,7 +284,7 @@ def marginal_error(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]
 
 
 def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], float]:
-    """Pearson r of the covariances of all pairs among the commonest classes held out."""
+    """Return Pearson r of the covariances of all pairs of the most common held-out classes."""
     common = np.argsort(-held_out.sum(0), kind="stable")[:_COMMON_CLASSES]
     common = common[held_out[:, common].any(0)]
     x, y = drawn[:, common], held_out[:, common]
@@ -309,7 +309,7 @@ def pair_correlation(held_out: Floats, drawn: Floats) -> Callable[[Floats], floa
 
 
 def copies(drawn: Tensor, train: Tensor) -> Floats:
-    """(B,) 1 where a drawn scene's set of classes is that of a training scene."""
+    """Return (B,) 1 where a generated scene has the same set of classes as a training scene."""
     known = {row.tobytes() for row in np.packbits(train.numpy() > 0, axis=1)}
     rows = np.packbits(drawn.numpy() > 0, axis=1)
     return np.array([row.tobytes() in known for row in rows], dtype=np.float64)
@@ -323,13 +323,14 @@ def generation_metrics(
     bandwidth: float,
     emphasis: Tensor | None = None,
 ) -> dict[str, Metric]:
-    """Every figure of T4.
+    """Compute all metrics of T4.
 
     Args:
-        drawn: two scenes or more.
-        held_out: (N, V) and train: (T, V) presence.
+        drawn: at least two generated scenes.
+        held_out: (N, V) presence.
+        train: (T, V) presence.
         asked: (V,) bool, the classes that count.
-        emphasis: (N,) how much each held-out scene counts; all alike by default.
+        emphasis: (N,) weights of the held-out scenes; 1 by default.
     """
     x, y, known = drawn.v[:, asked], held_out[:, asked], train[:, asked]
     ours, theirs = x.double().numpy(), y.double().numpy()
@@ -353,11 +354,13 @@ def generation_metrics(
 
 
 def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T4: as many scenes as there are in a second half of the held-out ones, against the first.
+    """Measure T4: compare generated scenes with the first half of the held-out scenes.
 
-    Free; given the room types of the second half; and given one class each, drawn from all the
-    classes that scenes of the second half hold. A scene then comes up as often as it has classes:
-    so the first half counts by size there, and a perfect sampler would leave no discrepancy.
+    The number of generated scenes is the size of the second half. There are three conditions: free,
+    with the room types of the second half, and with one given class. The given class is drawn from
+    all class mentions of the second half, so a scene is chosen in proportion to its number of
+    classes. In this condition the first half is weighted in the same way, so that a perfect sampler
+    has no discrepancy.
     """
     if contender.sampler is None or setting.train is None:
         return None

@@ -1,19 +1,21 @@
-"""Intruders: one absent class is added to a scene, drawn by one of four laws.
+"""Intruders: one absent class is added to a scene, drawn from one of four distributions.
 
-    uniform     from the absent, non-structure classes
-    popularity  by how many training scenes have the class
-    room        uniformly from the classes that training saw in the same room type
-    signature   typical of another room type
+    uniform     uniform over the absent, non-structure classes
+    popularity  proportional to the number of training scenes with the class
+    room        uniform over the classes seen in training in the same room type
+    signature   a class typical of another room type
 
-Scenes under three classes have no intruder.
+Scenes with fewer than three classes get no intruder.
 
-The lift of a class in a room type is p(class | room type) / p(class), by shares of training scenes
-whose room type is known. A room type's signature are the ten classes of highest lift there, of
-those in at least a fifth of its scenes and with a lift of at least 5: often there, seldom
-elsewhere. The intruder of a scene of room type r is drawn in two steps: uniformly one of the other
-room types that have a suitable class, then uniformly one of its suitable ones: signature classes
-that are absent from the scene, no structure, and in less than 1 % of the training scenes of type r.
-Room types of under 20 training scenes are left out.
+The lift of a class in a room type is p(class | room type) / p(class), over training scenes with a
+known room type. The signature of a room type has at most ten classes, those with the highest lift.
+A signature class has a lift of at least 5 and occurs in at least 20 % of the scenes of the room
+type. Room types with fewer than 20 training scenes are left out.
+
+For a scene of room type r, a suitable class is a signature class of another room type. It is absent
+from the scene, is not structure, and occurs in less than 1 % of the training scenes of type r. The
+intruder is drawn in two steps: uniformly one of the room types with a suitable class, then
+uniformly one of its suitable classes.
 """
 
 from __future__ import annotations
@@ -31,24 +33,24 @@ from training.cases import scene_rng
 from training.evaluation.metrics import Flags, Floats, Ints, Items, Ratio
 
 SIGNATURE = 10
-"""Classes that a room type is known by, at most."""
+"""Maximum number of signature classes of a room type."""
 
 _SCENES = 20
 _LIFT = 5.0
 _OFTEN = 0.2
 _FOREIGN = 0.01
 
-# Weights (N, V) of the classes to draw from, of scenes and training scenes.
+# Function of scenes and training scenes that returns sampling weights (N, V).
 Law = Callable[[SceneTensors, SceneTensors], Tensor]
 
 
 def by_popularity(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Weights (N, V): in how many of the training scenes each class is."""
+    """Return weights (N, V): the number of training scenes with each class."""
     return train.v.sum(0).expand(len(scenes), -1)
 
 
 def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Weights (N, V): 1 for classes that training saw in the scene's room type; 0 if unknown."""
+    """Return weights (N, V): 1 if training has the class in the scene's room type, else 0."""
     weights = torch.zeros_like(scenes.v)
     for room in scenes.room.unique().tolist():
         if room >= 0:
@@ -60,11 +62,11 @@ def by_room(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 def draw_intruders(
     scenes: SceneTensors, structure: Tensor, weights: Tensor | None = None, seed: int = 0
 ) -> Tensor:
-    """An intruder for each scene, (N,) int64; -1 where a scene is skipped.
+    """Draw an intruder for each scene, (N,) int64; -1 means the scene is skipped.
 
     Args:
-        structure: (V,) bool.
-        weights: (N, V) or None for uniform, how likely each class is to be drawn if absent.
+        structure: (V,) bool, True for structure classes.
+        weights: (N, V) sampling weights of absent classes; None means uniform.
     """
     present = scenes.v > 0
     absent = (~present & ~structure).double()
@@ -81,11 +83,11 @@ def draw_intruders(
 
 @dataclass(frozen=True, eq=False)
 class Signatures:
-    """What training scenes say of R room types.
+    """Statistics of training scenes for R room types.
 
     Attributes:
-        typical: (R, V) bool, the signature of each.
-        share: (R, V) p(class | room type), nan for a room type of too few scenes.
+        typical: (R, V) bool, the signature classes of each room type.
+        share: (R, V) p(class | room type); NaN for a room type with too few scenes.
     """
 
     typical: Flags
@@ -93,7 +95,7 @@ class Signatures:
 
 
 def signatures(train: SceneTensors) -> Signatures:
-    """The signature of every room type."""
+    """Compute the signature of every room type."""
     known = (train.room >= 0).numpy()
     v, room = train.v.numpy()[known] > 0, train.room.numpy()[known]
     rooms = int(room.max(initial=-1)) + 1
@@ -113,7 +115,7 @@ def signatures(train: SceneTensors) -> Signatures:
 
 
 def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
-    """Weights (N, V): the probability of each class to be drawn; 0 throughout for no intruder."""
+    """Return weights (N, V): the sampling probability of each class; all 0 for no intruder."""
     found = signatures(train)
     weights = np.zeros(scenes.v.shape)
     absent = scenes.v.numpy() == 0
@@ -132,14 +134,14 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 def kinds_of_intruders(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
-    """One intruder of each kind for every scene, by its source and id.
+    """Draw one intruder of each kind for every scene, by source and scene id.
 
-    The kinds are those of calibration: uniform, by popularity, and by signature.
+    The kinds are those of the calibration: uniform, by popularity and by signature.
     """
     laws: list[Tensor | None] = [None]
     if train is not None:
         laws += [by_popularity(scenes, train), by_signature(scenes, train)]
-    # `answers.ask_outliers` draws from the scene's numbers of the same seed.
+    # `answers.ask_outliers` draws with `seed`; another seed here keeps the draws independent.
     drawn = [draw_intruders(scenes, structure, weights, seed + 1) for weights in laws]
     each = torch.stack(drawn, 1).numpy()
     names = [(scene.source, scene.scene_id) for scene in scenes.scenes]
@@ -148,13 +150,17 @@ def kinds_of_intruders(
 
 @dataclass(frozen=True, eq=False)
 class IntruderScores:
-    """Log-odds of each object given the rest, for clean scenes and for the same with an intruder.
+    """Log-odds of each object given the rest, for scenes with and without an intruder.
 
     Attributes:
-        scene: (N,) position of the scene; thing: (N,) the class; log_odds: (N,); intruder: (N,)
-            bool; size: (N,) number of distinct classes in the scene as scored; clean: (N,) bool,
-            scored without an intruder.
-        scenes: how many were given; skipped: too small, or without a class to add.
+        scene: (N,) position of the scene.
+        thing: (N,) class of the object.
+        log_odds: (N,) log-odds of the object.
+        intruder: (N,) bool, the object is the intruder.
+        size: (N,) number of distinct classes in the scored scene.
+        clean: (N,) bool, the scored scene has no intruder.
+        scenes: number of scenes.
+        skipped: number of scenes that are too small or lack a class to add.
     """
 
     scene: Ints
@@ -168,32 +174,32 @@ class IntruderScores:
 
     @property
     def listed(self) -> Ints:
-        """(N,) number of distinct classes in the scene as scored, structure aside."""
+        """(N,) number of distinct classes in the scored scene, without structure."""
         as_scored = 2 * self.scene + self.clean
         counts: Ints = np.bincount(as_scored)[as_scored]
         return counts
 
     def with_prior(self, prior: Floats) -> IntruderScores:
-        """With the log-odds of being an intruder taken from each class, (V,)."""
+        """Subtract the prior log-odds of being an intruder, by class (V,)."""
         return replace(self, log_odds=self.log_odds - prior[self.thing])
 
     @property
     def dirty(self) -> Items:
-        """The objects of scenes with an intruder, by -log-odds; it alone is true."""
+        """Objects of scenes with an intruder, scored by -log-odds; only the intruder is true."""
         rows = ~self.clean
         score, truth = -self.log_odds[rows], self.intruder[rows]
         return Items(self.scene[rows], score, truth, self.scenes, self.skipped)
 
     def hit_at_1(self) -> Ratio:
-        """Share of scenes whose intruder has the lowest log-odds (ties in expectation)."""
+        """Return the share of scenes whose intruder has the lowest log-odds; expected over ties."""
         return self.dirty.hit_at_1()
 
     def false_alarms(self, loud: Flags) -> Ratio:
-        """Share of untouched scenes in which some object is loud, (N,)."""
+        """Return the share of clean scenes with an alarm; loud (N,) marks objects with an alarm."""
         return self._alarms(loud, self.clean)
 
     def caught(self, loud: Flags) -> Ratio:
-        """Share of intruders that are loud, (N,)."""
+        """Return the share of intruders with an alarm; loud (N,) marks objects with an alarm."""
         return self._alarms(loud, self.intruder)
 
     def _alarms(self, loud: Flags, judged: Flags) -> Ratio:
@@ -211,9 +217,9 @@ def intruder_scores(
     weights: Tensor | None = None,
     seed: int = 0,
 ) -> IntruderScores:
-    """Score every object of every scene, clean and with one intruder; see `draw_intruders`.
+    """Score every object of every scene without and with an intruder; see `draw_intruders`.
 
-    Every relation is unobserved.
+    All relations are unobserved.
     """
     added = draw_intruders(scenes, structure, weights, seed)
     kept = (added >= 0).nonzero().squeeze(1)
@@ -228,7 +234,7 @@ def intruder_scores(
 
 @torch.no_grad()
 def clean_scores(v: Tensor, structure: Tensor, score: Callable[[Tensor], Tensor]) -> IntruderScores:
-    """Score every object of every scene (N, V) as it is."""
+    """Score every object of every scene (N, V) without intruders."""
     parts = [
         _scored(v[index], index, torch.full_like(index, -1), structure, score)
         for index in torch.arange(len(v)).split(64)
@@ -243,7 +249,7 @@ def _scored(
     structure: Tensor,
     score: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, ...]:
-    """Columns of `IntruderScores` of some scenes; `added` is -1 in clean ones."""
+    """Return the columns of `IntruderScores` for some scenes; `added` is -1 for clean scenes."""
     row, thing = ((v > 0) & ~structure).nonzero(as_tuple=True)
     odds = torch.zeros(0)
     if len(row):

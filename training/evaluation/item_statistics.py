@@ -1,8 +1,9 @@
-"""Statistics of scored items that do not split into scenes.
+"""Statistics of scored items that are not sums over scenes.
 
-Each is prepared once from scores (N,) and truth (N,) and then asked with weights (N,): how often
-each item counts, whole numbers under resampling. Equal scores are taken in random order: a
-statistic is its expectation then. nan where a statistic is undefined.
+Each statistic is prepared once from scores (N,) and truth (N,). It is then evaluated with weights
+(N,), the number of times that each item counts; weights are whole numbers under resampling. Items
+of equal score are in random order, and the statistic is the expectation. An undefined statistic is
+NaN.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class _Levels:
     truth: NDArray[np.bool_]
 
     def count(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Weight of all items and of the true ones at each level."""
+        """Return the weight of all items and of the true items at each level."""
         size = len(self.scores)
         every = np.bincount(self.level, weights=weight, minlength=size).astype(np.float64)
         true = np.bincount(self.level, weights=weight * self.truth, minlength=size)
@@ -41,7 +42,7 @@ def _levels(score: Floats, truth: NDArray[np.bool_]) -> _Levels:
 
 
 def auroc(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Probability that a true item scores above a false one, ties counting half."""
+    """Return the probability that a true item scores above a false item; ties count half."""
     levels = _levels(score, truth)
 
     def at(weight: Floats) -> float:
@@ -55,10 +56,10 @@ def auroc(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 
 def average_precision(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Mean precision at the true items.
+    """Return the mean precision at the true items.
 
-    Where n items of equal score, p of them true, follow N items with P true ones, the true item at
-    place k of the n sees in expectation P + 1 + (k - 1)(p - 1)/(n - 1) true ones among N + k.
+    Suppose n items of equal score, p of them true, follow N items with P true ones. The true item
+    at place k of the n then has an expected P + 1 + (k - 1)(p - 1)/(n - 1) true items among N + k.
     """
     levels = _levels(score, truth)
 
@@ -78,9 +79,9 @@ def average_precision(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 
 def calibration_error(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """Expected calibration error of probabilities, in `BINS` bins of equal mass.
+    """Return the expected calibration error (ECE) of probabilities in `BINS` bins of equal mass.
 
-    The mean over bins of |mean probability - share of true items|.
+    The ECE is the mean over bins of |mean probability - share of true items|.
     """
     levels = _levels(score, truth)
 
@@ -95,7 +96,7 @@ def calibration_error(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 
 def brier_skill(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
-    """1 - Brier score / Brier score of the base rate: above 0 it says more than the base rate."""
+    """Return 1 - Brier score / Brier score of the base rate; 0 means as good as the base rate."""
     levels = _levels(score, truth)
 
     def at(weight: Floats) -> float:
@@ -112,7 +113,7 @@ def brier_skill(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Data of a reliability plot, per bin of equal mass: mean probability, share of true items."""
+    """Data of a reliability plot by bin of equal mass: mean probability and share of true items."""
 
     probability: Floats
     frequency: Floats
@@ -120,16 +121,16 @@ class Reliability:
 
 
 def reliability(score: Floats, truth: NDArray[np.bool_]) -> Reliability:
-    """The bins behind `calibration_error`."""
+    """Return the bins of `calibration_error`."""
     levels = _levels(score, truth)
     mass, p, y = _bins(levels.scores, *levels.count(np.ones(len(score))))
     return Reliability(p, y, mass)
 
 
 def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mass, mean score and share of true items of each bin.
+    """Return the mass, mean score and share of true items of each bin.
 
-    A level that crosses the border of two bins is divided, its true items in proportion.
+    A level that crosses a bin border is divided; its true items are divided in proportion.
     """
     total = every.sum()
     edges = np.linspace(0.0, total, BINS + 1)

@@ -1,10 +1,11 @@
-"""Metrics that keep what they were made of, scene by scene, and their bootstrap intervals.
+"""Metrics that keep their values per scene, with bootstrap intervals.
 
-So they can be resampled, paired with another model's, pooled over sources, and stored as JSON.
+The values per scene allow resampling, pairing with another model, pooling over sources, and storage
+as JSON.
 
-A resample draws as many scenes as there are, with replacement; it is held as the number of times
-that each scene was drawn. The draws depend on the seed and the number of scenes alone, so two
-metrics of the same scenes are resampled alike, and their difference is a paired one.
+A resample draws scenes with replacement, as many as the set has. It is stored as the number of
+times that each scene was drawn. The draws depend only on the seed and the number of scenes. So two
+metrics of the same scenes use the same resamples, and their difference is paired.
 
 Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993).
 """
@@ -35,8 +36,8 @@ class Figure:
 
     Attributes:
         value: the metric over all scenes.
-        low, high: percentiles 2.5 and 97.5 over scenes drawn with replacement.
-        n: scored items (removed objects, relations, scenes).
+        low, high: percentiles 2.5 and 97.5 over resampled scenes.
+        n: number of scored items (removed objects, relations, scenes).
     """
 
     value: float
@@ -46,7 +47,7 @@ class Figure:
 
     @classmethod
     def of(cls, value: float, draws: Floats, n: int) -> Figure:
-        """The interval of resampled values, those that are undefined left out."""
+        """Compute the interval from resampled values; undefined values are left out."""
         low, high = np.nanpercentile(draws, [2.5, 97.5])
         return cls(value, float(low), float(high), n)
 
@@ -58,8 +59,8 @@ class Metric(ABC):
     """A metric over a set of scenes that can be resampled.
 
     Attributes:
-        scenes: how many scenes were given, those that could not be scored among them.
-        n: scored items.
+        scenes: number of scenes, including scenes that could not be scored.
+        n: number of scored items.
     """
 
     scenes: int
@@ -67,17 +68,17 @@ class Metric(ABC):
 
     @abstractmethod
     def at(self, weight: Floats) -> float:
-        """The metric where scene k counts weight[k] times; nan where it is undefined.
+        """Return the metric with scene k counted weight[k] times; NaN if undefined.
 
         Raises:
-            NotImplementedError: the metric is of a whole set and keeps only its resamples.
+            NotImplementedError: the metric describes a whole set and keeps only its resamples.
         """
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Metric | None:
-        """The metric over the scenes of all parts, one after the other.
+        """Return the metric over the concatenated scenes of all parts.
 
-        None for metrics of whole sets.
+        The result is None for metrics of whole sets.
         """
         return None
 
@@ -87,11 +88,11 @@ class Metric(ABC):
         return self.at(np.ones(self.scenes))
 
     def resampled(self, resamples: int, seed: int) -> Floats:
-        """The metric over resampled scenes, (resamples,); nan where it is undefined."""
+        """Return the metric over resampled scenes, (resamples,); NaN where undefined."""
         return resample(self.at, self.scenes, resamples, seed)
 
     def draws(self, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
-        """`resampled`, computed once."""
+        """Return `resampled`, cached."""
         if (resamples, seed) not in self._known:
             self._known[resamples, seed] = self.resampled(resamples, seed)
         return self._known[resamples, seed]
@@ -101,7 +102,7 @@ class Metric(ABC):
         return {}
 
     def figure(self, *, resamples: int = RESAMPLES, seed: int = 0) -> Figure:
-        """The value with its interval."""
+        """Return the value with its interval."""
         return Figure.of(self.value, self.draws(resamples, seed), self.n)
 
 
@@ -113,18 +114,19 @@ def paired_difference(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Figure:
-    """a minus b on the same scenes, with the interval of the difference.
+    """Return a minus b on the same scenes, with the interval of the difference.
 
     Args:
-        groups: of each scene; groups are drawn then, not scenes, since scenes of one group are
-            near-duplicates (Field and Welsh, "Bootstrapping clustered data", 2007).
+        groups: group of each scene. With groups, a resample draws groups instead of scenes, because
+            scenes of one group are near-duplicates (Field and Welsh, "Bootstrapping clustered
+            data", 2007).
 
     Raises:
-        ValueError: the two were measured on different numbers of scenes.
+        ValueError: the numbers of scenes differ.
     """
     if a.scenes != b.scenes or (groups is not None and len(groups) != a.scenes):
-        of = "" if groups is None else f", of {len(groups)} groups"
-        raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes}{of}")
+        of = "" if groups is None else f" and {len(groups)} group labels"
+        raise ValueError(f"cannot pair {a.scenes} scenes with {b.scenes} scenes{of}")
     if groups is None:
         x, y = a.draws(resamples, seed), b.draws(resamples, seed)
         both = min(len(x), len(y))
@@ -138,9 +140,9 @@ def paired_difference(
 
 @lru_cache(maxsize=4)
 def scene_weights(scenes: int, resamples: int, seed: int) -> Floats:
-    """How often each scene is drawn, (resamples, scenes); not to be written to.
+    """Return how often each resample draws each scene, (resamples, scenes); read-only.
 
-    Kept, since many metrics are resampled over the same scenes one after the other.
+    The result is cached, because many metrics resample the same scenes one after the other.
     """
     rng = np.random.default_rng(seed)
     weights = np.empty((resamples, scenes))
@@ -153,24 +155,24 @@ def scene_weights(scenes: int, resamples: int, seed: int) -> Floats:
 def resample(
     statistic: Callable[[Floats], float], scenes: int, resamples: int = RESAMPLES, seed: int = 0
 ) -> Floats:
-    """A statistic of the scenes' weights over the resamples, (resamples,)."""
+    """Return a statistic of the scene weights for each resample, (resamples,)."""
     return np.array([statistic(weight) for weight in scene_weights(scenes, resamples, seed)])
 
 
 def _centred(drawn: Floats, value: float) -> Floats:
-    """The resamples moved onto the value, so that they tell its spread alone."""
+    """Shift the resamples so that their mean equals the value."""
     return drawn + (value - np.nanmean(drawn)) if np.isfinite(drawn).any() else drawn
 
 
 @dataclass(frozen=True, eq=False)
 class Ratio(Metric):
-    """sum(numerators) / sum(denominators) over scenes, as a micro-average is.
+    """Micro-average: sum(numerators) / sum(denominators) over scenes.
 
     Attributes:
-        numerators, denominators: (scenes,); denominator 0 where a scene was skipped.
+        numerators, denominators: (scenes,); the denominator of a skipped scene is 0.
 
     Raises:
-        ValueError: nothing was scored.
+        ValueError: all denominators are 0.
     """
 
     numerators: Floats
@@ -182,13 +184,13 @@ class Ratio(Metric):
 
     @classmethod
     def of_items(cls, scene: Ints, values: NDArray[Any], scenes: int) -> Ratio:
-        """The mean of values (N,) of items that belong to the scenes at `scene` (N,)."""
+        """Return the mean of item values (N,); `scene` (N,) is the scene of each item."""
         top = np.bincount(scene, weights=values, minlength=scenes).astype(np.float64)
         return cls(top, np.bincount(scene, minlength=scenes).astype(np.float64))
 
     @classmethod
     def of_scenes(cls, values: NDArray[Any], asked: NDArray[Any] | None = None) -> Ratio:
-        """The mean of values (scenes,) over the scenes that were asked about, all by default."""
+        """Return the mean of values (scenes,) over the scenes in ``asked``, by default all."""
         below = np.ones(len(values)) if asked is None else asked.astype(np.float64)
         return cls(values.astype(np.float64), below)
 
@@ -205,26 +207,26 @@ class Ratio(Metric):
         return float(weight @ self.numerators) / below if below > 0 else float("nan")
 
     def resampled(self, resamples: int, seed: int) -> Floats:
-        # All resamples in two products.
+        # Two matrix products compute all resamples.
         weights = scene_weights(self.scenes, resamples, seed)
         top, below = weights @ self.numerators, weights @ self.denominators
         share: Floats = np.divide(top, below, where=below > 0, out=np.full(resamples, np.nan))
         return share
 
     def mean_over_scenes(self) -> Ratio:
-        """The same with every scored scene counting alike."""
+        """Return the metric with equal weight for every scored scene."""
         some = self.denominators > 0
         share = np.divide(self.numerators, self.denominators, where=some, out=np.zeros(len(some)))
         return Ratio.of_scenes(share, some)
 
     def __sub__(self, other: Ratio) -> Ratio:
-        """The difference on the same items, as a metric with its paired interval.
+        """Return the difference on the same items, as a metric with a paired interval.
 
         Raises:
-            ValueError: they are of other items.
+            ValueError: the metrics have different items.
         """
         if not np.array_equal(self.denominators, other.denominators):
-            raise ValueError("the two were measured on different items")
+            raise ValueError("the two metrics have different items")
         return Ratio(self.numerators - other.numerators, self.denominators)
 
     @classmethod
@@ -236,14 +238,14 @@ class Ratio(Metric):
 
 
 class _OfItems(Metric):
-    """A metric of N items that belong to scenes: a dataclass of columns.
+    """A metric of N items that belong to scenes; subclasses are dataclasses of columns.
 
     Attributes:
-        scene: (N,) of each item.
-        count: scenes given.
+        scene: (N,) scene of each item.
+        count: number of scenes.
 
     Raises:
-        ValueError: nothing was scored.
+        ValueError: there are no items.
     """
 
     scene: Ints
@@ -263,7 +265,7 @@ class _OfItems(Metric):
         for field in fields(cls):  # type: ignore[arg-type]
             own = [getattr(part, field.name) for part in parts]
             values[field.name] = np.concatenate(own) if isinstance(own[0], np.ndarray) else own[0]
-        # The scenes of each part are counted on from the parts before.
+        # Scene numbers of each part are shifted by the number of scenes before it.
         starts = np.cumsum([0, *(part.count for part in parts)]).tolist()
         shifted = [part.scene + start for part, start in zip(parts, starts[:-1], strict=True)]
         scene = np.concatenate(shifted).astype(np.int64)
@@ -272,13 +274,14 @@ class _OfItems(Metric):
 
 @dataclass(frozen=True, eq=False)
 class Macro(_OfItems):
-    """The mean over groups (classes, say) of the mean over a group's items.
+    """Macro-average: the mean over groups, such as classes, of the mean over the group's items.
 
-    Rare groups drop out of resamples, which lifts their mean where rare groups do worse: the
+    A resample may lack rare groups. This raises its mean if rare groups score lower. So the
     resamples are centred on the value.
 
     Attributes:
-        group: (N,) of each item; value_of: (N,).
+        group: (N,) group of each item.
+        value_of: (N,) value of each item.
     """
 
     scene: Ints
@@ -303,14 +306,15 @@ class Macro(_OfItems):
 
 @dataclass(frozen=True, eq=False)
 class Scored(_OfItems):
-    """A statistic of all items' scores at once: AUROC, average precision, calibration.
+    """A statistic of the scores of all items: AUROC, average precision or calibration.
 
     Attributes:
-        statistic: its name in `STATISTICS`.
-        score: (N,); truth: (N,) bool.
+        statistic: name in `STATISTICS`.
+        score: (N,) score of each item.
+        truth: (N,) bool, the item is true.
 
     Raises:
-        ValueError: nothing was scored, or no such statistic.
+        ValueError: there are no items, or the statistic is unknown.
     """
 
     statistic: str
@@ -321,7 +325,9 @@ class Scored(_OfItems):
 
     def __post_init__(self) -> None:
         if self.statistic not in STATISTICS:
-            raise ValueError(f"unknown statistic {self.statistic!r}, not of {sorted(STATISTICS)}")
+            raise ValueError(
+                f"unknown statistic {self.statistic!r}: must be one of {sorted(STATISTICS)}"
+            )
         super().__post_init__()
 
     @property
@@ -330,7 +336,7 @@ class Scored(_OfItems):
 
     @cached_property
     def _prepared(self) -> Callable[[Floats], float]:
-        """Of the items' weights; the items are sorted once for all resamples."""
+        """The statistic as a function of item weights; items are sorted once for all resamples."""
         return STATISTICS[self.statistic](self.score, self.truth)
 
     def at(self, weight: Floats) -> float:
@@ -338,17 +344,19 @@ class Scored(_OfItems):
 
     def resampled(self, resamples: int, seed: int) -> Floats:
         drawn = super().resampled(resamples, seed)
-        # Calibration errors grow under resampling, as if there were fewer answers.
+        # Resampling inflates calibration errors, as a smaller number of answers would.
         return _centred(drawn, self.value) if self.statistic == "ECE" else drawn
 
 
 @dataclass(frozen=True, eq=False)
 class Items:
-    """N scored items of some scenes, such as answers with their probability.
+    """N scored items of some scenes, such as answers with their probabilities.
 
     Attributes:
-        scene: (N,) position; score: (N,); truth: (N,) bool.
-        scenes, skipped: how many were given, and how many could not be scored.
+        scene: (N,) scene of each item.
+        score: (N,) score of each item.
+        truth: (N,) bool, the item is true.
+        scenes, skipped: number of scenes, and number of scenes that could not be scored.
     """
 
     scene: Ints
@@ -358,7 +366,7 @@ class Items:
     skipped: int = 0
 
     def hit_at_1(self) -> Ratio:
-        """Share of scenes whose item of the highest score is a true one, ties in expectation."""
+        """Return the share of scenes whose highest-scored item is true; expected over ties."""
         highest = np.full(self.scenes, -np.inf)
         np.maximum.at(highest, self.scene, self.score)
         best = self.score == highest[self.scene]
@@ -367,18 +375,19 @@ class Items:
         return Ratio.of_scenes(hits / np.maximum(ties, 1), ties > 0)
 
     def metric(self, statistic: str) -> Scored:
-        """One of `STATISTICS`."""
+        """Return one of `STATISTICS`."""
         return Scored(statistic, self.scene, self.score, self.truth, self.scenes)
 
 
 @dataclass(frozen=True, eq=False)
 class Resampled(Metric):
-    """A metric of whole sets, which is kept by its value and its resamples alone.
+    """A metric of whole sets; only its value and its resamples are kept.
 
     Attributes:
         point: the value.
-        drawn: (resamples,) by `resample` with seed 0 over the same scenes.
-        count: scenes; items: what was compared with them.
+        drawn: (resamples,) from `resample` with seed 0.
+        count: number of resampled scenes.
+        items: number of scenes compared with them.
     """
 
     point: float
@@ -390,9 +399,9 @@ class Resampled(Metric):
     def of(
         cls, statistic: Callable[[Floats], float], scenes: int, items: int, resamples: int
     ) -> Resampled:
-        """From a statistic of the scenes' weights.
+        """Create the metric from a statistic of the scene weights.
 
-        Distances between sets grow under resampling, as if the sets were smaller; the resamples are
+        Resampling inflates distances between sets, as smaller sets would. So the resamples are
         centred on the value.
         """
         point = statistic(np.ones(scenes))
@@ -416,12 +425,12 @@ class Resampled(Metric):
 
     def resampled(self, resamples: int, seed: int) -> Floats:
         if seed != 0:
-            raise ValueError(f"only the resamples of seed 0 were kept, not those of {seed}")
+            raise ValueError(f"only the resamples of seed 0 are stored, not those of seed {seed}")
         return self.drawn[:resamples]
 
 
 class MeanOverSeeds(Metric):
-    """The mean of one metric over training seeds, on the same resampled scenes for all."""
+    """The mean of a metric over training seeds; all seeds use the same resamples."""
 
     def __init__(self, members: Sequence[Metric]) -> None:
         if not members:

@@ -1,19 +1,21 @@
-"""T2: is an object that was hidden from a scene proposed? All tasks about missing objects.
+"""T2: rank of objects that were hidden from a scene, in three tasks.
 
-    T2          each class is left out in turn, with all its instances and relations
-    T2 partial  25, 50 or 75 % of the classes are shown (rounded; at least one is shown and one
-                hidden), or all but one; what is shown at 25 % is shown at 50 % too. A published
-                model answers with its default coverage, and once more with unlisted = absent
-    T2-at       each class that stood in a relation to another class is left out in turn; one of
-                these relations, drawn at random, tells where it was: its direction and the class at
-                its other end, never the removed class
+    T2          each class is removed in turn, with all its instances and relations
+    T2 partial  25, 50 or 75 % of the classes are shown, or all but one; at least one class is shown
+                and one hidden. Classes shown at 25 % are also shown at 50 %. A published model
+                answers with its default coverage, and again with coverage 1 (unlisted = absent)
+    T2-at       each class with a relation to another class is removed in turn. One of these
+                relations, drawn at random, gives its place: the relation, its direction and the
+                class at its other end
 
-Every hidden class is ranked among the absent classes that are not hidden themselves: another
-hidden class above it is right, not wrong. Precision@5 is the share of the first five absent classes
-that are hidden; where fewer are hidden, it cannot reach 1. Ties score their expectation under
-random order. Structure classes are neither hidden nor candidates; scenes under two other classes
-are skipped. Relations between equal classes or with structure are not asked. In T2 every relation
-is unobserved, so that nothing of the removed object can leak.
+Candidates of a hidden class are the absent classes that are not hidden themselves, so another
+hidden class never counts as an error. Precision@5 is the share of hidden classes among the first
+five absent classes. It cannot reach 1 with fewer than five hidden classes. Ties score their
+expectation under random order.
+
+Structure classes are neither hidden nor candidates. Scenes with fewer than two other classes are
+skipped. T2-at excludes relations between equal classes and relations with structure. In T2 all
+relations are unobserved, so that they reveal nothing about the removed object.
 """
 
 from __future__ import annotations
@@ -38,25 +40,25 @@ from training.machines import BoltzmannMachine
 from training.machines.log_odds import object_log_odds
 from training.machines.mean_field import Evidence
 
-# Log-odds (B, V) of every class given presence (B, V).
+# Function of presence (B, V) that returns log-odds (B, V) of every class.
 ObjectScore = Callable[[Tensor], Tensor]
-# The same given room types (B,) as well, -1 where none is known.
+# Function of presence (B, V) and room types (B,), -1 if unknown; returns log-odds (B, V).
 RoomScore = Callable[[Tensor, Tensor], Tensor]
 
 TOP = (1, 2, 3, 5, 10, 20, 50)
-"""Lengths of the lists in which a removed object is looked for."""
+"""Values of k for top-k accuracy."""
 
 SHARES: dict[str, float | None] = {"50 %": 0.5, "25 %": 0.25, "75 %": 0.75, "all but one": None}
-"""What T2 partial shows of a scene, the primary one first."""
+"""Share of classes that T2 partial shows; the primary share comes first."""
 
 _FIRST = 5
-# Unlisted is absent: every object that is there was listed.
+# Coverage 1: the object list is complete, so unlisted objects are absent.
 _CLOSED = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class MachineScore:
-    """Log-odds under a machine with every relation unobserved.
+    """Log-odds of a machine with all relations unobserved.
 
     Seed-form machines sum relations out at the mean-field fixed point.
     """
@@ -65,24 +67,25 @@ class MachineScore:
 
     @property
     def parameter_count(self) -> int:
-        """Trained weights."""
+        """Number of trained weights."""
         return self.machine.parameter_count
 
     def __call__(self, v: Tensor, room: Tensor | None = None) -> Tensor:
-        """Scores (B, V) of presence (B, V), room types (B,) withheld unless they are given."""
+        """Return scores (B, V) for presence (B, V) and optional room types (B,)."""
         evidence = Evidence(v, self.machine.acting_units(v), room=room)
         return object_log_odds(self.machine, evidence)
 
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Every hidden class of a set of scenes among the candidates.
+    """Ranks of all hidden classes of a set of scenes.
 
     Attributes:
         scene: (N,) position of the scene in the set.
         target: (N,) the hidden class.
-        above: (N,) candidates ranked above the target; ties: (N,) others with exactly its score.
-        scenes, skipped: how many scenes were given, and how many had too few classes.
+        above: (N,) number of candidates with a higher score.
+        ties: (N,) number of other candidates with the same score.
+        scenes, skipped: number of scenes, and number of scenes with too few classes.
     """
 
     scene: Ints
@@ -96,19 +99,19 @@ class Ranking:
     def of(
         cls, scene: Tensor, target: Tensor, values: Tensor, scenes: int, skipped: int
     ) -> Ranking:
-        """By scores (N, V), -inf but for candidates.
+        """Compute ranks from scores (N, V); classes that are not candidates have score -inf.
 
         Raises:
-            FloatingPointError: a score is nan.
+            FloatingPointError: a score is NaN.
         """
         if bool(values.isnan().any()):
-            raise FloatingPointError("a score is not a number")
+            raise FloatingPointError("a score is NaN")
         chosen = values.gather(1, target.unsqueeze(1))
         above, ties = (values > chosen).sum(1), (values == chosen).sum(1) - 1
         return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes, skipped)
 
     def reciprocal_rank(self) -> Floats:
-        """Expectation of 1 / rank under random order of ties, (N,)."""
+        """Return the expectation of 1 / rank under random order of ties, (N,)."""
         # Mean of 1/r over r = above + 1 .. above + ties + 1, by harmonic numbers.
         last = self.above + self.ties + 1
         ranks = np.arange(1, int(last.max(initial=1)) + 1)
@@ -117,15 +120,15 @@ class Ranking:
         return mean
 
     def top(self, k: int) -> Floats:
-        """Probability that the target is among the first k, (N,)."""
+        """Return the probability that the target is among the first k, (N,)."""
         return np.clip((k - self.above) / (self.ties + 1), 0.0, 1.0)
 
     def mrr(self, some: Flags | slice = slice(None)) -> Ratio:
-        """Mean reciprocal rank, of some of the targets if given."""
+        """Return the mean reciprocal rank of the selected targets."""
         return Ratio.of_items(self.scene[some], self.reciprocal_rank()[some], self.scenes)
 
     def metrics(self) -> dict[str, Metric]:
-        """MRR and top-k, micro-averaged over hidden classes, and MRR by class."""
+        """Return MRR and top-k, micro-averaged over hidden classes, and the macro MRR by class."""
         metrics: dict[str, Metric] = {"MRR": self.mrr()}
         for k in TOP:
             metrics[f"top-{k}"] = Ratio.of_items(self.scene, self.top(k), self.scenes)
@@ -133,10 +136,12 @@ class Ranking:
         return metrics | {"MRR, macro by class": macro}
 
     def with_unknown(self, unknown: Ints) -> Ratio:
-        """MRR where labels outside the vocabulary count as removed objects that score 0.
+        """Return the MRR with each label outside the vocabulary counted as a removed object.
+
+        Such a label scores 0.
 
         Args:
-            unknown: (scenes,) such labels of each scene; skipped scenes stay skipped.
+            unknown: (scenes,) number of such labels per scene; skipped scenes stay skipped.
         """
         known = self.mrr()
         scored = known.denominators > 0
@@ -150,15 +155,15 @@ def leave_one_out(
     *,
     told_room: bool = False,
 ) -> Ranking:
-    """Rank every removed class.
+    """Rank every class when it is removed from its scene.
 
     Args:
         structure: (V,) bool.
-        score: higher = likelier missing.
-        told_room: the score gets the room type of each scene.
+        score: higher means more likely missing.
+        told_room: pass the room type of each scene to the score.
 
     Raises:
-        LeakError: the score depends on more than what is shown.
+        LeakError: the score depends on more than the shown evidence.
     """
     removable = (scenes.v > 0) & ~structure
     enough = removable.sum(1) >= 2
@@ -174,12 +179,13 @@ def leave_one_out(
 
 @dataclass(frozen=True, eq=False)
 class Partial:
-    """Scenes of which a part is hidden.
+    """Scenes with some classes hidden.
 
     Attributes:
         scene: (N,) position of the scene in the set.
-        v: (N, V) presence of what is shown; hidden: (N, V) bool.
-        scenes: how many were given.
+        v: (N, V) presence of the shown classes.
+        hidden: (N, V) bool, the hidden classes.
+        scenes: number of scenes in the set.
     """
 
     scene: Tensor
@@ -189,11 +195,11 @@ class Partial:
 
 
 def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int = 0) -> Partial:
-    """Hide classes of every scene that has two.
+    """Hide classes of every scene with at least two classes.
 
     Args:
         structure: (V,) bool.
-        share: of the classes that is shown; all but one for None.
+        share: share of shown classes; None shows all but one.
     """
     plain = ~structure.numpy()
     places: list[int] = []
@@ -211,24 +217,24 @@ def hide(scenes: SceneTensors, structure: Tensor, share: float | None, seed: int
 
 
 def shown_classes(classes: int, share: float | None) -> int:
-    """How many of so many classes are shown; at least one is, and one is hidden."""
+    """Return the number of shown classes; at least one class is shown and one hidden."""
     if share is None:
         return classes - 1
     return min(max(int(share * classes + 0.5), 1), classes - 1)
 
 
 def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tuple[Ratio, Ratio]:
-    """(MRR over hidden classes, precision@5 over scenes).
+    """Return (MRR over hidden classes, precision@5 over scenes).
 
     Raises:
-        LeakError: the score depends on more than what is shown.
-        FloatingPointError: a score is nan.
-        ValueError: no scene has two classes.
+        LeakError: the score depends on more than the shown evidence.
+        FloatingPointError: a score is NaN.
+        ValueError: all scenes have fewer than two classes.
     """
     if not len(partial.v):
-        raise ValueError("no scene has two classes, one to show and one to hide")
+        raise ValueError("all scenes have fewer than two classes: one to show and one to hide")
     values = ask_rows(score, partial.v)
-    # A candidate of probability 0 stays a candidate: -inf marks classes that are none.
+    # Only non-candidates have -inf; a candidate of probability 0 gets the smallest finite score.
     values = values.clamp(min=torch.finfo(values.dtype).min)
     values = values.masked_fill((partial.v > 0) | structure, -torch.inf)
     row, target = partial.hidden.nonzero(as_tuple=True)
@@ -245,10 +251,10 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
 
 
 def partial_score(artifact: Artifact, coverage: float | None = None) -> ObjectScore:
-    """Log-probabilities of `/missing`, asked with the labels alone.
+    """Return a score: log-probabilities of `/missing`, given labels only.
 
     Args:
-        coverage: the model's default for None; 1 for unlisted = absent.
+        coverage: None means the default of the model; 1 means unlisted = absent.
     """
 
     def log_p(row: NDArray[np.float32]) -> Floats:
@@ -264,14 +270,14 @@ def partial_score(artifact: Artifact, coverage: float | None = None) -> ObjectSc
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """B scenes with a class left out, and where it stood.
+    """B scenes with a removed class, and the place of the removed class.
 
     Attributes:
-        v: (B, V) presence of what stayed.
-        counts: (B, V) instances of what stayed, 0 elsewhere.
-        relation: (B,) int64 canonical.
-        anchor: (B,) int64 class at the other end.
-        outgoing: (B,) bool: the missing class is the subject of the relation.
+        v: (B, V) presence of the remaining classes.
+        counts: (B, V) instances of the remaining classes, 0 elsewhere.
+        relation: (B,) int64 canonical relation.
+        anchor: (B,) int64 class at the other end of the relation.
+        outgoing: (B,) bool, the removed class is the subject of the relation.
     """
 
     v: Tensor
@@ -281,18 +287,18 @@ class Places:
     outgoing: Tensor
 
     def rows(self, index: Tensor) -> Places:
-        """Some of them."""
+        """Select rows."""
         return Places(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-# Scores (B, V) of every class: the higher, the likelier missing from that place.
+# Function that returns scores (B, V): higher means more likely missing from the place.
 PlacedScore = Callable[[Places], Tensor]
 
 
 def removed_places(
     scenes: SceneTensors, structure: Tensor, seed: int = 0
 ) -> tuple[Tensor, Tensor, Places]:
-    """Positions of the scenes (N,), removed classes (N,), and what stayed."""
+    """Return the positions of the scenes (N,), the removed classes (N,), and the places."""
     found: list[tuple[int, int, int, int, bool]] = []
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
@@ -322,10 +328,10 @@ def removed_places(
 def leave_one_out_at(
     scenes: SceneTensors, structure: Tensor, score: PlacedScore, *, seed: int = 0
 ) -> tuple[Ranking, Ints]:
-    """Every removed class among all absent ones, and the relation (N,) that told its place.
+    """Rank every removed class among the absent classes; also return the relation (N,) used.
 
     Raises:
-        LeakError: the score depends on more than what is shown.
+        LeakError: the score depends on more than the shown evidence.
     """
     row, target, places = removed_places(scenes, structure, seed)
     values = places.v
@@ -341,7 +347,7 @@ def leave_one_out_at(
 
 
 def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T2."""
+    """Measure T2."""
     if contender.objects is None:
         return None
     scenes = setting.scenes
@@ -354,7 +360,7 @@ def missing_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 
 def missing_in_room_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T2 on the scenes whose room type is known and given; beside it the same with it withheld."""
+    """Measure T2 on scenes with a known room type, with and without the room type as evidence."""
     setting = setting.at((setting.scenes.room >= 0).nonzero().squeeze(1))
     scenes, structure, score = setting.scenes, setting.structure, contender.objects_in_rooms
     if score is None or not len(scenes):
@@ -371,7 +377,7 @@ def missing_in_room_task(contender: Contender, setting: Setting) -> Outcome | No
 
 
 def partial_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T2 partial; a published model stands beside itself with unlisted = absent."""
+    """Measure T2 partial; a published model is also measured with unlisted = absent."""
     artifact = contender.artifact
     score = contender.objects if artifact is None else partial_score(artifact)
     if score is None:
@@ -398,7 +404,7 @@ def partial_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 
 def placed_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T2-at; beside it the same questions answered without the place."""
+    """Measure T2-at, and the same questions without the place."""
     if contender.placed is None:
         return None
     scenes, structure = setting.some(related=True, share=3), setting.structure

@@ -1,9 +1,9 @@
-"""Do things stand where placements say they do?
+"""Coverage of the placement offsets on held-out scenes.
 
-Every two things of held-out scenes with poses that stand in a relation are looked up by their
-classes. Covered in the plane are those whose offset lies within the ellipse that should hold 80 %
-of them, in space those within the ellipsoid. Distances are from the mean offset, beside those from
-what the relation alone says.
+The task takes every pair of objects with known poses that stand in a relation, and looks up the
+offset distribution of their classes. In the plane, an offset is covered if it lies in the ellipse
+that should contain 80 % of offsets; in space, the region is an ellipsoid. Distances are measured
+from the mean offset, and from the offset of the relation alone.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from training.evaluation.setting import Contender, Outcome, Setting
 from training.offsets import seen_offsets
 
 SHARE: Final = 0.8
-"""Of the offsets that the ellipses should hold."""
+"""Share of the offsets that each region should contain."""
 
 _REGIONS: Final = {"the ellipse": 2, "the ellipsoid": 3}
-"""Names, and how many axes count, of x, y and z."""
+"""Name of a region and its number of axes, counted in the order x, y, z."""
 
 METRICS: Final = (
     *(f"in {region}, {name}" for name in CANONICAL for region in _REGIONS),
@@ -32,7 +32,7 @@ METRICS: Final = (
 
 
 def offsets_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Coverage by relation, and distances over all of them."""
+    """Measure coverage by relation, and distances over all relations."""
     if contender.artifact is None or (offsets := contender.artifact.offsets) is None:
         return None
     scenes = setting.scenes.scenes

@@ -1,14 +1,14 @@
-"""T3: one absent class is added to a scene; is it the one that fits least? And the alarm.
+"""T3: rank of an intruder, an absent class that is added to a scene; and the alarm for intruders.
 
-A score answers by the log-odds of each object given the rest. A published model is asked as a robot
-asks: all instances of the scene as labels, nothing else. hit@1 then follows the service's ranking,
-the probability of being an intruder; hit@1 by log-odds stands beside it. Structure raises no alarm
-and takes no rank. Ties score their expectation.
+A score ranks by the log-odds of each object given the rest. A published model gets the labels of
+all instances of the scene and no other evidence. Its hit@1 follows the ranking of the service, by
+probability of being an intruder; hit@1 by log-odds is reported too. Structure is not ranked and
+raises no alarm. Ties score their expectation.
 
-An alarm in a given share of untouched scenes is promised, by one rule for machines and baselines.
-Alarms of one place come together, places differ, and a source of one kind may be far more varied
-than another. So the threshold is kept for each source by itself, on the safe side of what resampled
-groups leave open.
+The alarm threshold aims at a fixed share of alarms in clean scenes (scenes without an intruder). It
+follows the same rule for machines and baselines. Alarms of scenes of one place are correlated,
+places differ, and one source may be more varied than another. So the share is kept within each
+source, with a safety margin from resampled groups.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from training.evaluation.missing import ObjectScore
 from training.evaluation.setting import Contender, Outcome, Setting
 
 MEDIUM = 0.1
-"""Share of untouched scenes that raise an alarm at the default sensitivity."""
+"""Target share of clean scenes with an alarm at the default sensitivity."""
 
 _RESAMPLES = 200
-# New places differ: the threshold is on the safe side in so many of the resampled sets of groups.
+# The threshold keeps the target share of alarms in this share of the resampled sets of groups.
 _CONFIDENCE = 0.7
-# Scenes of a source whose share of alarms is kept by itself, and of small sources together.
+# Minimum scenes of a source with its own threshold, and of all small sources together.
 _SOURCE_SCENES = 200
 _SMALL_SCENES = 30
 _SCENES = 1500
@@ -61,12 +61,12 @@ _SCENES = 1500
 
 @dataclass(frozen=True, eq=False)
 class Alarm:
-    """When a scene is called wrong.
+    """Alarm rule for objects.
 
     Attributes:
-        suspicion: scores (N,) of each judged object, higher = more an intruder.
-        threshold: from which an object raises the alarm.
-        short: the same for lists of 1, 2, ... classes, structure aside.
+        suspicion: function that returns a score (N,) per object, higher = more likely an intruder.
+        threshold: suspicion from which an object raises the alarm.
+        short: thresholds for lists of 1, 2, ... classes without structure.
     """
 
     suspicion: Callable[[IntruderScores], Floats]
@@ -74,7 +74,7 @@ class Alarm:
     short: tuple[float, ...] = ()
 
     def raised(self, scores: IntruderScores) -> Flags:
-        """Whether each scored object raises the alarm, (N,)."""
+        """Return whether each scored object raises the alarm, (N,)."""
         limits = np.array([*self.short, self.threshold])
         limit = limits[np.minimum(scores.listed - 1, len(self.short))]
         loud: Flags = self.suspicion(scores) >= limit
@@ -82,7 +82,7 @@ class Alarm:
 
 
 def calibrated_alarm(calibration: Calibration) -> Alarm:
-    """The service's own: its probability of an intruder, and its default threshold."""
+    """Return the alarm of the service: its intruder probability and its default threshold."""
     entry = calibration.outlier
     popularity = np.array(calibration.popularity)
 
@@ -98,10 +98,10 @@ def calibrated_alarm(calibration: Calibration) -> Alarm:
 def fitted_alarm(
     score: ObjectScore, validation: SceneTensors, structure: Tensor, seed: int = 0
 ) -> Alarm:
-    """The alarm of a score that has no calibration, by log-odds alone.
+    """Fit the alarm of a score without calibration, on log-odds only.
 
     Args:
-        validation: those with complete object lists are judged, at most 1,500.
+        validation: at most 1,500 scenes with complete object lists are used.
         structure: (V,) bool.
     """
     complete = subset(validation, validation.complete.nonzero().squeeze(1))
@@ -118,27 +118,27 @@ def alarm_threshold(
     rng: np.random.Generator,
     share: float = MEDIUM,
 ) -> float:
-    """The suspicion from which an object raises the alarm.
+    """Compute the suspicion from which an object raises the alarm.
 
-    The share of false alarms is kept in each source by itself: a robot's scenes are of one kind,
-    and one quantile over all kinds would alarm often in the most varied one and never in others.
+    The target share of false alarms holds within each source, because the scenes of a robot are of
+    one kind. One quantile over all sources would cause too many alarms in the most varied source.
 
     Args:
-        suspicion: (N,) of each scored object; higher = more an intruder.
-        scores: of `scenes`, with untouched ones among them.
-        share: of untouched scenes of the hardest large source that raise an alarm.
+        suspicion: (N,) score per object; higher = more likely an intruder.
+        scores: scored objects of `scenes`, including clean scenes.
+        share: share of alarms in clean scenes of the large source with the highest threshold.
 
     Raises:
-        ValueError: no untouched scene was scored.
-        FloatingPointError: one of them has no finite suspicion.
+        ValueError: the scores contain no clean scene.
+        FloatingPointError: a clean scene has a suspicion that is not finite.
     """
     worst = np.full(len(scenes), -np.inf)
     np.maximum.at(worst, scores.scene[scores.clean], suspicion[scores.clean])
     judged = np.bincount(scores.scene[scores.clean], minlength=len(scenes)) > 0
     if not judged.any():
-        raise ValueError("no untouched scene was scored: there is nothing to fit an alarm on")
+        raise ValueError("the scores contain no clean scene, which the alarm threshold needs")
     if not np.isfinite(worst[judged]).all():
-        raise FloatingPointError("the suspicion of an untouched scene is not finite")
+        raise FloatingPointError("the suspicion of a clean scene is not finite")
     group = np.array([scene.group for scene in scenes.scenes])[judged]
     return kept_in_each_source(worst[judged], group, scenes.source.numpy()[judged], rng, share)
 
@@ -150,15 +150,16 @@ def kept_in_each_source(
     rng: np.random.Generator,
     share: float,
 ) -> float:
-    """The threshold that the given share of scenes reaches in the hardest source, and less in
-    others.
+    """Return the threshold that keeps the share of alarms within every source.
 
-    Small sources are judged together, and by their quantile as it is: of few places, resampled ones
-    say little more than the strangest scene does.
+    The source with the highest threshold decides; other sources have fewer alarms. Small sources
+    are pooled and use their plain quantile, because resampling a few places mostly reflects their
+    strangest scene.
 
     Args:
-        worst: (N,) the most suspicious score of each untouched scene.
-        group: (N,) places; source: (N,) numbers.
+        worst: (N,) highest suspicion of each clean scene.
+        group: (N,) group of each scene.
+        source: (N,) index of the source.
     """
     kinds, sizes = np.unique(source, return_counts=True)
     large = [source == kind for kind in kinds[sizes >= _SOURCE_SCENES]]
@@ -166,16 +167,16 @@ def kept_in_each_source(
     bounds = [_bound(worst[some], group[some], rng, share) for some in large]
     if small.sum() >= _SMALL_SCENES or not large:
         bounds.append(float(np.quantile(worst[small], 1 - share)))
-    # What reaches the threshold raises the alarm, and many scenes may have one and the same worst
-    # suspicion (a class's popularity): these stay below.
+    # A suspicion equal to the threshold raises the alarm. Many scenes may share one value, such as
+    # the popularity of a class, so the threshold moves just above it.
     return float(np.nextafter(max(bounds), np.inf))
 
 
 def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator, share: float) -> float:
-    """The threshold that a share of scenes exceeds, on the safe side.
+    """Return a threshold that a share of scenes exceeds, with a safety margin.
 
-    Scenes of one place raise alarms together, so the share in new places is uncertain: a high
-    quantile of the threshold over resampled groups.
+    Scenes of one place raise alarms together, so the share in new places is uncertain. The margin
+    is a high quantile of the threshold over resampled groups.
     """
     members = [worst[group == name] for name in np.unique(group)]
     found = []
@@ -188,12 +189,12 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator, sha
 
 # ------------------------------------------------------------------------------------------ tasks
 
-# Lists of so few classes are asked too: a robot that has just begun to look.
+# Short lists, as at the beginning of an exploration by a robot, are measured too.
 _SHORT_LISTS = (1, 2, 4)
 
 
 def outliers_task(contender: Contender, setting: Setting, law: Law | None = None) -> Outcome | None:
-    """T3 by a score: uniform intruders by default."""
+    """Measure T3 with a score; uniform intruders by default."""
     if contender.objects is None or (law is not None and setting.train is None):
         return None
     scenes = setting.some()
@@ -216,7 +217,7 @@ def outliers_task(contender: Contender, setting: Setting, law: Law | None = None
 
 
 def signature_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T3 signature; a baseline ranks by log-odds alone."""
+    """Measure T3 signature; a baseline ranks by log-odds only."""
     if setting.train is None:
         return None
     structure, seed = setting.structure, setting.seed
@@ -239,7 +240,7 @@ def signature_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 
 def sensitivity_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """Alarms in untouched scenes, and intruders caught, at each sensitivity."""
+    """Measure alarms in clean scenes and detected intruders at each sensitivity."""
     artifact = contender.artifact
     if artifact is None:
         return None
@@ -276,11 +277,11 @@ def sensitivity_task(contender: Contender, setting: Setting) -> Outcome | None:
 def judge_intruders(
     artifact: Artifact, scenes: SceneTensors, structure: Tensor, intruders: Tensor, law: str = ""
 ) -> dict[str, Metric]:
-    """hit@1 by probability and by log-odds, and the share caught at each sensitivity.
+    """Return hit@1 by probability and by log-odds, and the detected share at each sensitivity.
 
     Args:
-        intruders: (N,) classes, -1 for scenes that are not asked.
-        law: what the names of the metrics say of the intruders.
+        intruders: (N,) classes; -1 for scenes without an intruder.
+        law: suffix of the metric names, for the distribution of the intruders.
 
     Raises:
         LeakError: see `ask_every`.
@@ -309,13 +310,13 @@ def judge_intruders(
 
 
 def verdict(artifact: Artifact, sensitivity: Sensitivity, scene: Scene) -> Floats:
-    """(n, 3) of its objects: probability, log-odds, called an outlier."""
+    """Return (n, 3) per object: probability, log-odds, and 1 if it is flagged as an outlier."""
     found = judge(artifact, scene, sensitivity)
     return np.column_stack([found.probability, found.log_odds, found.is_outlier])
 
 
 def share_of_first(values: Floats, target: int) -> float:
-    """Whether the value at `target` is the highest; ties in expectation."""
+    """Return 1 if the value at `target` is the highest, 0 otherwise; expectation over ties."""
     best = values == values.max()
     return float(best[target] / best.sum())
 
@@ -327,7 +328,7 @@ def alarms(
     sensitivity: Sensitivity,
     judged: Flags,
 ) -> Ratio:
-    """Share of the judged of N untouched scenes with an object that is called an outlier."""
+    """Return the share of judged clean scenes with an object flagged as an outlier."""
     found = ask_every(partial(verdict, artifact, sensitivity), cases)
     loud = [
         bool(((columns[:, 2] > 0) & things(case, structure.numpy())).any())
@@ -339,7 +340,7 @@ def alarms(
 def first_classes(
     encoded: EncodedScene, structure: Tensor, listed: int, rng: np.random.Generator
 ) -> Scene:
-    """All instances of so many of its classes, drawn at random, and its structure."""
+    """Return a scene of structure and all instances of ``listed`` random classes."""
     every = np.unique(encoded.instance_classes)
     hidden = rng.permutation(every[~structure.numpy()[every]])[listed:]
     kept = np.flatnonzero(~np.isin(encoded.instance_classes, hidden))

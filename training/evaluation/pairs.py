@@ -1,14 +1,14 @@
-"""T1 pairs: which of eight relations is it, between two classes that stand one on another?
+"""T1 pairs: which of eight relations holds between two vertically related classes?
 
-Asked are the pairs of different classes of a scene for which a vertical relation (on-top, under,
-above, below) is listed, in that scene: all its objects are given as labels, no relation is. The
-eight are the four canonical relations, read both ways. A pair may have several listed relations;
-each of them is right.
+A question is a pair of different classes of a scene for which the scene lists a vertical relation
+(on-top, under, above, below). The evidence is the labels of all objects of the scene, without
+relations. The eight relations are the four canonical relations in both directions. A pair may have
+several listed relations; each of them is correct.
 
-    accuracy   the likeliest of the eight is listed (ties in expectation)
+    accuracy   the most probable of the eight is listed (expectation over ties)
     log-loss   -log of the listed relations' share of the eight probabilities, in nats
 
-Structure classes are no ends. Scenes without such a pair are skipped.
+Pairs with structure classes are excluded. Scenes without such a pair are skipped.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from training.evaluation.relations import RelationScore, telling
 from training.evaluation.setting import Contender, Outcome, Setting
 
 RARE = 10
-"""A class that is related to so many classes at most in training is rare."""
+"""A class is rare if training relates it to at most this many classes."""
 
 VERTICAL = (CANONICAL.index("on-top"), CANONICAL.index("above"))
 
-# A relation that is held impossible costs this much at most, about 21 nats.
+# Lower bound of a share, so that the log-loss of a pair is at most about 21 nats.
 _LEAST = 1e-9
 
 Floats = NDArray[np.float64]
@@ -43,12 +43,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ScenePairs:
-    """The asked pairs of one scene.
+    """The questions about one scene.
 
     Attributes:
-        place: of the scene in its set; scene: it.
-        ends: (P, 2) places in the scene's classes, the first below the second.
-        listed: (P, 8) bool, relations of the first to the second, then back.
+        place: position of the scene in its set.
+        scene: the scene.
+        ends: (P, 2) positions in the scene's classes, the smaller position first.
+        listed: (P, 8) bool, relations of the first class to the second, then of the second to the
+            first.
     """
 
     place: int
@@ -58,17 +60,17 @@ class ScenePairs:
 
     @property
     def classes(self) -> NDArray[np.int64]:
-        """(P, 2), the lower one first."""
+        """(P, 2) class indices of the ends."""
         ends: NDArray[np.int64] = self.scene.evidence.classes[self.ends]
         return ends
 
 
-# Probabilities (P, 8) of the asked pairs of a scene.
+# Function that returns probabilities (P, 8) for the pairs of a scene.
 PairScore = Callable[[ScenePairs], Floats]
 
 
 def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
-    """The pairs of every scene that has any."""
+    """Return the vertical pairs of every scene that has such pairs."""
     plain = ~structure.numpy()
     found = []
     for place, scene in enumerate(scenes.scenes):
@@ -85,7 +87,7 @@ def vertical_pairs(scenes: SceneTensors, structure: Tensor) -> list[ScenePairs]:
 
 
 def service_score(artifact: Artifact) -> PairScore:
-    """Probabilities of `/relations`, between the first instances of both classes."""
+    """Return a score: probabilities of `/relations` between the first instances of both classes."""
 
     def score(asked: ScenePairs) -> Floats:
         scene, own = asked.scene, asked.scene.evidence.classes
@@ -100,7 +102,7 @@ def service_score(artifact: Artifact) -> PairScore:
 
 
 def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
-    """The same of a score of relations by classes, whose values are log-odds."""
+    """Return a score from log-odds of relations between classes."""
 
     @torch.no_grad()
     def score(asked: ScenePairs) -> Floats:
@@ -114,11 +116,14 @@ def baseline_score(scenes: SceneTensors, relations: RelationScore) -> PairScore:
 
 @dataclass(frozen=True, eq=False)
 class PairAnswers:
-    """All asked pairs.
+    """Answers about all pairs.
 
     Attributes:
-        scene: (N,); classes: (N, 2); p: (N, 8); listed: (N, 8) bool.
-        scenes: how many were given.
+        scene: (N,) scene of each pair.
+        classes: (N, 2) class indices.
+        p: (N, 8) probabilities.
+        listed: (N, 8) bool, listed relations.
+        scenes: number of scenes.
     """
 
     scene: NDArray[np.int64]
@@ -128,24 +133,24 @@ class PairAnswers:
     scenes: int
 
     def where(self, mask: NDArray[np.bool_]) -> PairAnswers:
-        """Some of them."""
+        """Select pairs."""
         return PairAnswers(
             self.scene[mask], self.classes[mask], self.p[mask], self.listed[mask], self.scenes
         )
 
     def accuracy(self) -> Ratio:
-        """The likeliest of the eight is listed."""
+        """Return the share of pairs whose most probable relation of the eight is listed."""
         best = self.p == self.p.max(1, keepdims=True)
         right = (best & self.listed).sum(1) / best.sum(1)
         return Ratio.of_items(self.scene, right, self.scenes)
 
     def upright(self) -> Ratio:
-        """The likeliest of the four vertical relations is listed."""
+        """Return the share of pairs whose most probable vertical relation is listed."""
         columns = [a + back for back in (0, self.p.shape[1] // 2) for a in VERTICAL]
         return replace(self, p=self.p[:, columns], listed=self.listed[:, columns]).accuracy()
 
     def log_loss(self) -> Ratio:
-        """-log of the listed relations' share."""
+        """Return the mean -log of the listed relations' share of the probabilities."""
         total = self.p.sum(1)
         share = np.divide(
             (self.p * self.listed).sum(1), total, where=total > 0, out=self.listed.mean(1)
@@ -154,7 +159,7 @@ class PairAnswers:
 
 
 def answer_pairs(asked: list[ScenePairs], score: PairScore, scenes: int) -> PairAnswers:
-    """Ask for the pairs of all scenes.
+    """Query the score for the pairs of all scenes.
 
     Raises:
         LeakError: see `ask_every`.
@@ -170,7 +175,7 @@ def answer_pairs(asked: list[ScenePairs], score: PairScore, scenes: int) -> Pair
 
 
 def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T1 pairs; the primary metric is the accuracy over all of them."""
+    """Measure T1 pairs; the primary metric is the accuracy over all pairs."""
     related = {one.place for one in vertical_pairs(setting.scenes, setting.structure)}
     if not related:
         return None
@@ -198,11 +203,11 @@ def pairs_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 
 def _little_known(classes: NDArray[np.int64], setting: Setting) -> dict[str, NDArray[np.bool_]]:
-    """Which pairs (N, 2) training tells little of, (N,) bool; nothing where that is unknown.
+    """Return masks (N,) of unseen pairs and of rare classes; empty without training scenes.
 
-    Unseen pairs: no relation of the two classes is listed in training. Rare classes: one of the two
-    is related to `RARE` classes at most there. By all that the contender may have learnt from,
-    which is more than scenes of one source.
+    "unseen pairs": training lists no relation of the two classes. "rare classes": training relates
+    one of the two classes to at most `RARE` classes. Training here means all data that the
+    contender may have learnt from, not only the scenes of one source.
     """
     V = setting.scenes.v.shape[1]
     triples = setting.seen

@@ -1,8 +1,9 @@
-"""Reconstruction error of objects and of relations, separately: the seed paper's training curve.
+"""Reconstruction error of objects and of relations: the training curve of the seed paper.
 
-One deterministic up–down pass: the context's mean given the scene (relations observed where
-annotated), then p(v | h1) and p(r | v, h1). The error of objects is the mean absolute difference
-over classes. That of relations is the same over observed units between present objects.
+The error uses one deterministic up–down pass. The up pass computes the mean of the hidden layer
+given the scene, with annotated relations observed. The down pass computes p(v | h1) and
+p(r | v, h1). The object error is the mean absolute difference over classes. The relation error is
+the same over observed relation units between present objects.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ from training.machines.mean_field import Evidence, mean_field
 def reconstruction_error(
     machine: BoltzmannMachine, scenes: SceneTensors, *, limit: int = 512, block: int = 64
 ) -> tuple[float, float]:
-    """(object error, relation error) over `limit` random scenes; nan where nothing was
-    annotated."""
+    """Return (object error, relation error) over `limit` random scenes; NaN without relations."""
     object_sum = relation_sum = 0.0
     objects = relations = 0
     chosen = torch.randperm(len(scenes), generator=torch.Generator().manual_seed(0))[:limit]

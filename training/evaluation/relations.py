@@ -1,19 +1,22 @@
 """T1a, T1b and T3b: the annotated relations of a scene, by classes.
 
-    T1a   given the classes alone
-    T1b   given the classes and a random half of the triples; given triples are no candidates, nor
-          are their mirror images a(y, x), which a given a(x, y) all but excludes
-    T3b   one triple is false; is it the one that fits least, each judged given the others?
+    T1a   the evidence is the classes
+    T1b   the evidence is the classes and a random half of the triples. Given triples a(x, y) and
+          their mirror images a(y, x) are not candidates
+    T3b   one triple is false: does the model rank it as the worst fit, each triple judged given
+          the others?
 
-T1 is R-precision over all ordered pairs i ≠ j of present classes × canonical relations: as many
-predictions as there are annotated triples. Unlisted is counted as wrong although annotators list
-only a few relations a scene. Structure classes are no ends. Scenes without annotated triples are
-skipped; T1b and T3b need two. Triples are canonical and distinct, so that none is held out in one
-spelling (left) and given in the other (right). Everything that is not given is unobserved.
+T1 is R-precision over all ordered pairs i ≠ j of present classes × canonical relations: the number
+of predictions is the number of annotated triples. An unlisted triple counts as wrong, although
+annotators list only a few relations per scene. Structure classes are excluded. Scenes without
+annotated triples are skipped; T1b and T3b need two triples.
 
-The false triple of T3b has, half of the time, another relation between the two classes, otherwise
-another present class at one end. Neither it nor its mirror image, which the rest of the triples
-would contradict outright, is true in the scene.
+Triples are canonical and distinct. So T1b never gives a held-out relation in its opposite form
+(right for left). Relations that are not given are unobserved.
+
+The false triple of T3b has another relation between the two classes, or another present class at
+one end, with equal probability. The scene contains neither the false triple nor its mirror image,
+which the other triples would contradict directly.
 """
 
 from __future__ import annotations
@@ -35,17 +38,17 @@ from training.machines.edges import triple_keys
 from training.machines.log_odds import relation_log_odds
 from training.machines.mean_field import Evidence
 
-# Scores (B, A, n, n) of the relations between the classes of a batch.
+# Function that returns scores (B, A, n, n) of the relations between the classes of a batch.
 RelationScore = Callable[[Batch], Tensor]
 
 FIRST = (1, 2, 5, 10, 20, 50, 100)
-"""Numbers of predictions, per scene, among which annotated relations are looked for."""
+"""Numbers of predictions per scene for recall."""
 _RECALLS = (20, 50, 100)
 _TRIES = 50
 
 
 def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScore:
-    """Log-odds of every relation with all relations unobserved, whatever the batch says of them."""
+    """Return a score: log-odds of every relation, with all relations unobserved."""
 
     def score(batch: Batch) -> Tensor:
         edges = machine.edges(batch.classes, batch.counts)
@@ -56,7 +59,7 @@ def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScor
 
 
 def transitive_closure(given: Tensor) -> Tensor:
-    """All pairs joined by a chain of given ones, (..., n, n) bool, by repeated squaring."""
+    """Return all pairs connected by a chain of given pairs, (..., n, n) bool; repeated squaring."""
     reach = given.float()
     while True:
         further = ((reach + reach @ reach) > 0).float()
@@ -67,12 +70,14 @@ def transitive_closure(given: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """The triples of one scene that are ranked, k of them.
+    """The k ranked triples of one scene.
 
     Attributes:
-        scene: place of the scene among those that were scored.
-        relation: (k,) int64; key: (k,) int64, see `triple_keys`.
-        score: (k,); truth: (k,) bool, annotated.
+        scene: position of the scene among the scored scenes.
+        relation: (k,) int64.
+        key: (k,) int64, see `triple_keys`.
+        score: (k,).
+        truth: (k,) bool, the triple is annotated.
     """
 
     scene: int
@@ -82,14 +87,14 @@ class Candidates:
     truth: Flags
 
     def where(self, mask: Flags) -> Candidates:
-        """Some of them."""
+        """Select triples."""
         return Candidates(
             self.scene, self.relation[mask], self.key[mask], self.score[mask], self.truth[mask]
         )
 
 
 def scorable(batch: Batch, structure: Tensor) -> Tensor:
-    """(B, A, n, n) bool: the triples between two different classes that are no structure."""
+    """Return a mask (B, A, n, n) of triples between two different classes without structure."""
     n = batch.classes.shape[1]
     usable = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
     pair = usable[:, :, None] & usable[:, None, :] & ~torch.eye(n, dtype=torch.bool)
@@ -97,7 +102,7 @@ def scorable(batch: Batch, structure: Tensor) -> Tensor:
 
 
 def telling(batch: Batch, given: Tensor | None = None) -> Batch:
-    """The batch with no relation observed but those that are given, (B, A, n, n) bool."""
+    """Return the batch with only the given relations (B, A, n, n) observed."""
     if given is None:
         given = torch.zeros_like(batch.observed)
     return replace(batch, holds=given.to(batch.holds.dtype), observed=given)
@@ -106,7 +111,7 @@ def telling(batch: Batch, given: Tensor | None = None) -> Batch:
 def _batches(
     scenes: SceneTensors, triples: int, block: int = 16
 ) -> Iterator[tuple[list[int], Batch]]:
-    """(positions, batch) of the scenes that have so many triples."""
+    """Iterate over (positions, batch) of the scenes with at least this many triples."""
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.sum() >= triples]
     for start in range(0, len(related), block):
         index = related[start : start + block]
@@ -114,13 +119,13 @@ def _batches(
 
 
 def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candidates]:
-    """Candidates of every scene, numbered in their order.
+    """Return the candidates of every scene, numbered in order.
 
     Args:
-        batches: with scores and masks (B, A, n, n), the latter of the triples that are candidates.
+        batches: batches with scores (B, A, n, n) and masks (B, A, n, n) of the candidates.
 
     Raises:
-        FloatingPointError: the score of a candidate is nan.
+        FloatingPointError: the score of a candidate is NaN.
     """
     found: list[Candidates] = []
     for batch, values, mask in batches:
@@ -128,7 +133,7 @@ def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candida
             relation, x, y = mask[row].nonzero(as_tuple=True)
             score = values[row, relation, x, y].double().numpy()
             if np.isnan(score).any():
-                raise FloatingPointError(f"the score of scene {row} of a batch is not a number")
+                raise FloatingPointError(f"a score of scene {row} of a batch is NaN")
             key = triple_keys(relation, own[x], own[y], batch.v.shape[1]).numpy()
             truth = (batch.holds[row, relation, x, y] > 0).numpy()
             found.append(Candidates(len(found), relation.numpy(), key, score, truth))
@@ -139,11 +144,11 @@ def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candida
 def score_scenes(
     scenes: SceneTensors, structure: Tensor, score: RelationScore, *, counts: bool = True
 ) -> list[Candidates]:
-    """T1a: the candidates of the scenes that have annotated triples.
+    """Score the T1a candidates of the scenes with annotated triples.
 
     Args:
         structure: (V,) bool.
-        counts: say how many instances of each class there are; otherwise 0, nobody counted.
+        counts: give the number of instances of each class; otherwise 0, which means not counted.
     """
 
     def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
@@ -160,13 +165,13 @@ def score_scenes(
 def complete_scenes(
     scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
 ) -> list[Candidates]:
-    """T1b: the candidates of every scene with two triples or more, given half of the triples."""
+    """Score the T1b candidates of scenes with at least two triples, given half of the triples."""
 
     def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
         for index, batch in _batches(scenes, 2):
             mask = scorable(batch, structure)
             given = random_half((batch.holds > 0) & mask, scenes, index, seed)
-            # A single triple cannot be divided: nothing of it was given.
+            # A single triple cannot be divided: the scene has no given triple and is left out.
             divided = given.flatten(1).any(1)[:, None, None, None]
             yield batch, score(telling(batch, given)), mask & ~given & ~given.mT & divided
 
@@ -174,10 +179,10 @@ def complete_scenes(
 
 
 def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed: int) -> Tensor:
-    """Half of each scene's triples (rounded down), (B, A, n, n) bool.
+    """Return half of each scene's triples (rounded down), (B, A, n, n) bool.
 
     Args:
-        truth: (B, A, n, n) bool, the triples to choose from.
+        truth: (B, A, n, n) bool, all triples.
         index: positions of the B scenes.
     """
     given = torch.zeros_like(truth)
@@ -191,10 +196,11 @@ def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed:
 
 @dataclass(frozen=True, eq=False)
 class RelationRanking:
-    """Per scene: annotated triples, and how many were among as many predictions.
+    """Number of annotated triples per scene, and number of hits among the predictions.
 
     Attributes:
-        annotated: (scenes,) int64, 0 where skipped; hits: (scenes,).
+        annotated: (scenes,) int64, 0 for a skipped scene.
+        hits: (scenes,).
     """
 
     annotated: Ints
@@ -202,25 +208,25 @@ class RelationRanking:
 
     @property
     def skipped(self) -> int:
-        """Scenes without annotated triples among the candidates."""
+        """Number of scenes without annotated triples among the candidates."""
         return int((self.annotated == 0).sum())
 
     def pooled(self) -> Ratio:
-        """R-precision pooled over scenes."""
+        """Return the R-precision pooled over scenes."""
         return Ratio(self.hits, self.annotated.astype(np.float64))
 
     def per_scene(self) -> Ratio:
-        """Mean over scenes of their R-precision."""
+        """Return the mean over scenes of their R-precision."""
         return self.pooled().mean_over_scenes()
 
 
 def rank(scored: Iterable[Candidates], scenes: int, *, first: int | None = None) -> RelationRanking:
-    """Annotated triples among the best candidates.
+    """Count annotated triples among the best candidates.
 
     Args:
-        scored: candidates of the scenes that have any.
-        scenes: how many scenes there are.
-        first: how many predictions; as many as the scene has annotated triples by default.
+        scored: candidates of the scenes.
+        scenes: total number of scenes.
+        first: number of predictions; by default the number of annotated triples of the scene.
     """
     annotated, hits = np.zeros(scenes, dtype=np.int64), np.zeros(scenes)
     for scene in scored:
@@ -233,15 +239,15 @@ def rank(scored: Iterable[Candidates], scenes: int, *, first: int | None = None)
 def rank_relations(
     scenes: SceneTensors, structure: Tensor, score: RelationScore
 ) -> RelationRanking:
-    """R-precision of a score on a set of scenes."""
+    """Compute the R-precision of a score on a set of scenes."""
     return rank(score_scenes(scenes, structure, score), len(scenes))
 
 
 def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Candidates]:
-    """Candidates that never held in training (zero-shot).
+    """Select the candidates that never held in training (zero-shot).
 
     Args:
-        seen: (T, 3) of the (a, i, j) that did; see `training.batches.seen_triples`.
+        seen: (T, 3) triples (a, i, j) of training; see `training.batches.seen_triples`.
         classes: V.
     """
     relation, subject, object_ = seen.long().unbind(1)
@@ -250,7 +256,7 @@ def unseen(scored: Sequence[Candidates], seen: Tensor, classes: int) -> list[Can
 
 
 def expected_hits(score: Floats, truth: Flags, count: int) -> float:
-    """True items among the first `count`, in expectation under random order of ties."""
+    """Return the expected number of true items among the first `count`; ties in random order."""
     if count >= len(score):
         return float(truth.sum())
     threshold = np.partition(score, -count)[-count]
@@ -263,10 +269,11 @@ def expected_hits(score: Floats, truth: Flags, count: int) -> float:
 
 
 def alter(holds: Flags, usable: Flags, rng: np.random.Generator) -> tuple[Triple, Triple] | None:
-    """A triple of a scene and the false one in its place; None where there is none.
+    """Draw a triple of a scene and a false replacement; return (true, false) or None.
 
     Args:
-        holds: (A, n, n) what is true; usable: (A, n, n) which triples may be asked for.
+        holds: (A, n, n) bool, the true triples.
+        usable: (A, n, n) bool, the triples that may be used.
     """
     triples = np.argwhere(holds & usable)
     if len(triples) < 2:
@@ -291,11 +298,14 @@ def alter(holds: Flags, usable: Flags, rng: np.random.Generator) -> tuple[Triple
 def placement_scores(
     scenes: SceneTensors, structure: Tensor, score: RelationScore, *, seed: int = 0
 ) -> Items:
-    """Every triple of every scene of which one is false: its suspicion, and whether it is false.
+    """Score all triples of scenes in which one triple is false.
 
     Args:
-        score: gets the triples as observed ones; it must judge each without itself; higher =
-            likelier true.
+        score: function of a batch that observes the triples. It must judge each triple without
+            using that triple; higher means more likely true.
+
+    Returns:
+        The triples; their score is the suspicion, and the false triple is the true item.
     """
     scene = [torch.zeros(0, dtype=torch.int64)]
     values = [torch.zeros(0, dtype=torch.float64)]
@@ -325,7 +335,7 @@ def placement_scores(
 
 
 def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T1a."""
+    """Measure T1a."""
     if contender.relations is None:
         return None
     scenes, structure, score = setting.scenes, setting.structure, contender.relations
@@ -345,7 +355,7 @@ def relations_task(contender: Contender, setting: Setting) -> Outcome | None:
 
 
 def completion_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T1b; beside it the same candidates with nothing given."""
+    """Measure T1b, and the same candidates without given triples."""
     if contender.completion is None:
         return None
     scenes, structure, seed = setting.scenes, setting.structure, setting.seed
@@ -369,7 +379,7 @@ def _any_true(scored: list[Candidates]) -> bool:
 
 
 def _parts(scored: list[Candidates], setting: Setting, first: Sequence[int]) -> dict[str, Metric]:
-    """R-precision by relation, recall among the first, R-precision of unseen triples."""
+    """Return R-precision by relation, recall at k, and R-precision of unseen triples."""
     count = len(setting.scenes)
     metrics: dict[str, Metric] = {}
     for a, name in enumerate(CANONICAL):
@@ -386,7 +396,7 @@ def _parts(scored: list[Candidates], setting: Setting, first: Sequence[int]) -> 
 
 
 def placement_task(contender: Contender, setting: Setting) -> Outcome | None:
-    """T3b."""
+    """Measure T3b."""
     if contender.placement is None:
         return None
     scenes = setting.some(related=True)

@@ -1,9 +1,8 @@
-"""The figures of one contender, per source and pooled, stored so that they can be resumed.
+"""Metrics of one contender by source and pooled, stored in files that a later run can continue.
 
-One `SourceReport` is one model, training seed and source. `measure` fills the file of one, task by
-task; what the file holds already is not computed again. Metrics are stored with what they were made
-of, so that reports can be pooled over sources and compared by paired resampling of scenes without
-the models.
+A `SourceReport` holds the results of one model, training seed and source. `measure` fills its file
+task by task and skips stored tasks. Metrics are stored with their values per scene. So reports can
+be pooled over sources, and compared by paired resampling, without the models.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from training.evaluation.metrics import Figure, Macro, Metric, Ratio, Resampled,
 from training.evaluation.setting import Contender, Outcome, Setting
 from training.evaluation.tasks import EVERY_TASK, ONCE, TASKS, WHOLE_SET
 
-# Scenes of a source where a task is slow; and where the machine has no closed form and draws too.
+# Maximum scenes of a source for slow tasks; the second limit is for machines that sample answers.
 _LIMIT = 200
 _LIMIT_OF_DRAWS = 20
 
@@ -36,12 +35,12 @@ Progress = Callable[[str], None]
 
 
 def silent(_: str) -> None:
-    """Progress that nobody hears of."""
+    """Ignore progress messages."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One figure: task and source as in the evaluation's tables."""
+    """One table entry with its interval."""
 
     task: str
     source: str
@@ -51,13 +50,13 @@ class Row:
 
 @dataclass
 class SourceReport:
-    """What is known of one contender on one source.
+    """Results of one contender on one source.
 
     Attributes:
-        source: its name, or what the pool of several is called.
-        scenes: digest of the scenes that were asked about, the questions' seed and their limit.
-        outcomes: by task; None where the contender does not take part.
-        seconds: by task.
+        source: name of the source or of the pool.
+        scenes: digest of the scenes, the question seed and the limit.
+        outcomes: outcome by task; None if the contender does not support the task.
+        seconds: wall time by task.
     """
 
     source: str
@@ -66,7 +65,7 @@ class SourceReport:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; figures are written beside the metrics for whoever reads the file."""
+        """Return a JSON-serialisable dictionary; it contains intervals for human readers too."""
         return {
             "source": self.source,
             "scenes": self.scenes,
@@ -78,7 +77,7 @@ class SourceReport:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> SourceReport:
-        """What `to_dict` wrote."""
+        """Create a report from the output of `to_dict`."""
         tasks = values["tasks"].items()
         return cls(
             values["source"],
@@ -89,7 +88,7 @@ class SourceReport:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Replace a file as a whole: an interrupted run leaves the earlier one."""
+    """Replace a file atomically; an interrupted run keeps the earlier file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".part")
     draft.write_text(text, encoding="utf-8")
@@ -97,7 +96,7 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def by_source(scenes: SceneTensors) -> Iterator[tuple[str, SceneTensors]]:
-    """The scenes of each source."""
+    """Iterate over the sources and their scenes."""
     for source in sorted({scene.source for scene in scenes.scenes}):
         index = [k for k, scene in enumerate(scenes.scenes) if scene.source == source]
         yield source, subset(scenes, torch.tensor(index))
@@ -112,14 +111,14 @@ def settings_by_source(
     limit: int | None = 600,
     seed: int = 0,
 ) -> Iterator[tuple[str, Setting]]:
-    """The settings of each source, with the training scenes of the same one."""
+    """Iterate over the sources and their settings, with training scenes of the same source."""
     training = dict(by_source(train))
     for source, some in by_source(scenes):
         yield source, Setting(some, structure, training.get(source), seen, limit, seed)
 
 
 def digest(setting: Setting) -> str:
-    """sha256 of what is asked: scenes, limit, seed and facts."""
+    """Return the sha256 of the questions: scene ids, limit, seed and facts."""
     names = [f"{scene.source} {scene.scene_id}" for scene in setting.scenes.scenes]
     facts = [] if setting.everyday is None else [f"facts {facts_digest(setting.everyday)}"]
     asked = "\n".join([*names, f"limit {setting.limit}", f"seed {setting.seed}", *facts])
@@ -134,16 +133,16 @@ def run(
     tasks: Iterable[str] = tuple(TASKS),
     progress: Progress = silent,
 ) -> Iterator[str]:
-    """Fill in the tasks that a report lacks; yields each one's name when it is there.
+    """Measure the tasks that a report lacks; yield the name of each finished task.
 
     Raises:
-        ValueError: an unknown task, or the report is of other scenes or questions.
+        ValueError: a task is unknown, or the report belongs to other scenes or questions.
     """
     if report.scenes != digest(setting):
-        raise ValueError(f"the report on {report.source} is of other scenes or questions")
+        raise ValueError(f"the report on {report.source} belongs to other scenes or questions")
     wanted = list(tasks)
     if unknown := sorted(set(wanted) - set(EVERY_TASK)):
-        raise ValueError(f"unknown tasks {unknown}, must be of {list(EVERY_TASK)}")
+        raise ValueError(f"unknown tasks {unknown}: must be among {list(EVERY_TASK)}")
     for task in wanted:
         if task in report.outcomes:
             continue
@@ -163,7 +162,7 @@ def measure(
     tasks: Iterable[str] = tuple(TASKS),
     progress: Progress = silent,
 ) -> SourceReport:
-    """The report in the file at `path`, which is made or gone on with; written after every task.
+    """Create or continue the report in the file at `path`; write it after every task.
 
     Raises:
         ValueError: see `run`.
@@ -177,9 +176,9 @@ def measure(
 
 
 def pooled(reports: Sequence[SourceReport], source: str = "pooled") -> SourceReport:
-    """One report over the scenes of several sources; the order of the reports is theirs.
+    """Pool the reports of several sources into one report.
 
-    Metrics of whole sets (T4) do not pool: `measure` the union of the scenes for these.
+    Metrics of whole sets (T4) cannot be pooled: `measure` them on the union of the scenes.
     """
     together = sha256("\n".join(report.scenes for report in reports).encode()).hexdigest()
     joined = SourceReport(source, together)
@@ -209,16 +208,16 @@ def evaluate(
     everyday: Path | None = None,
     progress: Progress = silent,
 ) -> list[Row]:
-    """What is published with a model, of every source of a set of scenes.
+    """Measure the published metrics of a model for every source of a set of scenes.
 
-    Generation, whose metrics are of a whole set, is measured on all sources together.
+    Generation has metrics of whole sets and is measured on all sources together.
 
     Args:
-        artifact: as it is published, with its calibration.
+        artifact: the model as published, with its calibration.
         structure: (V,) bool.
-        train: training scenes, which generation must not copy, and which say what is typical.
-        limit: at most so many scenes of a source where a task is slow, see `Setting`; by default
-            fewer for a machine that draws its answers.
+        train: training scenes, for copies in generated scenes and for typical classes.
+        limit: maximum number of scenes of a source for slow tasks, see `Setting`. The default is
+            lower for a machine with sampled answers.
         everyday: folder of the everyday facts, see `Setting`.
     """
     if limit is None:
@@ -254,7 +253,7 @@ def _published(
         for task, outcome in report.outcomes.items()
         if outcome is not None
         for name in EVERY_TASK[task].card
-        # Not every source has every question: some list no relations.
+        # Some sources lack the data for a question, such as listed relations.
         if name in outcome.metrics
     ]
 
@@ -289,10 +288,10 @@ def _from_dict(values: dict[str, Any] | None) -> Outcome | None:
 
 
 def pool(parts: Sequence[Metric]) -> Metric | None:
-    """One metric over the scenes of all parts; None for metrics of whole sets.
+    """Pool metrics of the same kind over all scenes; None for metrics of whole sets.
 
     Raises:
-        ValueError: no parts, or parts of different kinds.
+        ValueError: there are no parts, or the parts have different kinds.
     """
     kinds = {(type(part), getattr(part, "statistic", "")) for part in parts}
     if len(kinds) != 1:
@@ -310,17 +309,17 @@ _TYPES: dict[str, type] = {"scene": np.int64, "group": np.int64, "truth": np.boo
 
 
 def metric_to_dict(metric: Metric) -> dict[str, Any]:
-    """JSON-able values, floats to nine significant digits."""
+    """Return JSON-serialisable values; floats have nine significant digits."""
     kind = next(name for name, cls in _KINDS.items() if type(metric) is cls)
     names = [field.name for field in fields(_KINDS[kind])]
     return {"kind": kind} | {name: _plain(getattr(metric, name)) for name in names}
 
 
 def metric_from_dict(values: dict[str, Any]) -> Metric:
-    """What `metric_to_dict` wrote.
+    """Create a metric from the output of `metric_to_dict`.
 
     Raises:
-        ValueError: not one of its kinds.
+        ValueError: unknown kind of metric.
     """
     rest = dict(values)
     kind = rest.pop("kind", None)
@@ -333,7 +332,7 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
 def _array(name: str, value: Any) -> Any:
     if not isinstance(value, list):
         return value
-    # JSON has no nan; a resample without a value is null.
+    # JSON has no NaN: null marks an undefined resample.
     values = [float("nan") if x is None else x for x in value]
     return np.array(values, dtype=_TYPES.get(name, np.float64))
 

@@ -1,17 +1,18 @@
-"""The seed paper's own protocol: every question answered by one stochastic reconstruction.
+"""Protocol of the seed paper: one stochastic reconstruction answers each question.
 
-The hidden layers are drawn once (h1 from its mean-field field, exact with one layer) and the units
-asked about once given h1. No ranking, no threshold: a coin flip is the answer. The figures say how
-a model does on the paper's terms; they are reported for that alone, for they leak and reward
-switching much on:
+The hidden layers are sampled once. h1 is drawn from its mean field, which is exact with one layer.
+Then the queried units are sampled once given h1. The protocol uses no ranking or threshold; a
+random sample is the answer. The metrics serve comparison with the paper only, because they leak
+information and reward switching many units on:
 
-    T1  share of labelled relations that are switched on, all objects given. Nothing is charged for
-        units that are switched on beside them, hence their number.
-    T2  share of removed objects that are switched on again. As published the object's relations
-        stay on: in a gated machine they hold it, so that the answer is given away; elsewhere they
-        tell the context, and the GBM's two-way weights the object. Once more with them deleted.
+    T1  share of labelled relations that are switched on, given all objects. Other switched-on
+        units cost nothing, so their number is reported too
+    T2  share of removed objects that are switched on again. As published, the relations of the
+        object stay on. In a gated machine they force the object on; in other machines they inform
+        the hidden layer, and the two-way weights of the GBM also raise the object. A second
+        variant deletes these relations
     T3  mean over classes of |reconstruction - scene| after a class was added. A model that returns
-        what it was given is wrong in one class out of V: it scores 1/V.
+        its input is wrong in one of V classes and scores 1/V
 
 The split is random by scene, so near-duplicates of test scenes are in the training part.
 
@@ -45,13 +46,13 @@ PAPER: dict[str, dict[str, float]] = {
     },
     "T3 error measure": {"RBM": 0.6446, "GBM": 0.1404, "Triway": 0.0789, "doing nothing": 1 / 417},
 }
-"""What the paper reports, on its own data."""
+"""Results of the paper on its own data."""
 
 _BLOCK = 32
 
 
 def relations_switched_on(contender: Contender, setting: Setting) -> Outcome | None:
-    """T1: relations start unobserved, and are drawn once."""
+    """Measure T1: relations are unobserved and sampled once."""
     if contender.machine is None:
         return None
     scenes = setting.some(related=True)
@@ -73,7 +74,7 @@ def relations_switched_on(contender: Contender, setting: Setting) -> Outcome | N
 
 
 def removed_switched_on(contender: Contender, setting: Setting) -> Outcome | None:
-    """T2: one class of each scene, drawn at random, is removed and its unit drawn again."""
+    """Measure T2: remove one random class of each scene and sample its unit again."""
     if contender.machine is None:
         return None
     scenes = setting.some(related=True)
@@ -99,7 +100,7 @@ def removed_switched_on(contender: Contender, setting: Setting) -> Outcome | Non
 
 
 def reconstruction_after_addition(contender: Contender, setting: Setting) -> Outcome | None:
-    """T3: all objects drawn again after one absent class was added; relations unobserved."""
+    """Measure T3: add an absent class and sample all objects again, relations unobserved."""
     if contender.machine is None:
         return None
     machine, scenes = contender.machine, setting.some()
@@ -132,9 +133,12 @@ def reconstruction_after_addition(contender: Contender, setting: Setting) -> Out
 def draw_relations(
     machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """One draw of all relations given the objects: units on (B,), and those between (B, A, n, n).
+    """Sample all relations once given the objects.
 
-    Units of absent objects, which machines without gates switch on as well, count in the first.
+    Returns:
+        The number of units that are on (B,), and the relations between present classes
+        (B, A, n, n). Machines without gates also switch on units of absent objects; only the first
+        value counts these.
     """
     h1 = _draw_h1(machine, Evidence(batch.v), generator)
     edges = machine.edges(batch.classes, batch.counts)
@@ -151,11 +155,11 @@ def switch_on_probability(
     left_on: bool,
     generator: torch.Generator,
 ) -> Tensor:
-    """p(v_i = 1 | one draw of h1, relations), (B,), of a class i that was removed from each scene.
+    """Return p(v_i = 1 | one sample of h1, relations), (B,), for the removed class i of each scene.
 
     Args:
-        target: (B,) int64.
-        left_on: the relations of i stay as annotated; otherwise they are unobserved.
+        target: (B,) int64, the removed classes.
+        left_on: keep the relations of i as annotated; otherwise they are unobserved.
     """
     place = target.unsqueeze(1)
     absent, there = batch.v.scatter(1, place, 0.0), batch.v.scatter(1, place, 1.0)
@@ -168,7 +172,7 @@ def switch_on_probability(
     for v, sign in ((there, 1.0), (absent, -1.0)):
         logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
         logit = logit + sign * machine.relation_term(logits, gate, r, observed).sum(-1)
-    # A relation that is on and may be on with i alone leaves i no choice.
+    # A relation that is on and requires i forces i on.
     held = (observed * r > machine.gate(edges, absent)).any(-1)
     return torch.where(held, torch.inf, logit).sigmoid()
 
@@ -179,13 +183,13 @@ def _draw_h1(machine: BoltzmannMachine, evidence: Evidence, generator: torch.Gen
 
 
 def _touches(edges: Edges, target: Tensor) -> Tensor:
-    """(B, E) bool: units that the class has to do with."""
+    """Return a mask (B, E) of the relation units of the class."""
     i = target.unsqueeze(1)
     return ((edges.subject == i) | (edges.object == i)) & edges.valid
 
 
 def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
-    """A removable class of each scene, (N,); -1 where it has fewer than two."""
+    """Draw a removable class of each scene, (N,); -1 for scenes with fewer than two."""
     found = torch.full((len(scenes),), -1, dtype=torch.int64)
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
@@ -196,7 +200,7 @@ def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
 
 
 def _blocks(scenes: SceneTensors, seed: int) -> Iterator[tuple[Tensor, Batch, torch.Generator]]:
-    """(positions, batch, random numbers) block by block."""
+    """Iterate over (positions, batch, random generator) in blocks."""
     generator = torch.Generator().manual_seed(seed)
     for index in torch.arange(len(scenes)).split(_BLOCK):
         yield index, scenes.batch(index), generator

@@ -1,4 +1,4 @@
-"""What is evaluated, what it is asked about, and what comes of it."""
+"""Inputs and results of an evaluation task: contender, setting and outcome."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """One row of the tables: a callable for each task; None where it does not take part.
+    """One row of the tables: a callable per task; None if the row does not support the task.
 
     Attributes:
-        objects: T2 and T3.
-        relations: T1a.
-        completion: T1b; gets the given triples as the batch's relations.
-        placed: T2-at.
-        placement: T3b; gets the triples, a false one among them, as the batch's relations.
-        sampler: T4.
-        density: Density; called once, when it is needed.
-        alarm: T3, the share of untouched scenes that raise one.
-        artifact: Calibration, and all that is asked as a robot asks.
-        objects_in_rooms: T2 where the room type is given.
-        machine: the seed protocol, which samples.
-        parameters: number of trained weights, None where that says nothing.
+        objects: score of T2 and T3.
+        relations: score of T1a.
+        completion: score of T1b; the batch observes the given triples.
+        placed: score of T2-at.
+        placement: score of T3b; the batch observes all triples, one of them false.
+        sampler: sampler of T4.
+        density: density, computed at its first use.
+        alarm: alarm of T3.
+        artifact: model for Calibration and for all questions to the service.
+        objects_in_rooms: score of T2 with the room type given.
+        machine: machine for the seed protocol.
+        parameters: number of trained weights, or None if this number is not meaningful.
     """
 
     objects: ObjectScore | None = None
@@ -60,18 +60,17 @@ class Contender:
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What a contender is asked about.
+    """The questions of an evaluation.
 
     Attributes:
         scenes: held-out scenes.
-        structure: (V,) bool.
-        train: training scenes of the same source or sources; tasks that need them are left out
-            where there are none.
-        seen: (T, 3), the triples that the contender may have learnt from.
-        limit: at most so many scenes where a task is slow: all but T1a, T1b and T2; a third of it
-            where a scene costs most: T2-at and Calibration.
-        seed: of the questions.
-        everyday: folder of the everyday facts; they are left out where it is None or absent.
+        structure: (V,) bool, True for structure classes.
+        train: training scenes of the same sources. If None, tasks that need them are left out.
+        seen: (T, 3) triples that the contender may have learnt from.
+        limit: maximum number of scenes for slow tasks, which are all but T1a, T1b and T2. The
+            slowest tasks, T2-at and Calibration, use a third of the limit.
+        seed: random seed of the questions.
+        everyday: folder of the everyday facts; None leaves them out.
     """
 
     scenes: SceneTensors
@@ -83,7 +82,7 @@ class Setting:
     everyday: Path | None = None
 
     def some(self, related: bool = False, *, share: int = 1) -> SceneTensors:
-        """At most `limit` / `share` scenes, only annotated ones if `related`."""
+        """Return at most `limit` / `share` scenes; with `related`, only scenes with relations."""
         scenes = self.scenes
         if related:
             kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.any()]
@@ -92,12 +91,12 @@ class Setting:
         return some_scenes(scenes, most, self.seed)
 
     def at(self, index: Tensor) -> Setting:
-        """Of the scenes at the given positions alone."""
+        """Return the setting with only the scenes at the given positions."""
         return replace(self, scenes=subset(self.scenes, index))
 
     @cached_property
     def complete(self) -> Setting:
-        """The scenes with complete object lists: in others, unlisted objects may be there."""
+        """The scenes with complete object lists; in other scenes unlisted objects may exist."""
         train = None if self.train is None else _complete(self.train)
         return replace(self, scenes=_complete(self.scenes), train=train if train else None)
 
@@ -113,9 +112,9 @@ class Outcome:
     """Metrics of one task.
 
     Attributes:
-        metrics: name to metric, the primary one first.
-        scenes, skipped: how many were asked about, and how many of them could not be scored.
-        notes: what has to be said beside the figures, such as a bandwidth.
+        metrics: metrics by name; the primary metric comes first.
+        scenes, skipped: number of scenes, and number of scenes that could not be scored.
+        notes: additional values, such as a bandwidth.
     """
 
     metrics: dict[str, Metric]

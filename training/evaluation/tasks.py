@@ -1,6 +1,6 @@
-"""The tasks of the evaluation's tables: a contender and a set of scenes to metrics.
+"""The tasks of the evaluation: functions from a contender and a setting to metrics.
 
-A task that the contender does not take part in, or for which the scenes hold nothing, is None.
+A task returns None if the contender does not support it or the scenes lack the required data.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class Task:
     """One task.
 
     Attributes:
-        ask: the task itself.
-        shown: the metrics of the Markdown tables; the JSON holds every one.
-        card: the metrics of a model card.
-        of_objects: it sees scenes with complete object lists alone.
+        ask: function that measures the task.
+        shown: metrics of the Markdown tables; the JSON file holds all metrics.
+        card: metrics of a model card.
+        of_objects: use only scenes with complete object lists.
     """
 
     ask: Callable[[Contender, Setting], Outcome | None]
@@ -57,7 +57,7 @@ class Task:
     of_objects: bool = False
 
     def __call__(self, contender: Contender, setting: Setting) -> Outcome | None:
-        """The outcome; None where there is nothing to ask."""
+        """Return the outcome, or None if the task has no scenes."""
         if self.of_objects:
             setting = setting.complete
             if not len(setting.scenes):
@@ -74,7 +74,7 @@ def _objects(
 
 
 def _each(names: tuple[str, ...], kinds: tuple[str, ...]) -> tuple[str, ...]:
-    """Metrics of all kinds, name by name."""
+    """Combine all names with all kinds."""
     return tuple(f"{name}, {kind}" for name in names for kind in kinds)
 
 
@@ -175,16 +175,16 @@ SEED_TASKS: dict[str, Task] = {
         reconstruction_after_addition, shown=("error measure", "error measure, doing nothing")
     ),
 }
-"""The seed paper's protocol, with tables of its own."""
+"""The protocol of the seed paper; it has separate tables."""
 
-# All machines that were trained on the same scenes have the same offsets: no table compares them.
+# Machines trained on the same scenes have the same offsets, so no table compares the offsets.
 EVERY_TASK = TASKS | SEED_TASKS | {"Offsets": Task(offsets_task, card=METRICS)}
 
 ONCE = ("Everyday",)
-"""Tasks that do not depend on the scenes: measured on the set of all sources alone."""
+"""Tasks that do not depend on the scenes; they are measured once, on the set of all sources."""
 
 WHOLE_SET = ("T4 generate", *ONCE)
-"""Tasks whose metrics are of a set of scenes as a whole: of several sources they are measured anew.
+"""Tasks with metrics of a whole set of scenes: they are measured again on all sources together.
 
-The others' are pooled from what was found of each source.
+Other tasks are pooled from the results of each source.
 """

@@ -1,4 +1,4 @@
-"""`python -m training ablate`: a configuration, and the same with one thing changed."""
+"""`python -m training ablate`: compare a configuration with variants that change one thing."""
 
 from __future__ import annotations
 
@@ -37,33 +37,37 @@ PRIMARY: dict[str, tuple[str, ...]] = {
     "T2-at missing at a place": ("MRR",),
     "T3 outliers, uniform": ("hit@1", "AUROC"),
 }
-"""What is compared; the reports hold every metric of these tasks."""
+"""Metrics to compare; the reports hold all metrics of these tasks."""
 
 console = Console()
 
 
 def ablate(
-    configuration: Annotated[str, typer.Argument(help="the full model's configuration")],
+    configuration: Annotated[str, typer.Argument(help="configuration of the full model")],
     rows: Annotated[
-        Path | None, typer.Option(help="the rows; by default the shipped ones of its name")
+        Path | None, typer.Option(help="TOML file of the rows; by default the shipped file")
     ] = None,
-    row: Annotated[list[str] | None, typer.Option(help="only these, and the full model")] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="training seeds of every row")] = 1,
-    limit: Annotated[int | None, typer.Option(min=10, help="scenes a source")] = None,
-    asked: Annotated[int, typer.Option(min=1, help="scenes a source where a task is slow")] = 300,
-    epochs: Annotated[int | None, typer.Option(min=1, help="at most, for every row")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="processes, of one thread each")] = 2,
+    row: Annotated[
+        list[str] | None, typer.Option(help="train only these rows and the full model")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="number of training seeds per row")] = 1,
+    limit: Annotated[int | None, typer.Option(min=10, help="maximum scenes of a source")] = None,
+    asked: Annotated[
+        int, typer.Option(min=1, help="maximum scenes of a source for slow tasks")
+    ] = 300,
+    epochs: Annotated[int | None, typer.Option(min=1, help="maximum epochs of a row")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
-    folder: Annotated[Path, typer.Option("--folder", help="for runs and results")] = Path(
+    folder: Annotated[Path, typer.Option("--folder", help="folder for runs and results")] = Path(
         "runs/ablation"
     ),
-    fresh: Annotated[bool, typer.Option("--fresh", help="forget earlier runs")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier runs")] = False,
 ) -> None:
     """Train the full model and each of its ablations, and compare them on the same scenes.
 
-    Writes results.json and results.md into <folder>/<configuration>. A row that diverges is
-    reported and left out. Ctrl-C loses at most an epoch or a task; the same command goes on from
-    there.
+    The command writes results.json and results.md into <folder>/<configuration>. A row that
+    diverges is reported and left out. After Ctrl-C, the same command continues; at most one epoch
+    or task is lost.
     """
     with resumable(console):
         configs = _configs(configuration, rows, row, limit, epochs)
@@ -98,12 +102,12 @@ def ablate(
             ([c.name, c.description, f"{seconds.get(c.name, 0):.0f}"] for c in configs),
         ),
         results.markdown(PRIMARY, changes=True),
-        *(f"- {row} was not measured: {why}" for row, why in failures.items()),
+        *(f"- {row} could not be measured: {why}" for row, why in failures.items()),
     ]
     text = "\n\n".join(parts).rstrip() + "\n"
     write(place, results.to_dict() | {"failures": failures}, text)
     console.print(text, markup=False, soft_wrap=True)
-    console.print(f"every figure: {place / 'results.json'}")
+    console.print(f"all results: {place / 'results.json'}")
 
 
 def _configs(
@@ -113,10 +117,10 @@ def _configs(
     limit: int | None,
     epochs: int | None,
 ) -> list[Config]:
-    """The full model and the rows, within the limits.
+    """Return the full model and the selected rows, with the given limits.
 
     Raises:
-        ConfigError: see `load_rows`; no rows come with the configuration; an unknown row.
+        ConfigError: invalid rows, see `load_rows`; no shipped rows; an unknown row.
     """
     full = load_config(reference)
     if limit is not None:
@@ -124,12 +128,12 @@ def _configs(
     shipped = shipped_ablations()
     if path is None and full.name not in shipped:
         raise ConfigError(
-            f"no ablation comes with {full.name}, only with {', '.join(shipped)}: name a TOML "
-            "file with --rows"
+            f"no shipped ablation of {full.name}, only of {', '.join(shipped)}: name a TOML file "
+            "with --rows"
         )
     found = load_rows(path or shipped[full.name], full)
     if unknown := sorted(set(names or ()) - {config.name for config in found}):
-        raise ConfigError(f"no rows {unknown}, only {', '.join(c.name for c in found)}")
+        raise ConfigError(f"unknown rows {unknown}: must be {', '.join(c.name for c in found)}")
     chosen = [full, *(config for config in found if not names or config.name in names)]
     if epochs is None:
         return chosen
@@ -140,7 +144,7 @@ def _configs(
 
 
 def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
-    """The scenes of each source, of both parts; at most `limit` where a task is slow."""
+    """Return the settings of each source and part; `limit` bounds the scenes of slow tasks."""
     seen = seen_triples(scenes.train.scenes, scenes.train.v.shape[1])
     parts = {"validation": scenes.validation, "test": scenes.test}
     return {
@@ -153,7 +157,7 @@ def _settings(scenes: TrainingData, limit: int) -> dict[str, Setting]:
 
 
 def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
-    """The metrics of `PRIMARY`, pools first."""
+    """Return the metrics of `PRIMARY`, pooled reports first."""
     pools = {
         f"{part} pooled": pooled(
             [report for name, report in reports.items() if name.startswith(part)], f"{part} pooled"
@@ -166,7 +170,7 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
 def _costs(
     folder: Path, configs: Sequence[Config], seeds: int
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Number of trained weights by row, without those fixed at zero, and mean seconds."""
+    """Return trained weights by row, without weights fixed at zero, and mean training seconds."""
     weights, seconds = {}, {}
     for config in configs:
         places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]
@@ -200,24 +204,24 @@ class _File(BaseModel):
 
 
 def shipped_ablations() -> dict[str, Path]:
-    """The ablations that come with the package, by the name of the full model."""
+    """Return the shipped ablation files by the name of the full model."""
     folder = Path(__file__).parents[1] / "configs/ablations"
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def load_rows(path: Path, full: Config) -> list[Config]:
-    """The ablation configurations of a file, with the scenes of the full model.
+    """Read the ablation configurations of a file; they use the scenes of the full model.
 
-    The name of each is its row's, the description says what it changes.
+    A configuration has the name of its row; its description states the change.
 
     Raises:
-        ConfigError: no such file, not TOML, a setting that does not exist or fit, a name twice, or
-            a row that changes nothing.
+        ConfigError: the file is missing or not TOML, a setting is unknown or invalid, a name occurs
+            twice, or a row has no effect.
     """
     try:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
-        raise ConfigError(f"no ablation {path}") from error
+        raise ConfigError(f"ablation file {path} does not exist") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not TOML: {error}") from error
     except ValidationError as error:
@@ -227,7 +231,7 @@ def load_rows(path: Path, full: Config) -> list[Config]:
     configs: dict[str, Config] = {}
     for row in file.row:
         if row.name in configs or row.name == full.name:
-            raise ConfigError(f"{path.name}: two rows are called {row.name}")
+            raise ConfigError(f"{path.name}: two rows have the name {row.name}")
         configs[row.name] = _config(row, full, path.name)
     return list(configs.values())
 
@@ -237,7 +241,7 @@ def _config(row: _Change, full: Config, file: str) -> Config:
         start = load_config(row.start) if row.start else full
         changed = with_settings(start, row.changes).model_copy(update={"data": full.data})
         if changed == full:
-            raise ConfigError(f"it changes nothing in {full.name}")
+            raise ConfigError(f"the row does not change {full.name}")
         values = changed.model_dump() | {"name": row.name, "description": row.what}
         return Config.model_validate(values)
     except ConfigError as error:

@@ -1,8 +1,8 @@
-"""`python -m training benchmark`: baselines and machines on the same scenes, resumed where stopped.
+"""`python -m training benchmark`: compare baselines and machines on the same scenes, resumable.
 
 <folder>/<domain>/results.*                  the tables
-<folder>/<domain>/seed-protocol/results.*    the seed paper's protocol
-<folder>/<domain>/shuffled/<task>/results.*  rows trained on shuffled scenes, asked about real ones
+<folder>/<domain>/seed-protocol/results.*    the protocol of the seed paper
+<folder>/<domain>/shuffled/<task>/results.*  rows trained on shuffled scenes, tested on real scenes
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ from training.experiments.rows import (
 from training.pipeline import SplitScenes, prepare
 
 DOMAINS = ("indoor", "everyday")
-"""Measured when no configuration is given."""
+"""Domains to measure without given configurations."""
 
 YARDSTICKS = {
     "T1a relations": ("relation popularity", "R-precision, distinct classes"),
@@ -68,12 +68,12 @@ YARDSTICKS = {
     "T2 partial": ("popularity", "MRR, 50 %"),
     "T3 signature": ("popularity", "hit@1"),
 }
-"""The tasks on shuffled scenes: the row that all others must fall to, and its metric."""
+"""Tasks on shuffled scenes: the baseline that no other row should exceed, and the metric."""
 
 _RELATION_TASKS = ("T1a relations", "T1 pairs")
-# Log Z by annealing takes a while however few the scenes are.
+# Annealing for log Z is slow for any number of scenes.
 _SLOW_TASKS = ("Density",)
-# A quick run shows that everything works; its figures mean nothing.
+# Settings of a quick run, which only tests the command; its results are meaningless.
 _QUICK_SCENES = 150
 _QUICK_EPOCHS = 2
 _QUICK_LIMIT = 30
@@ -90,11 +90,11 @@ console = Console()
 
 @dataclass(frozen=True)
 class Domain:
-    """Configurations of one data section.
+    """Configurations with the same data section.
 
     Attributes:
-        name: that of its first configuration, less its last word.
-        configs: the first is compared with all other rows.
+        name: name of the first configuration without its last word.
+        configs: the configurations; all rows are compared with the first.
     """
 
     name: str
@@ -102,37 +102,37 @@ class Domain:
 
     @property
     def leaks(self) -> bool:
-        """Scenes of one group are in several parts: near-duplicates of test scenes are learnt."""
+        """True if a group may be in several parts, so near-duplicates of test scenes are learnt."""
         return self.configs[0].data.split == "random"
 
     def require_groups(self) -> None:
-        """In tables that rank rows no group of scenes may be in two parts.
+        """Check that each group is in one part, as tables that rank rows require.
 
         Raises:
-            ConfigError: the domain splits its scenes otherwise.
+            ConfigError: the domain uses a random split.
         """
         if self.leaks:
             names = ", ".join(config.name for config in self.configs)
             raise ConfigError(
                 f'{names}: data.split = "random" leaves near-duplicates of test scenes in the '
-                'training part; tables and shuffled scenes need "group". --seed-protocol asks such '
-                "a configuration, without tables"
+                'training part; tables and shuffled scenes need "group". Use --seed-protocol for '
+                "such a configuration"
             )
 
 
 @dataclass(frozen=True)
 class Options:
-    """The command's options.
+    """Options of the command.
 
     Attributes:
         root: folder with the scene files.
         tasks: names in `TASKS`.
-        seeds: training seeds of every row whose training is random.
-        baselines: only these; all for None.
-        limit: scenes a source where a task is slow.
-        workers: processes.
-        quick: few scenes, epochs and baselines.
-        fresh: earlier reports are removed.
+        seeds: number of training seeds for rows with random training.
+        baselines: baselines to measure; None means all.
+        limit: maximum scenes of a source for slow tasks.
+        workers: number of processes.
+        quick: use few scenes, epochs and baselines.
+        fresh: delete earlier reports.
     """
 
     root: Path
@@ -145,7 +145,7 @@ class Options:
     fresh: bool = False
 
     def configs(self, domain: Domain, seed: int) -> list[Config]:
-        """The domain's configurations as they are trained for one seed."""
+        """Return the configurations of the domain for one training seed."""
         most = _QUICK_EPOCHS if self.quick else None
         return [
             with_settings(
@@ -159,7 +159,7 @@ class Options:
         ]
 
     def scenes(self, domain: Domain, **changes: Any) -> SplitScenes:
-        """The domain's scenes."""
+        """Return the scenes of the domain."""
         data: DataConfig = domain.configs[0].data.model_copy(update=changes)
         if self.quick:
             few = min(data.limit or _QUICK_SCENES, _QUICK_SCENES)
@@ -171,37 +171,41 @@ def benchmark(
     machines: Annotated[
         list[str] | None,
         typer.Argument(
-            help="configurations; those of one data section are measured together, the first of "
-            "them compared with all other rows. By default the indoor and the everyday machines."
+            help="configurations; those with the same data section are measured together, and all "
+            "rows are compared with the first. Default: the indoor and everyday machines."
         ),
     ] = None,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
-    folder: Annotated[Path, typer.Option("--folder", help="for reports and results")] = Path(
+    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
         "runs/benchmark"
     ),
-    seeds: Annotated[int, typer.Option(min=1, help="training seeds, where they matter")] = 3,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="training seeds, for rows with random training")
+    ] = 3,
     baseline: Annotated[
-        list[str] | None, typer.Option(help="only these baselines; none for no baseline")
+        list[str] | None, typer.Option(help="measure only these baselines; 'none' for no baseline")
     ] = None,
     task: Annotated[
-        list[str] | None, typer.Option(help="only these tasks, by name or its beginning: T2, T3")
+        list[str] | None, typer.Option(help="measure only these tasks, by name or prefix: T2, T3")
     ] = None,
-    limit: Annotated[int, typer.Option(min=1, help="scenes a source where a task is slow")] = 300,
-    workers: Annotated[int, typer.Option(min=1, help="processes, of one thread each")] = 2,
+    limit: Annotated[
+        int, typer.Option(min=1, help="maximum scenes of a source for slow tasks")
+    ] = 300,
+    workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
     seed_protocol: Annotated[
-        bool, typer.Option("--seed-protocol", help="the seed paper's protocol as well")
+        bool, typer.Option("--seed-protocol", help="also run the protocol of the seed paper")
     ] = False,
     shuffled: Annotated[
-        bool, typer.Option("--shuffled", help="the same rows trained on shuffled scenes as well")
+        bool, typer.Option("--shuffled", help="also train the rows on shuffled scenes")
     ] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="a small run, to see it work")] = False,
-    fresh: Annotated[bool, typer.Option("--fresh", help="forget earlier reports")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="small run to test the command")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier reports")] = False,
 ) -> None:
     """Train every baseline and machine on the same groups and evaluate all on the same scenes.
 
-    Writes results.json, results.md and plots into a folder for each domain; the seed protocol and
-    the shuffled scenes have folders of their own there. Ctrl-C loses at most the task at hand; the
-    same command goes on from there.
+    The command writes results.json, results.md and plots into one folder per domain. The seed
+    protocol and the shuffled scenes have subfolders there. After Ctrl-C, the same command
+    continues; at most the current task is lost.
     """
     with resumable(console, ValueError, FloatingPointError):
         wanted = None if baseline is None else tuple(b for b in baseline if b != "none")
@@ -218,39 +222,40 @@ def benchmark(
             fresh=fresh,
         )
         if shuffled:
-            shuffled_tasks(options.tasks)  # a request that fails, fails before hours of training
+            shuffled_tasks(options.tasks)  # report invalid tasks before hours of training
         for domain in domains:
             if shuffled or not seed_protocol:
                 domain.require_groups()
         for domain in domains:
             place = folder / domain.name
-            # The seed protocol is all that may be asked of a random split.
+            # A random split allows the seed protocol only.
             if not domain.leaks:
                 compare_domain(domain, place, options)
             if seed_protocol:
                 compare_by_seed_protocol(domain, place / "seed-protocol", options)
             if shuffled:
                 compare_on_shuffled(domain, place / "shuffled", options)
-            console.print(f"every figure: {place}/**/results.json; plots beside it")
+            console.print(f"all results: {place}/**/results.json, with plots beside them")
 
 
 def default_configs() -> list[str]:
-    """The shipped configurations of `DOMAINS`, the Triway machine of each first."""
+    """Return the shipped configurations of `DOMAINS`; the Triway machine of each comes first."""
     names = [f"{domain}-{variant}" for domain in DOMAINS for variant in ("triway", "gbm", "rbm")]
     return [name for name in names if name in shipped_configs()]
 
 
 def read_domains(references: Sequence[str]) -> list[Domain]:
-    """The domains of some configurations, in the order in which they are first named.
+    """Group configurations into domains, in the order of the first configuration of each.
 
     Raises:
-        ConfigError: a configuration cannot be read, two have one name, or two domains would.
+        ConfigError: a configuration cannot be read, or two configurations or domains have the same
+            name.
     """
     groups: dict[DataConfig, list[Config]] = {}
     for reference in references:
         config = load_config(reference)
         if any(config.name == other.name for group in groups.values() for other in group):
-            raise ConfigError(f"two configurations are called {config.name}")
+            raise ConfigError(f"two configurations have the name {config.name}")
         groups.setdefault(config.data, []).append(config)
     domains: dict[str, Domain] = {}
     for configs in groups.values():
@@ -258,49 +263,49 @@ def read_domains(references: Sequence[str]) -> list[Domain]:
         if name in domains:
             raise ConfigError(
                 f"{configs[0].name} and {domains[name].configs[0].name} have different data "
-                f"sections, but would both be of the domain {name!r}: rename one"
+                f"sections, but the same domain name {name!r}: rename one of them"
             )
         domains[name] = Domain(name, tuple(configs))
     return list(domains.values())
 
 
 def chosen_tasks(wanted: Sequence[str] | None, quick: bool) -> tuple[str, ...]:
-    """Names in `TASKS`: those wanted, by their names or how these begin; all by default.
+    """Return names in `TASKS` that match a wanted name or prefix; by default all.
 
     Raises:
-        ValueError: a name that no task has or begins with.
+        ValueError: a wanted name matches no task.
     """
     if not wanted:
         return tuple(name for name in TASKS if not quick or name not in _SLOW_TASKS)
     found: set[str] = set()
     for part in wanted:
-        # A task that is named in full is meant alone, though others may begin like it.
+        # A full name selects only that task, even if it is a prefix of other names.
         named = {part} & set(TASKS) or {name for name in TASKS if name.startswith(part)}
         if not named:
-            raise ValueError(f"unknown task {part!r}, must be of {list(TASKS)}")
+            raise ValueError(f"unknown task {part!r}: must match one of {list(TASKS)}")
         found |= named
     return tuple(name for name in TASKS if name in found)
 
 
 def shuffled_tasks(tasks: Sequence[str]) -> tuple[str, ...]:
-    """Those of the tasks that `YARDSTICKS` has.
+    """Select the tasks of `YARDSTICKS`.
 
     Raises:
-        ValueError: there are none.
+        ValueError: all tasks are outside `YARDSTICKS`.
     """
     found = tuple(task for task in YARDSTICKS if task in tasks)
     if not found:
-        raise ValueError(f"on shuffled scenes only {', '.join(YARDSTICKS)} are asked")
+        raise ValueError(f"shuffled scenes support only the tasks {', '.join(YARDSTICKS)}")
     return found
 
 
 def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
-    """Every row of a domain on its test scenes; writes tables and plots into the folder.
+    """Measure every row of a domain on its test scenes; write tables and plots.
 
     Raises:
-        ConfigError: see `Domain.require_groups`; the scenes cannot be found.
-        DatasetError: they cannot be read.
-        BenchmarkError: see `Plan.known`.
+        ConfigError: the split is random, or the scenes cannot be found.
+        DatasetError: the scenes cannot be read.
+        BenchmarkError: the folder holds other reports, see `Plan.known`.
         ValueError: an unknown baseline.
     """
     domain.require_groups()
@@ -320,7 +325,7 @@ def compare_domain(domain: Domain, folder: Path, options: Options) -> Results:
 
 
 def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> Results:
-    """The machines of a domain, trained once on the random split, asked as the seed paper asks."""
+    """Measure the machines of a domain by the seed protocol, trained once on a random split."""
     scenes = options.scenes(domain, split="random")
     plan = _plan(folder, scenes, options, tuple(SEED_TASKS))
     rows = [
@@ -329,21 +334,21 @@ def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> 
     ]
     reports = _measured(plan, rows, options, f"{domain.name}, seed protocol")
     found = summarise(reports, domain.configs[0].name, parameters(folder, rows))
-    # These figures do not rank rows.
+    # The seed protocol does not rank rows.
     results = replace(found, differences=())
     _write(folder, scenes, results.to_dict() | {"paper": PAPER}, _protocol_text(results))
     return results
 
 
 def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[str, Results]:
-    """The control by task: rows that learnt from shuffled scenes, asked about the real test scenes.
+    """Control experiment: rows trained on shuffled scenes, tested on real scenes, by task.
 
-    Baselines are tuned, and epochs chosen, on shuffled validation scenes. One seed of every row.
-    In each task "ours" is the yardstick; it is measured whichever baselines are wanted.
+    Baselines and epochs are also selected on shuffled validation scenes. Each row has one seed. The
+    reference of each task is its yardstick, which is measured even if not selected.
 
     Raises:
-        ConfigError: see `Domain.require_groups`.
-        ValueError: see `shuffled_tasks`; or only relations are asked, and there are none.
+        ConfigError: the split is random, see `Domain.require_groups`.
+        ValueError: invalid tasks, see `shuffled_tasks`, or the scenes lack the relations for them.
     """
     domain.require_groups()
     real = options.scenes(domain)
@@ -353,10 +358,10 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
     if not plan.material.related:
         asked = tuple(task for task in asked if task not in _RELATION_TASKS)
         if not asked:
-            raise ValueError(f"{domain.name} has no relations to shuffle")
+            raise ValueError(f"the scenes of {domain.name} contain no relations to shuffle")
         plan = replace(plan, tasks=asked)
     rows = [machine_row(config, calibrated=False) for config in options.configs(domain, 0)]
-    # A baseline is fitted once, whichever tasks it is asked.
+    # One fit of a baseline serves all its tasks.
     names = [name for name, one in BASELINES.items() if one.scores in (("objects",), RELATIONS)]
     if options.baselines is not None:
         yardsticks = {YARDSTICKS[task][0] for task in asked}
@@ -371,7 +376,7 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
             row: {source: only(report, {task: (metric,)}) for source, report in by_source.items()}
             for row, by_source in reports.items()
         }
-        # Not every set of scenes has every question.
+        # Some sets of scenes lack the data for a task.
         if any(report.outcomes[task] for report in some[yardstick, 0].values()):
             results[task] = summarise(some, yardstick, weights)
             text = shuffled_text(task, results[task])
@@ -386,10 +391,10 @@ def _plan(
     tasks: tuple[str, ...],
     asked_by: SplitScenes | None = None,
 ) -> Plan:
-    """The questions to rows that learn from some scenes.
+    """Plan the measurement of rows that learn from the given scenes.
 
     Args:
-        asked_by: whose training scenes say which questions are put; the same by default.
+        asked_by: scenes whose training part defines the questions; by default the same scenes.
     """
     material = Material.of(scenes)
     data = material.data
@@ -411,7 +416,7 @@ def _measured(plan: Plan, rows: Sequence[Row], options: Options, title: str) -> 
 
 
 def _write(folder: Path, scenes: SplitScenes, values: dict[str, Any], text: str) -> None:
-    """With sha256 of what was read, by source."""
+    """Write the results with the sha256 of each source."""
     write(folder, {"contents": dict(scenes.digests)} | values, text)
     console.print(text, markup=False)
 
@@ -427,20 +432,20 @@ def _protocol_text(results: Results) -> str:
     )
     return f"""# Seed protocol
 
-One stochastic reconstruction answers, and scenes are split at random (60 / 30 / 10). These figures
-are not comparable with other tables, and they leak: near-duplicates of test scenes are in the
-training part; relations that are left on hold or betray the removed object; switching on more
-relations can only help T1, and returning a scene as it was given scores 1/V in T3.
+One stochastic reconstruction gives each answer, and scenes are split at random (60 / 30 / 10 %).
+These figures are not comparable with other tables, and they leak information. Near-duplicates of
+test scenes are in the training part. Relations that are left on force or reveal the removed object.
+Switching on more relations can only improve T1. Returning the input scene scores 1/V in T3.
 
 {results.markdown({name: task.shown for name, task in SEED_TASKS.items()})}
-The paper's own figures, on its own data:
+Results of the paper on its own data:
 
 {paper}
 """
 
 
 def shuffled_text(task: str, results: Results) -> str:
-    """The page of one task of the control."""
+    """Return the Markdown page of one task of the control experiment."""
     _, metric = YARDSTICKS[task]
     above = [
         f"{gap.row} by {-gap.figure.value:.3f}"
@@ -449,11 +454,11 @@ def shuffled_text(task: str, results: Results) -> str:
     ]
     return f"""# Shuffled scenes, {task}
 
-Rows trained on scenes whose objects were permuted between scenes: each scene has as many classes as
-before and each class is in as many scenes, but what stands together is chance. Test scenes are
-real. Every row must fall to {results.ours}; a row above it was told something that training scenes
-do not say. A star: the row in bold is better, with the whole interval.
+The rows are trained on scenes with objects permuted between scenes. Each scene keeps its number of
+classes, and each class keeps its number of scenes, but co-occurrence is random. Test scenes are
+real. No row should exceed {results.ours}; a row above it uses information from outside the training
+scenes. A star marks a row that is worse than the bold row over the whole interval.
 
 {results.markdown({task: (metric,)})}
-Above {results.ours} with the whole interval: {", ".join(above) or "no row"}.
+Rows above {results.ours} over the whole interval: {", ".join(above) or "none"}.
 """

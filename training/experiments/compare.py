@@ -1,4 +1,4 @@
-"""`python -m training compare`: two models on scenes that neither has learnt from."""
+"""`python -m training compare`: compare two models on scenes held out from both."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ COMPARED: dict[str, tuple[str, ...]] = {
     "T1b completion": ("R-precision",),
     "T3b placement": ("hit@1",),
 }
-"""By task the metrics that are compared, its primary one first; more is better in all of them."""
+"""Metrics to compare by task, the primary metric first; higher is better for all."""
 
 RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
-"""The tasks that only scenes with relations ask about."""
+"""Tasks that need scenes with relations."""
 
-# Tasks that leave out scenes without relations.
+# Tasks that exclude scenes without relations.
 _RELATED = ("T2-at missing at a place", "T3b placement")
-# Intervals over fewer groups than this are rough.
+# With fewer groups, intervals are rough.
 _ENOUGH_GROUPS = 15
-# Answers that are shown of each model.
+# Number of answers to show per model.
 _FIRST = 3
 _COLOURS = {"better": "green", "worse": "red"}
 
@@ -64,14 +64,15 @@ console = Console()
 
 @dataclass(frozen=True)
 class Example:
-    """One object taken out of one scene.
+    """One removed object of one scene.
 
     Attributes:
-        scene: its id; room_type: or "".
-        shown: labels that were left.
-        removed: the label that was taken out.
-        ranks: of the removed one, by either model; the first of them where it is one of a tie.
-        answers: the first few of either.
+        scene: scene id.
+        room_type: room type, or "".
+        shown: labels of the remaining objects.
+        removed: label of the removed object.
+        ranks: rank of the removed object by each model; a tie counts as the best rank.
+        answers: the first few answers of each model.
     """
 
     scene: str
@@ -84,17 +85,17 @@ class Example:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two models side by side.
+    """Comparison of two models.
 
     Attributes:
-        results: the first one is `ours`.
-        b: the title of the second.
-        scenes, groups: how many were asked about.
-        certain: nothing suggests that either has learnt from any of them.
-        notes: remarks on the figures.
-        examples: questions whose answers differ most.
-        unmeasured: tasks about relations at which the second was measured when it was published,
-            where the scenes ask about none.
+        results: results with the first model as `ours`.
+        b: title of the second model.
+        scenes, groups: number of scenes and groups.
+        certain: True if the scenes are certainly held out from both models.
+        notes: remarks on the results.
+        examples: questions with the most different answers.
+        unmeasured: relation tasks that the published second model was measured on, if the scenes
+            of this comparison contain no relations.
     """
 
     results: Results
@@ -108,48 +109,48 @@ class Comparison:
 
     @property
     def a(self) -> str:
-        """The title of the first."""
+        """Title of the first model."""
         return self.results.ours
 
     def worse_by(self, margin: float) -> list[Difference]:
-        """The primary metrics in which the first is worse by more than a margin, surely."""
+        """Return primary metrics that are worse than the margin over the whole interval."""
         return [
             row for row in self.results.differences if is_primary(row) and row.figure.high < -margin
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: `Results.to_dict`, and the other attributes."""
+        """Return a JSON-serialisable dictionary: `Results.to_dict` and the other attributes."""
         own = asdict(self)
         own.pop("results")
         return self.results.to_dict() | {"a": self.a} | own
 
 
 def is_primary(row: Difference) -> bool:
-    """The metric by which its task is judged."""
+    """Return True for the primary metric of the task."""
     return row.metric == COMPARED[row.task][0]
 
 
 def compare_command(
-    new: Annotated[str, typer.Argument(help="a finished run's folder, or a model of the store")],
+    new: Annotated[str, typer.Argument(help="folder of a finished run, or a model of the store")],
     old: Annotated[
         str | None,
         typer.Argument(
-            help=f"another one, or {BASELINE_SIDE}; by default what `default` serves, and "
-            f"{BASELINE_SIDE} where nothing is"
+            help=f"the other model, or {BASELINE_SIDE}; by default the model served as `default`, "
+            f"or {BASELINE_SIDE} without such a model"
         ),
     ] = None,
     data: Annotated[
-        Path | None, typer.Option("--data", help="folder with the first one's scenes")
+        Path | None, typer.Option("--data", help="folder with the scenes of the first model")
     ] = None,
     store: Annotated[Path, typer.Option("--store", help="the model store")] = Path("model_store"),
-    limit: Annotated[int, typer.Option(min=2, help="scenes that are asked about")] = 300,
-    examples: Annotated[int, typer.Option(min=0, help="changed answers that are shown")] = 3,
-    output: Annotated[Path | None, typer.Option("--json", help="write everything here")] = None,
+    limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
+    examples: Annotated[int, typer.Option(min=0, help="number of changed answers to show")] = 3,
+    output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
 ) -> None:
-    """Compare two models on scenes that neither has learnt from.
+    """Compare two models on scenes held out from both.
 
-    The scenes are the test part of the first one's configuration; those that the second has learnt
-    from are left out. Intervals are of 95 %, paired, over groups of scenes.
+    The scenes are the test part of the first model's configuration, without scenes that the second
+    model learnt from. Intervals are 95 % and paired, over groups of scenes.
     """
     try:
         with console.status("reading") as status:
@@ -167,7 +168,7 @@ def compare_command(
 
 
 def _served(store: Path) -> str:
-    """The alias `default`, where the store has one."""
+    """Return the alias `default`, or the baselines if the store lacks the alias."""
     return "default" if "default" in Store(store).aliases() else BASELINE_SIDE
 
 
@@ -197,41 +198,41 @@ def show(comparison: Comparison, console: Console) -> None:
     notes = list(comparison.notes)
     if comparison.unmeasured:
         names = ", ".join(comparison.unmeasured)
-        notes.append(f"nothing here shows how {comparison.a} does at {names}")
+        notes.append(f"the scenes do not measure {comparison.a} in {names}")
     for note in notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     if not comparison.examples:
         return
-    console.print("Answers that differ most, each with one thing taken out of a scene:")
+    console.print("Most different answers, each with one object removed from a scene:")
     for example in comparison.examples:
         room = f" ({example.room_type})" if example.room_type else ""
         lines = [f"  {example.scene}{room}: {', '.join(example.shown)}"]
-        lines.append(f"    taken out: {example.removed}")
+        lines.append(f"    removed: {example.removed}")
         for name, rank, answers in zip(
             (comparison.a, comparison.b), example.ranks, example.answers, strict=True
         ):
-            lines.append(f"    {name} has it in place {rank}: {', '.join(answers)}, …")
+            lines.append(f"    {name}, rank {rank}: {', '.join(answers)}, …")
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
 def compare(
     a: Side, b: Side, root: Path, *, limit: int | None, examples: int, say: Say
 ) -> Comparison:
-    """Ask both the questions of `COMPARED`, in the classes of the first.
+    """Ask both models the questions of `COMPARED`, in the classes of the first model.
 
     Args:
-        root: the folder with the scenes of the first one's configuration.
-        limit: at most so many scenes.
+        root: folder with the scenes of the first model's configuration.
+        limit: maximum number of scenes.
 
     Raises:
-        ConfigError: the first does not say how it was trained; its scenes cannot be found; none is
-            held out for both, or too few are.
+        ConfigError: the first model lacks its configuration, its scenes cannot be found, or too few
+            scenes are held out from both models.
         DatasetError: the scenes cannot be read.
     """
     if a.config is None or a.vocabulary is None:
         raise ConfigError(
-            f"{a.title} does not say which scenes were held out from it: name a model or a "
-            "run that was trained here first"
+            f"{a.title} does not state its held-out scenes: use a model or run trained with this "
+            "project as the first one"
         )
     say("reading scenes")
     sources = read_sources(a.config.data, root)
@@ -245,7 +246,7 @@ def compare(
     except ValueError as error:
         raise ConfigError(f"{a.title} and {b.title} cannot be compared: {error}") from error
     if not results.differences:
-        raise ConfigError(f"none of the {len(scenes)} scenes that are held out can be asked about")
+        raise ConfigError(f"the {len(scenes)} held-out scenes are unsuitable for all tasks")
     groups = len({scene.group for scene in scenes.scenes})
     say("looking for examples")
     first, second = (rival("T2 missing").objects for rival in rivals)
@@ -272,13 +273,13 @@ def side_by_side(
     *,
     progress: Progress = silent,
 ) -> Results:
-    """Every compared metric that both have on the scenes; differences are paired over groups.
+    """Measure every metric that both models support; differences are paired over groups.
 
     Args:
         structure: (V,) bool.
 
     Raises:
-        ValueError: fewer than two groups: there is no interval.
+        ValueError: fewer than two groups, so intervals are impossible.
     """
     setting = Setting(scenes, structure, limit=None)
     groups = {
@@ -286,7 +287,7 @@ def side_by_side(
         for related in (False, True)
     }
     if len(set(groups[False])) < 2:
-        raise ValueError("the scenes are of fewer than two groups: no interval can be told")
+        raise ValueError("intervals need scenes of at least two groups")
     reports = {}
     for title, rival in zip(titles, rivals, strict=True):
         report = SourceReport("held out", digest(setting))
@@ -299,7 +300,7 @@ def side_by_side(
 
 
 def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
-    """The tasks about relations at which a model was measured, where no row is of any."""
+    """Return the relation tasks of the other model's card, if no row has a relation task."""
     if other.artifact is None or any(row.task in RELATIONAL for row in rows):
         return ()
     measured = {metric.task for metric in other.artifact.manifest.metrics}
@@ -312,27 +313,27 @@ def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneT
 
 
 def _notes(a: Side, b: Side, held: HeldOut, limit: int | None, groups: int) -> Iterator[str]:
-    """Remarks on the figures."""
+    """Return remarks on the results."""
     yield from held.notes
     asked, other = a.vocabulary, b.vocabulary
     if asked is not None and other is not None and not same_classes(asked, other):
         yield _classes_note(a, b, asked, other, held)
     if limit is not None and len(held.scenes) > limit:
-        yield f"{limit} of {len(held.scenes)} held-out scenes, by --limit"
+        yield f"--limit selects {limit} of {len(held.scenes)} held-out scenes"
     if groups < _ENOUGH_GROUPS:
-        yield f"{groups} groups are few: intervals over them are rough, and too narrow"
+        yield f"{groups} groups are few: the intervals are rough and too narrow"
 
 
 def _classes_note(a: Side, b: Side, asked: Vocabulary, other: Vocabulary, held: HeldOut) -> str:
-    """What the second does not know of the first one's classes."""
+    """Describe which classes of the first model the second model lacks."""
     own = Translation.between(asked, other).own
     labels = [thing.label for scene in held.scenes for thing in scene.objects]
     mentions = [index for label in labels if (index := asked.index(label)) is not None]
     lost = sum(int(own[index]) < 0 for index in mentions)
     return (
-        f"asked in the {len(asked)} classes of {a.title}; {b.title} does not know "
-        f"{int((own < 0).sum())} of them, {lost / max(len(mentions), 1):.0%} of the mentions here: "
-        "it is not shown these, and ranks them last, in no order"
+        f"questions use the {len(asked)} classes of {a.title}; {b.title} lacks "
+        f"{int((own < 0).sum())} of them ({lost / max(len(mentions), 1):.0%} of the mentions). It "
+        "does not see these objects, and it ranks these classes last as a tie"
     )
 
 
@@ -344,7 +345,7 @@ def changed_most(
     vocabulary: Vocabulary,
     count: int,
 ) -> list[Example]:
-    """The removed objects whose reciprocal rank differs most, one a group, the largest first."""
+    """Return the removed objects whose reciprocal rank differs most, at most one per group."""
     first, second = (leave_one_out(scenes, structure, score) for score in (a, b))
     change = np.abs(first.reciprocal_rank() - second.reciprocal_rank())
     chosen: dict[str, int] = {}
@@ -378,8 +379,8 @@ def changed_most(
 def _answers(
     score: ObjectScore, v: Tensor, structure: Tensor, vocabulary: Vocabulary
 ) -> tuple[str, ...]:
-    """The likeliest missing objects, as they are asked for in the task."""
+    """Return the most probable missing objects, as in the task."""
     values = score(v.unsqueeze(0))[0].masked_fill((v > 0) | structure, -torch.inf)
     order = values.argsort(descending=True, stable=True)[:_FIRST].tolist()
-    # What a model has no class for is no answer of it.
+    # A class that the model lacks is not an answer of the model.
     return tuple(vocabulary.labels[index] for index in order if values[index] > -BEYOND)

@@ -1,8 +1,8 @@
-"""Whether a new version may take the place of the one that an alias serves.
+"""Decide whether a new version may replace the version that an alias serves.
 
-It may not where a primary metric is worse by more than a margin, surely: where the whole interval
-of the paired difference lies beyond it. A difference that could be chance stops nobody. Nor may it
-where nothing shows how it does at relations, and what is served was measured at them.
+A primary metric must not be worse by more than the margin over the whole interval of the paired
+difference. Smaller or uncertain losses are accepted. If the served version was measured on
+relations, the comparison must measure relations too.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from training.experiments.sides import Say, Side, stored_side
 from training.pipeline import SplitScenes
 from training.runs import FinishedRun
 
-# A primary metric may be worse by so much, surely, before a promotion is refused.
+# Accepted loss of a primary metric at a promotion.
 MARGIN = 0.02
 
 
 class WorseError(RuntimeError):
-    """A version that is, or may be, worse than the one it would replace; holds the comparison."""
+    """The new version is worse, or it is not measured on relations; see `comparison`."""
 
     def __init__(self, comparison: Comparison, margin: float) -> None:
         a, b, reasons = comparison.a, comparison.b, []
@@ -32,8 +32,8 @@ class WorseError(RuntimeError):
         if comparison.unmeasured:
             names = ", ".join(comparison.unmeasured)
             reasons.append(
-                f"none of the scenes compared on tells of relations: nothing shows how {a} does at "
-                f"{names}, at which {b} was measured"
+                f"the compared scenes contain no relations: {b} was measured in {names}, but {a} "
+                "was not"
             )
         super().__init__("; ".join(reasons))
         self.comparison = comparison
@@ -41,12 +41,13 @@ class WorseError(RuntimeError):
 
 @dataclass(frozen=True)
 class Seat:
-    """What an alias points at now.
+    """Current target of an alias.
 
     Attributes:
-        alias: its name; target: what it points at, None where it is new.
-        holder: the model that it serves; None where there is none, or none that can be read.
-        note: why there is nothing to compare with, else "".
+        alias: name of the alias.
+        target: target of the alias; None for a new alias.
+        holder: the served model; None if it does not exist or cannot be read.
+        note: reason why a comparison is impossible, or "".
     """
 
     alias: str
@@ -59,15 +60,15 @@ def seat(store: Store, alias: str) -> Seat:
     """Look up an alias.
 
     Raises:
-        StoreError: the store's aliases cannot be read.
+        StoreError: the aliases of the store cannot be read.
     """
     target = store.aliases().get(alias)
     if target is None:
-        return Seat(alias, None, None, f"nothing is served as {alias} yet: nothing to compare with")
+        return Seat(alias, None, None, f"{alias} is a new alias: no model to compare with")
     try:
         return Seat(alias, target, stored_side(alias, store), "")
     except (ArtifactError, StoreError) as error:
-        note = f"what {alias} serves cannot be read ({error}): nothing to compare with"
+        note = f"the model served as {alias} cannot be read ({error}): no model to compare with"
         return Seat(alias, target, None, note)
 
 
@@ -82,14 +83,14 @@ def judge(
     limit: int | None,
     say: Say,
 ) -> Comparison:
-    """Compare a version that is about to be published with the one that is served.
+    """Compare a new version with the served version before publication.
 
     Args:
-        artifact: as it would be published.
+        artifact: the new version.
 
     Raises:
-        WorseError: it is worse, or nothing shows how it does at relations.
-        ConfigError: see `compare`.
+        WorseError: the version is worse, or it is not measured on relations.
+        ConfigError: the comparison is impossible, see `compare`.
     """
     new = Side("the new version", run.config, scenes.digests, artifact, root)
     comparison = compare(new, holder, root, limit=limit, examples=3, say=say)

@@ -1,12 +1,12 @@
-"""Rows measured on every source; a finished report on disk is never computed again.
+"""Measure rows on every source; finished reports on disk are reused.
 
-<folder>/<row>/seed-<n>/row.json          its identity, the scenes it learnt from, its weights
-                        trials.jsonl      every trial of its tuning
-                        run/              the training run of a machine, and its calibration
-                        <source>.json     its report on a source
-                        pooled.json       what does not follow from these: see `WHOLE_SET`
+<folder>/<row>/seed-<n>/row.json          identity, digest of the training scenes, trained weights
+                        trials.jsonl      all trials of the tuning
+                        run/              training run of a machine, and its calibration
+                        <source>.json     report on a source
+                        pooled.json       report of the tasks in `WHOLE_SET`
 
-Several processes fill these files side by side, each row in one of them with one thread.
+Several processes fill these files in parallel. One process with one thread measures each row.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ from training.evaluation.tasks import ONCE, WHOLE_SET
 from training.experiments.rows import Material, Rival, Row
 from training.runs import RunError
 
-# Called with (row, source, what is being done).
+# Called with the row, the source, and a note on the current step.
 Progress = Callable[[str, str, str], None]
-# The last note on a row and a source: measured now, or read from a file.
+# Last note on a row and source: measured now, or read from a file.
 DONE, KNOWN = "done", "known"
 Reports = dict[tuple[str, int], dict[str, SourceReport]]
 
 POOLED = "pooled"
-"""All sources together."""
+"""Name of the union of all sources."""
 
 
 class BenchmarkError(RuntimeError):
-    """Files in the folder of another experiment; says which."""
+    """The folder holds files of another experiment; the text names them."""
 
 
 @contextmanager
 def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
-    """A command that goes on where it was stopped; errors end it with their text."""
+    """Handle errors of a resumable command: print the error or the hint to continue, and exit."""
     expected: tuple[type[Exception], ...] = (
         *(ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool),
         *others,
@@ -68,18 +68,18 @@ def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
         console.print(f"[red]error:[/red] {error}")
         raise typer.Exit(1) from None
     except KeyboardInterrupt:
-        console.print("stopped; the same command goes on from there")
+        console.print("stopped; run the same command again to continue")
         raise typer.Exit(130) from None
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What every row is asked.
+    """Questions for every row.
 
     Attributes:
-        folder: of the reports.
-        material: what rows learn from.
-        settings: by source, and `POOLED` for all of them.
+        folder: folder of the reports.
+        material: scenes that rows learn from.
+        settings: setting by source; `POOLED` is the union of all sources.
         tasks: names in `TASKS` or `SEED_TASKS`.
     """
 
@@ -89,21 +89,21 @@ class Plan:
     tasks: Sequence[str]
 
     def place(self, row: Row) -> Path:
-        """The folder of one row and seed."""
+        """Return the folder of a row and seed."""
         return place_of(self.folder, row.name, row.seed)
 
     def asked(self, source: str) -> list[str]:
-        """The tasks that are measured on a source."""
+        """Return the tasks to measure on a source."""
         if source == POOLED:
             return [task for task in self.tasks if task in WHOLE_SET]
         return [task for task in self.tasks if task not in ONCE]
 
     def known(self, row: Row) -> dict[str, SourceReport]:
-        """The finished reports of a row, by source.
+        """Return the finished reports of a row, by source.
 
         Raises:
-            BenchmarkError: the folder holds reports of other scenes, or of a row that was
-                configured otherwise or learnt from other scenes.
+            BenchmarkError: the folder holds reports of other scenes, of another configuration of
+                the row, or of other training scenes.
         """
         claim(self.place(row), row, self.material.digest)
         found = {}
@@ -118,12 +118,12 @@ class Plan:
         return found
 
     def measure(self, row: Row, progress: Progress) -> None:
-        """Fill in a row's report on every source, training it only where one lacks a task.
+        """Complete the reports of a row on all sources; train only if a report is incomplete.
 
-        KeyboardInterrupt passes through; finished tasks are on disk by then.
+        KeyboardInterrupt passes through; finished tasks are on disk.
 
         Raises:
-            BenchmarkError: see `known`.
+            BenchmarkError: the folder holds other reports, see `known`.
         """
         known = self.known(row)
         rival: Rival | None = None
@@ -143,7 +143,7 @@ class Plan:
             say(DONE)
 
     def report(self, row: Row) -> dict[str, SourceReport]:
-        """A measured row's reports as its files have them, that of the pool with all tasks."""
+        """Return the reports of a measured row; the pooled report holds all tasks."""
         found = self.known(row)
         sources = [found[source] for source in self.settings if source != POOLED]
         if POOLED in self.settings:
@@ -163,17 +163,17 @@ def measure_rows(
     fresh: bool = False,
     failures: tuple[type[Exception], ...] = (),
 ) -> tuple[Reports, dict[str, str]]:
-    """Every row's report on every source by (name, seed), and by name why others have none.
+    """Measure all rows; return reports by (name, seed), and the error of each failed row by name.
 
-    KeyboardInterrupt stops the workers and passes through; finished tasks are on disk by then.
+    KeyboardInterrupt stops the workers and passes through; finished tasks are on disk.
 
     Args:
-        fresh: earlier reports of these rows are removed.
-        failures: errors that end the row in which they arise and leave the others alone.
+        fresh: delete earlier reports of these rows.
+        failures: exception types that end only the row in which they occur.
 
     Raises:
-        BenchmarkError: see `Plan.known`.
-        BrokenProcessPool: a worker died.
+        BenchmarkError: a folder holds other reports, see `Plan.known`.
+        BrokenProcessPool: a worker process died.
     """
     if fresh:
         for row in rows:
@@ -207,7 +207,7 @@ def _failure(
 
 @contextmanager
 def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
-    """A progress bar over (row, source) pairs."""
+    """Show a progress bar over (row, source) pairs."""
     columns = (
         "[progress.description]{task.description}",
         BarColumn(),
@@ -227,17 +227,17 @@ def shown(console: Console, title: str, total: int) -> Iterator[Progress]:
 
 
 def place_of(folder: Path, name: str, seed: int) -> Path:
-    """Where a row of one seed lies."""
+    """Return the folder of a row and seed."""
     return folder / slug(name) / f"seed-{seed}"
 
 
 def slug(name: str) -> str:
-    """A folder's name: lower case, words joined by hyphens."""
+    """Convert a name to a folder name: lower-case words joined by hyphens."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
 def parameters(folder: Path, rows: Sequence[Row]) -> dict[str, int]:
-    """Trained weights of the rows of which a number says something, by name."""
+    """Return the number of trained weights by row, for rows with a meaningful number."""
     found = {}
     for row in rows:
         path = place_of(folder, row.name, row.seed) / "row.json"
@@ -248,25 +248,25 @@ def parameters(folder: Path, rows: Sequence[Row]) -> dict[str, int]:
 
 
 def claim(place: Path, row: Row, material: str) -> None:
-    """Write down whose folder this is.
+    """Write the identity of a row into its folder, or check it.
 
     Args:
-        material: digest of what the row learns from.
+        material: digest of the training scenes.
 
     Raises:
-        BenchmarkError: it is another one's.
+        BenchmarkError: the folder belongs to another row or to other scenes.
     """
     path = place / "row.json"
     if path.exists():
         known = json.loads(path.read_text(encoding="utf-8"))
         if known["identity"] != row.identity:
             raise BenchmarkError(
-                f"{place} holds another configuration of {row.name}; give --fresh or another folder"
+                f"{place} holds another configuration of {row.name}; use --fresh or another folder"
             )
         if known.get("material") != material:
             raise BenchmarkError(
-                f"{place} learnt from other scenes than these, or does not say from which: another "
-                "file, source, limit, split or vocabulary; give --fresh or another folder"
+                f"the reports in {place} belong to other training scenes: the file, source, limit, "
+                "split or vocabulary differs, or is not recorded; use --fresh or another folder"
             )
         return
     values = {"name": row.name, "seed": row.seed, "identity": row.identity}
@@ -274,15 +274,15 @@ def claim(place: Path, row: Row, material: str) -> None:
 
 
 def read_report(path: Path, setting: Setting) -> SourceReport:
-    """The report in a file.
+    """Read the report in a file.
 
     Raises:
-        BenchmarkError: it is of other scenes or questions.
+        BenchmarkError: the report belongs to other scenes or questions.
     """
     report = SourceReport.from_dict(json.loads(path.read_text(encoding="utf-8")))
     if report.scenes != digest(setting):
         raise BenchmarkError(
-            f"{path} is of other scenes or questions; give --fresh or another folder"
+            f"{path} belongs to other scenes or questions; use --fresh or another folder"
         )
     return report
 
@@ -297,9 +297,9 @@ def _note_parameters(place: Path, count: int | None) -> None:
 # ------------------------------------------------------------------------------------- processes
 
 _Message = tuple[str, str, str]
-# Seconds between two looks for messages.
+# Seconds between two checks for messages.
 _TICK = 0.2
-# Read by the linear algebra libraries when they are loaded, that is at the start of a process.
+# Linear algebra libraries read these variables when a process loads them.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _plan: Plan
@@ -313,11 +313,11 @@ def _in_workers(
     workers: int,
     failures: tuple[type[Exception], ...],
 ) -> dict[tuple[str, int], Exception]:
-    """Measure rows in processes; returns the `failures` by (name, seed)."""
-    # Plain bytes: torch would hand tensors over through shared memory, which containers keep small.
+    """Measure rows in worker processes; return the `failures` by (name, seed)."""
+    # Pickled bytes avoid the shared memory of torch, which is small in containers.
     material = pickle.dumps(plan)
     context = multiprocessing.get_context("spawn")
-    # A queue without a sending thread: the last message of a row is there when the row is done.
+    # SimpleQueue has no sending thread: all messages of a finished row are in the queue.
     messages: SimpleQueue[_Message] = context.SimpleQueue()
     with (
         _one_thread(),
@@ -357,10 +357,10 @@ def _one_thread() -> Iterator[None]:
 
 def _begin(material: bytes, messages: SimpleQueue[_Message]) -> None:
     global _plan, _messages  # set once in each worker
-    # Ctrl-C reaches every process of the terminal; the first one decides.
+    # Ctrl-C reaches every process of the terminal; only the main process handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
-    # Written by the process that started this one, and passed on in memory.
+    # The main process wrote these bytes and passed them on in memory.
     _plan = pickle.loads(material)  # noqa: S301  # nosec B301
     _messages = messages
 

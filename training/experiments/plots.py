@@ -1,7 +1,7 @@
-"""Plots beside the tables.
+"""Plots for the tables.
 
-learning-curves.png   every machine and seed, from its run's curve
-reliability-*.png     of each machine: what its probabilities promise and what came true
+learning-curves.png   metrics of every machine and seed by epoch
+reliability-*.png     predicted probability against observed frequency, one file per machine
 recall.png            relations among the first k predictions, removed objects in the first k places
 """
 
@@ -33,7 +33,7 @@ _CURVES = {
     "relation_error_validation": "reconstruction error, relations",
 }
 _RECALL = {
-    "T1a relations": ("R@", "annotated relations among the first k, a scene"),
+    "T1a relations": ("R@", "annotated relations among the first k of a scene"),
     "T2 missing": ("top-", "removed objects in the first k places"),
 }
 
@@ -41,10 +41,10 @@ _RECALL = {
 def write_plots(
     plan: Plan, machines: Sequence[Row], reports: Reports, results: Results
 ) -> list[Path]:
-    """Every plot that there is something to draw for; what was written.
+    """Write all plots with data; return the written files.
 
     Args:
-        machines: the rows that have a run and a calibration, the first one ours.
+        machines: rows with a run and a calibration; the first row is the reference.
     """
     matplotlib.use("Agg")
     runs: dict[str, list[Path]] = {}
@@ -68,7 +68,7 @@ def write_plots(
 
 
 def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
-    """Validation figures by epoch; one colour a machine, one line a seed."""
+    """Plot validation metrics by epoch; a colour is a machine, a line is a seed."""
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     axes = figure.subplots(2, 2).flat
     for axis, (column, title) in zip(axes, _CURVES.items(), strict=True):
@@ -83,16 +83,16 @@ def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
 
 
 def read_curve(path: Path, column: str) -> tuple[list[int], list[float]]:
-    """Epochs, counted from 1, and one column of a run's curve."""
+    """Read epochs, counted from 1, and one column of the curve of a run."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return [int(row["epoch"]) + 1 for row in rows], [float(row[column]) for row in rows]
 
 
 def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
-    """One diagram a question, calibrated and not; bins of equal mass, logarithmic axes.
+    """Plot one diagram per question, with and without calibration; bins have equal mass.
 
-    Most of the probabilities are small: on linear axes all but a bin or two lie in one corner.
+    Most probabilities are small, so the axes are logarithmic.
     """
     asked = [name for name in QUESTIONS if f"ECE, {name}" in outcome.metrics]
     figure = Figure(figsize=(3.2 * max(len(asked), 1), 3.6), layout="constrained")
@@ -102,7 +102,7 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
         for suffix, marker in ((", uncalibrated", "x"), ("", "o")):
             metric = outcome.metrics[f"ECE, {name}{suffix}"]
             if not isinstance(metric, Scored):
-                raise TypeError(f"ECE of {name} does not hold its answers")
+                raise TypeError(f"the metric ECE of {name} lacks its answers")
             bins = reliability(metric.score, metric.truth)
             label = f"{suffix[2:] or 'as published'}, ECE {metric.value:.3f}"
             axis.plot(bins.probability, bins.frequency, marker=marker, linewidth=1, label=label)
@@ -114,7 +114,7 @@ def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
 
 
 def recall_curves(results: Results, source: str) -> Figure:
-    """Recall over the number of predictions, every row that was asked."""
+    """Plot recall by number of predictions for every measured row."""
     figure = Figure(figsize=(12, 5), layout="constrained")
     for axis, (task, (prefix, title)) in zip(
         _axes(figure, 1, len(_RECALL)), _RECALL.items(), strict=True
@@ -134,7 +134,7 @@ def recall_curves(results: Results, source: str) -> Figure:
 def recall_points(
     results: Results, task: str, prefix: str, source: str
 ) -> dict[str, list[tuple[int, float]]]:
-    """(k, value) by row, of the metrics that are called the prefix and k."""
+    """Return points (k, value) by row, for metrics named prefix + k."""
     found: dict[str, list[tuple[int, float]]] = {}
     for cell in results.cells:
         k = cell.metric.removeprefix(prefix)

@@ -14,7 +14,7 @@ from training.evaluation.tasks import TASKS
 
 Reports = Mapping[tuple[str, int], Mapping[str, SourceReport]]
 
-# Annotators list a part of the relations that hold.
+# Annotators list only a part of the relations that hold.
 UNLISTED = "An unlisted relation counts as wrong"
 
 _RELATION_TASKS = ("T1a", "T1b", "T1 with")
@@ -37,11 +37,11 @@ _LOWER_IS_BETTER = (
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure.
+    """One table entry.
 
     Attributes:
-        row, task, source, metric: its place in the tables.
-        figure: mean over seeds, with the interval over scenes.
+        row, task, source, metric: position in the tables.
+        figure: mean over seeds with the interval over scenes.
         seeds: the value of each seed.
     """
 
@@ -55,7 +55,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Difference:
-    """Ours minus another row in one metric, with the paired interval."""
+    """Reference row minus another row in one metric, with the paired interval."""
 
     row: str
     task: str
@@ -65,7 +65,7 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """`better`, `worse` or `undecided`: is ours better, by the whole interval?"""
+        """Return `better`, `worse` or `undecided` for the reference row, by the whole interval."""
         low, high = self.figure.low, self.figure.high
         if self.metric.startswith(_LOWER_IS_BETTER):
             low, high = -high, -low
@@ -77,9 +77,9 @@ class Asked:
     """Number of scored and skipped scenes of one task, for one row and seed.
 
     Attributes:
-        row, seed, task, source: its place in the tables.
-        scenes, skipped: how many were asked about, and how many of them could not be scored.
-        notes: such as a bandwidth, or log Z with its standard errors.
+        row, seed, task, source: position in the tables.
+        scenes, skipped: number of scenes, and number of scenes that could not be scored.
+        notes: additional values, such as a bandwidth, or log Z with its standard errors.
     """
 
     row: str
@@ -96,10 +96,10 @@ class Results:
     """The results of an experiment.
 
     Attributes:
-        ours: the row that the others are compared with.
-        cells, differences: in the order of rows, sources and tasks.
-        parameters: trained weights by row, for rows with weights.
-        asked: the size of each task.
+        ours: the reference row of all comparisons.
+        cells, differences: sorted by row, source and task.
+        parameters: number of trained weights by row, for rows with weights.
+        asked: number of scenes of each task.
     """
 
     ours: str
@@ -109,7 +109,7 @@ class Results:
     asked: tuple[Asked, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
+        """Return a JSON-serialisable dictionary."""
         return {
             "ours": self.ours,
             "parameters": dict(self.parameters),
@@ -121,13 +121,13 @@ class Results:
     def markdown(
         self, shown: Mapping[str, tuple[str, ...]] | None = None, *, changes: bool = False
     ) -> str:
-        """One table for each shown metric, rows by sources, and remarks on each task.
+        """Return one Markdown table per metric, rows by sources, and remarks on each task.
 
-        A star marks a row that ours is better than, by the whole paired interval.
+        A star marks a row that is worse than the reference row over the whole paired interval.
 
         Args:
-            shown: by task its metrics; those of `TASKS` by default.
-            changes: brackets hold the interval of the row minus ours, in place of the row's own.
+            shown: metrics by task; by default those of `TASKS`.
+            changes: brackets hold the interval of the row minus the reference row.
         """
         parts: list[str] = []
         if shown is None:
@@ -176,13 +176,13 @@ def _text(cell: Cell, gap: Difference | None, changes: bool) -> str:
 
 
 def grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
 
 
 def write(folder: Path, values: Mapping[str, Any], text: str) -> None:
-    """results.json and results.md of a folder, each replaced as a whole."""
+    """Write results.json and results.md of a folder, each atomically."""
     write_whole(folder / "results.md", text)
     write_whole(folder / "results.json", json.dumps(values, indent=1) + "\n")
 
@@ -194,13 +194,14 @@ def summarise(
     *,
     groups: Callable[[str], Sequence[str]] | None = None,
 ) -> Results:
-    """The figures of every row, and its paired differences to ours.
+    """Compute the metrics of every row and its paired differences to the reference row.
 
     Args:
-        groups: by task the group of each scene; differences then resample groups, not scenes.
+        groups: function of a task that returns the group of each scene. With it, differences
+            resample groups instead of scenes.
 
     Raises:
-        ValueError: no report of `ours`.
+        ValueError: the reports lack `ours`.
     """
     means = {
         (row, source, task, name): MeanOverSeeds(metrics)
@@ -208,7 +209,7 @@ def summarise(
         for source, task, name, metrics in _by_metric(reports, row)
     }
     if not any(key[0] == ours for key in means):
-        raise ValueError(f"there is no report of {ours}")
+        raise ValueError(f"the reports lack the row {ours}")
     cells = tuple(
         Cell(row, task, source, name, mean.figure(), tuple(m.value for m in mean.members))
         for (row, source, task, name), mean in means.items()
@@ -221,14 +222,14 @@ def summarise(
         for (row, source, task, name), mean in means.items()
         if row != ours
         and (mine := means.get((ours, source, task, name))) is not None
-        # Of several sources, either may have answered in fewer.
+        # A pooled metric may cover fewer sources for one of the rows.
         and mine.scenes == mean.scenes
     )
     return Results(ours, cells, differences, parameters or {}, tuple(_asked(reports)))
 
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
-    """The report with some metrics by task alone: resampling all of them takes minutes."""
+    """Return the report with selected metrics only; resampling all metrics takes minutes."""
     outcomes = {
         task: outcome
         and replace(
@@ -252,10 +253,10 @@ def _asked(reports: Reports) -> Iterator[Asked]:
 
 
 def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
-    """(source, task, metric name, one metric a seed) of a row.
+    """Iterate over (source, task, metric name, one metric per seed) of a row.
 
-    A metric that is pooled from fewer sources for one seed than for another is left out: a source
-    has no skill where all of its asked relations hold.
+    A metric is left out if its seeds are pooled from different sources. For example, skill is
+    undefined on a source where all queried relations hold.
     """
     found: dict[tuple[str, str, str], list[Metric]] = {}
     for (name, _), by_source in reports.items():
@@ -271,7 +272,7 @@ def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list
 
 
 def remarks(asked: Sequence[Asked]) -> list[str]:
-    """Skipped scenes and notes, for below the figures of one task."""
+    """Return remarks for one task: skipped scenes and notes."""
     skipped = []
     for source in dict.fromkeys(one.source for one in asked):
         here = [one for one in asked if one.source == source]
@@ -284,13 +285,13 @@ def remarks(asked: Sequence[Asked]) -> list[str]:
 
 
 def _range(counts: Iterable[int]) -> str:
-    """Of all rows; rows that answer about other scenes show as two numbers."""
+    """Format a count over all rows; rows with different scenes give a range."""
     low, *others = sorted(set(counts))
     return f"{low:,}–{others[-1]:,}" if others else f"{low:,}"
 
 
 def _notes(asked: Sequence[Asked]) -> str:
-    """By source where the rows agree, by row where the sources agree, else by both."""
+    """Format notes by source if rows agree, by row if sources agree, else by both."""
     found: dict[str, Mapping[str, float]] = {}
     for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
         found = {place.format(one): one.notes for one in asked}

@@ -1,4 +1,4 @@
-"""The rows of an experiment: machines, baselines tuned on validation scenes, and references."""
+"""The rows of an experiment: machines, tuned baselines, and references."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from training.runs import RunError, load_run, save_run
 from training.trainer import Trainer, TrainingData
 
 CALIBRATION = "calibration.json"
-"""A machine's calibration, beside its run."""
+"""File name of a machine's calibration, in the folder of its run."""
 
 Say = Callable[[str], None]
-# What answers for a row before some scenes: the same before all of them if it was trained.
+# Function from a setting to the contender of a row; a trained row ignores the setting.
 Rival = Callable[[Setting], Contender]
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The scenes that the rows learn from.
+    """The scenes that rows learn from.
 
     Attributes:
         data: tensors of the three parts.
-        vocabulary: their classes.
-        digest: of the scenes' contents and split; with a row's identity it decides whether a
-            folder's reports are kept.
+        vocabulary: classes of the scenes.
+        digest: digest of the scenes and their split. With the identity of a row it decides whether
+            reports of a folder are reused.
     """
 
     data: TrainingData
@@ -54,21 +54,21 @@ class Material:
 
     @classmethod
     def of(cls, scenes: SplitScenes) -> Material:
-        """All of some split scenes.
+        """Create the material from split scenes.
 
         Raises:
-            ConfigError: a part of them is empty.
+            ConfigError: a part is empty.
         """
         for part, some in scenes.parts.items():
             if not some:
                 raise ConfigError(
-                    f"no scene is in the {part} part: take more scenes, or of more groups"
+                    f"the {part} part contains no scenes: provide more scenes or more groups"
                 )
         return cls(scenes.training_data(), scenes.vocabulary, scenes.digest)
 
     @property
     def related(self) -> bool:
-        """Training and validation scenes are annotated with relations."""
+        """True if training and validation scenes contain annotated relations."""
         return has_relations(self.data.train) and has_relations(self.data.validation)
 
 
@@ -77,14 +77,14 @@ Maker = Callable[[Material, Path, Say], Rival]
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One row, for one training seed.
+    """One row with one training seed.
 
     Attributes:
-        name: of the row; rows of one name differ by their seed.
-        seed: of the training.
-        identity: of everything but the scenes that decides the figures; reports of another
-            identity are refused.
-        make: trains it, or reads back what was trained, in a folder of its own.
+        name: name of the row; all seeds of a row have the same name.
+        seed: training seed.
+        identity: text that identifies everything except the scenes that affects the results.
+            Reports of another identity are rejected.
+        make: function that trains the row, or reads the trained row from its folder.
     """
 
     name: str
@@ -100,17 +100,17 @@ def baseline_rows(
     related: bool = True,
     whole: bool = True,
 ) -> Iterator[Row]:
-    """Every baseline, or those named, where the seed changes anything.
+    """Generate the rows of selected baselines; deterministic ones have a row for seed 0 only.
 
     Args:
-        related: there are relations to learn from; otherwise baselines of relations are left out.
-        whole: with an alarm, and places for scores of objects.
+        related: the scenes contain relations; otherwise relation baselines are left out.
+        whole: add an alarm and place scores to object baselines.
 
     Raises:
         ValueError: an unknown name.
     """
     if unknown := sorted(set(names or ()) - set(BASELINES)):
-        raise ValueError(f"unknown baselines {unknown}, must be of {list(BASELINES)}")
+        raise ValueError(f"unknown baselines {unknown}: must be among {list(BASELINES)}")
     for name, baseline in BASELINES.items():
         wanted = (names is None or name in names) and (related or not baseline.learns_relations)
         if wanted and (baseline.stochastic or seed == 0):
@@ -119,7 +119,7 @@ def baseline_rows(
 
 
 def reference_rows() -> Iterator[Row]:
-    """References for drawn scenes and densities; nothing is trained."""
+    """Generate reference rows for generated scenes and densities; they need no training."""
     references: dict[str, Rival] = {
         "independent classes": independent_contender,
         "held-out scenes (floor)": floor_contender,
@@ -133,10 +133,10 @@ def _reference(rival: Rival, material: Material, folder: Path, say: Say) -> Riva
 
 
 def machine_row(config: Config, *, calibrated: bool = True) -> Row:
-    """A machine trained by a configuration; its run lies in the row's folder and is resumed.
+    """Return a machine trained by a configuration; its run is in the row's folder, resumable.
 
     Args:
-        calibrated: as publishing does; without it, as it was trained.
+        calibrated: calibrate the machine as for publication.
     """
     if calibrated:
         identity, make = f"{config.digest}, calibrated", partial(_calibrated, config)
@@ -148,7 +148,7 @@ def machine_row(config: Config, *, calibrated: bool = True) -> Row:
 def _fitted(
     baseline: Baseline[Any], seed: int, whole: bool, material: Material, folder: Path, say: Say
 ) -> Rival:
-    """A score of objects also answers T2-at, by the product with the frequency table."""
+    """Fit a baseline; an object score also answers T2-at by its product with the place table."""
     data = material.data
     score = _fit(baseline, data, seed, folder, say).score
     values: dict[str, Any] = dict.fromkeys(baseline.scores, score)
@@ -199,14 +199,14 @@ def _trained(config: Config, data: TrainingData, run: Path, say: Say) -> Boltzma
 
 
 def always(contender: Contender) -> Rival:
-    """The same contender before all scenes."""
+    """Return the same contender for all settings."""
     return lambda _: contender
 
 
 def _fit(
     baseline: Baseline[Any], data: TrainingData, seed: int, folder: Path, say: Say
 ) -> Fitted[Any]:
-    """Fit, and write down every trial; those of an interrupted fit are replaced."""
+    """Fit a baseline and write all trials; trials of an interrupted fit are replaced."""
     fitted = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
     before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []
@@ -217,5 +217,5 @@ def _fit(
 
 
 def has_relations(scenes: SceneTensors) -> bool:
-    """Any scene is annotated with a relation."""
+    """Return True if a scene has an annotated relation."""
     return any(scene.evidence.holds.any() for scene in scenes.scenes)

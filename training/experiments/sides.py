@@ -1,6 +1,6 @@
-"""The two that are compared: a finished run, a published model, or the baselines.
+"""The two sides of a comparison, and the scenes held out from both.
 
-And the scenes that neither of them has learnt from.
+A side is a finished run, a published model, or the baselines.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from training.runs import RunError, load_run
 from training.trainer import TrainingData
 
 BASELINE_SIDE = "baselines"
-"""EASE for objects, the frequency table for relations, their product for places."""
+"""Baseline side: EASE for objects, frequency table for relations, their product for places."""
 
 _OBJECTS, _RELATIONS = "EASE", "frequency table"
 
 Say = Callable[[str], None]
-# The contender of a model in a task.
+# Function from a task to the contender of a side.
 Rival = Callable[[str], Contender]
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of two models.
+    """One of the two compared models.
 
     Attributes:
-        title: what it is called in tables.
-        config: what it was trained by; None where it does not say.
-        learnt: digest of each source that it learnt from, by name.
+        title: name in tables.
+        config: training configuration, or None if unknown.
+        learnt: digest of each source that the model learnt from, by name.
         artifact: the model; None for the baselines.
-        data: the folder that a run read its scenes from.
+        data: folder of the scenes of a run.
     """
 
     title: str
@@ -56,14 +56,14 @@ class Side:
 
     @property
     def vocabulary(self) -> Vocabulary | None:
-        """Its classes; those of the other side where it has none of its own."""
+        """Classes of the model; None for the baselines, which use the classes of the other side."""
         return None if self.artifact is None else self.artifact.vocabulary
 
     def rival(self, scenes: Vocabulary, data: TrainingData, say: Say) -> Rival:
-        """What answers for it about scenes in the classes of a vocabulary.
+        """Return the contender of the side for scenes in the classes of a vocabulary.
 
         Args:
-            data: what baselines are fitted to.
+            data: scenes to fit the baselines on.
         """
         if self.artifact is None:
             fitted = _baselines(data, say)
@@ -76,11 +76,11 @@ class Side:
 
 
 def run_side(folder: Path, data: Path | None, say: Say) -> Side:
-    """A finished run, calibrated as it would be published.
+    """Return the side of a finished run, calibrated as for publication.
 
     Raises:
-        RunError: no finished run, or one that learnt from other scenes.
-        ConfigError, DatasetError: its scenes cannot be read.
+        RunError: the folder holds no finished run, or its scenes differ from the training scenes.
+        ConfigError, DatasetError: the scenes cannot be read.
     """
     run = load_run(folder)
     root = data if data is not None else Path(run.data) if run.data else DATA
@@ -93,10 +93,10 @@ def run_side(folder: Path, data: Path | None, say: Say) -> Side:
 
 
 def stored_side(reference: str, store: Store) -> Side:
-    """A published model by alias, name or name@version.
+    """Return the side of a published model by alias, name or name@version.
 
     Raises:
-        StoreError, ArtifactError: there is none, or it cannot be used.
+        StoreError, ArtifactError: the model does not exist or cannot be used.
     """
     name, version = store.resolve(reference)
     artifact = store.load(name, version)
@@ -110,13 +110,13 @@ def stored_side(reference: str, store: Store) -> Side:
 
 
 def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
-    """Whatever a reference names: a run's folder, the baselines, or a published model.
+    """Return the side of a reference: folder of a run, the baselines, or a published model.
 
     Raises:
-        ConfigError: none of them; and see `run_side` and `stored_side`.
+        ConfigError: the reference matches none of them; see also `run_side` and `stored_side`.
     """
     if reference == BASELINE_SIDE:
-        # Fitted to what the other side learnt from.
+        # Baselines are fitted on the training scenes of the other side.
         return Side(BASELINE_SIDE, None, {}, None)
     folder = Path(reference)
     if (folder / "config.json").is_file():
@@ -125,7 +125,7 @@ def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
         return stored_side(reference, store)
     except StoreError as error:
         if folder.is_dir():
-            raise RunError(f"{reference} holds no finished run") from error
+            raise RunError(f"{reference} contains no finished run") from error
         raise ConfigError(
             f"{reference!r} must be a finished run or a model in {store.root}: {error}"
         ) from error
@@ -146,19 +146,19 @@ def _baselines(data: TrainingData, say: Say) -> Contender:
 
 # --------------------------------------------------------------------------------- held-out scenes
 
-# Whether a model was kept from a scene.
+# Filter of scenes: False if the model is known to have learnt from the scene.
 Kept = Callable[[AnnotatedScene], bool]
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Scenes to compare on.
+    """Scenes for the comparison.
 
     Attributes:
-        scenes: test scenes of the first that the second has not learnt from either.
-        dropped: how many of the first one's test scenes are left out.
-        notes: what has to be said beside the figures.
-        certain: nothing speaks for either having learnt from any of the scenes.
+        scenes: test scenes of the first model that the second model did not learn from.
+        dropped: number of the first model's test scenes that are left out.
+        notes: remarks on the results.
+        certain: False if a model may have learnt from some of the scenes.
     """
 
     scenes: list[AnnotatedScene]
@@ -170,22 +170,22 @@ class HeldOut:
 def held_out(
     a: Side, b: Side, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
 ) -> HeldOut:
-    """The first one's test scenes, less what the second has learnt from.
+    """Return the first model's test scenes without scenes that the second model learnt from.
 
     Args:
-        sources: the scenes of the first one's configuration, by source, as they are now.
-        root: the folder that they, and so perhaps the second one's, were read from.
+        sources: current scenes of the first model's configuration, by source.
+        root: folder of these scenes; sources of the second model are read from it too.
 
     Raises:
-        ConfigError: the first does not say how it was trained, or nothing is left.
+        ConfigError: the first model does not state its split, or all test scenes are left out.
     """
     if a.config is None:
-        raise ConfigError(f"{a.title} does not say how its scenes were split")
+        raise ConfigError(f"{a.title} does not state how its scenes were split")
     everything = [scene for some in sources.values() for scene in some]
     data = a.config.data
     candidates = split(everything, seed=data.split_seed, protocol=data.split)["test"]
     if not candidates:
-        raise ConfigError("no scene is in the test part: take more scenes, or of more groups")
+        raise ConfigError("the test part contains no scenes: provide more scenes or more groups")
     notes: list[str] = []
     certain = True
     kept = candidates
@@ -198,7 +198,7 @@ def held_out(
     dropped = len(candidates) - len(kept)
     if not kept:
         raise ConfigError(
-            f"{b.title} has learnt from every test scene of {a.title}: nothing is held out for both"
+            f"{b.title} has learnt from all test scenes of {a.title}: no common held-out scenes"
         )
     if dropped:
         notes.append(
@@ -211,9 +211,9 @@ def held_out(
 def _kept(
     side: Side, sources: Mapping[str, Sequence[AnnotatedScene]], root: Path
 ) -> tuple[Kept, str, bool]:
-    """Whether a side was kept from a scene, what to say of it, and whether that is certain."""
+    """Return a filter for held-out scenes of a side, a note, and whether the filter is certain."""
     if side.artifact is None:
-        return _all, "", True  # fitted to the first one's own training scenes
+        return _all, "", True  # fitted on the training scenes of the first model
     digests = {name: digest_of(some) for name, some in sources.items()}
     shared = {
         name
@@ -221,10 +221,10 @@ def _kept(
         if name in side.learnt or digest in side.learnt.values()
     }
     if not shared:
-        names = ", ".join(side.learnt) or "nothing it tells of"
+        names = ", ".join(side.learnt) or "unknown"
         return _all, f"{side.title} learnt from other sources ({names})", True
     if side.config is None:
-        note = f"{side.title} does not say how its scenes were split: it may have learnt from these"
+        note = f"{side.title} does not state its split: it may have learnt from these scenes"
         return _all, note, False
     data = side.config.data
     if data.split == "stable":
@@ -237,12 +237,12 @@ def _kept(
     if (own := _scenes_of(data, side.learnt, sources, digests, root)) is None:
         note = (
             f"{side.title} learnt from other versions of {', '.join(sorted(shared))}, and its "
-            "split cannot be made again: it may have learnt from these (a split that is stable "
+            "split cannot be reproduced: it may have learnt from these scenes (a stable split "
             "avoids this)"
         )
         return _all, note, False
     parts = split(own, seed=data.split_seed, protocol=data.split)
-    # By group whatever the protocol: of whom a near-duplicate was learnt has been seen.
+    # Filter by group for all protocols: scenes of one group are near-duplicates.
     learnt = {scene.group for part in ("train", "validation") for scene in parts[part]}
     return lambda scene: scene.group not in learnt, "", True
 
@@ -258,7 +258,7 @@ def _scenes_of(
     digests: Mapping[str, str],
     root: Path,
 ) -> list[AnnotatedScene] | None:
-    """The scenes that a side was split from, if they can be had as they were."""
+    """Return the scenes that a side was split from, or None if they are not available unchanged."""
     found: list[AnnotatedScene] = []
     for source in data.sources:
         name = source_name(source)

@@ -1,8 +1,8 @@
-"""A model asked about scenes in another model's classes.
+"""Query a model about scenes in the classes of another model.
 
-Each class of the scenes is what the model calls by its name, or nothing. Classes that the model
-pools under one name share its answer. What it does not know it is not shown; it can neither
-propose such a thing, which therefore comes last, nor suspect it, which therefore comes last too.
+Each class of the scenes is looked up in the model by name. Classes that the model pools under one
+name share its score. An unknown class is not shown to the model. The model can neither propose it
+nor suspect it, so it comes last in both cases.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from training.evaluation.setting import Contender
 
 Score = TypeVar("Score")
 
-# Beyond every log-odds, and finite: unknown classes tie for the last places.
+# Larger than every log-odds and finite, so that unknown classes share the last rank.
 BEYOND = 1e9
 
 
 def same_classes(a: Vocabulary, b: Vocabulary) -> bool:
-    """The two mean the same by every class index; sizes and aliases may differ."""
+    """Return True if all class indices have the same meaning; sizes and aliases may differ."""
     return a.labels == b.labels and bool((a.structure == b.structure).all())
 
 
 @dataclass(frozen=True, eq=False)
 class Translation:
-    """From the classes of scenes to those of a model.
+    """Mapping from the classes of scenes to the classes of a model.
 
     Attributes:
-        own: (V,) int64, the model's class of each class of the scenes, -1 for none.
-        size: how many classes the model has.
-        unknown: the score of what it has no class for.
+        own: (V,) int64, the model's class for each class of the scenes; -1 for an unknown class.
+        size: number of classes of the model.
+        unknown: score of an unknown class.
     """
 
     own: Tensor
@@ -47,7 +47,7 @@ class Translation:
 
     @classmethod
     def between(cls, scenes: Vocabulary, model: Vocabulary) -> Translation:
-        """By name, then by alias."""
+        """Match classes by name, then by alias."""
         own = []
         for entry in scenes.objects:
             named = (model.index(name) for name in (entry.label, *entry.aliases))
@@ -55,10 +55,10 @@ class Translation:
         return cls(torch.tensor(own, dtype=torch.int64), len(model))
 
     def contender(self, model: Contender, task: str) -> Contender:
-        """The model as one that understands the scenes' classes.
+        """Return the model as a contender for scenes in the other classes.
 
         Args:
-            task: in T3 and T3b what scores low is suspected, in others what scores high proposed.
+            task: T3 and T3b suspect low scores; the other tasks propose high scores.
         """
         if task.startswith("T3"):
             return replace(self, unknown=BEYOND)._contender(model)
@@ -75,13 +75,13 @@ class Translation:
         )
 
     def presence(self, v: Tensor) -> Tensor:
-        """(B, V) presence or counts of the scenes' classes as (B, model's V), the larger of two."""
+        """Map presence or counts (B, V) to the model's classes; pooled classes take the maximum."""
         known = self.own >= 0
         index = self.own[known].expand(len(v), -1)
         return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, known], "amax")
 
     def scores(self, values: Tensor) -> Tensor:
-        """(B, model's V) scores as (B, V), `unknown` where the model knows no such class."""
+        """Map scores of the model's classes to (B, V); unknown classes get `unknown`."""
         found = values[:, self.own.clamp(min=0)]
         return found.masked_fill(self.own < 0, self.unknown)
 
@@ -100,7 +100,7 @@ class Translation:
                     anchor=anchor[known],
                     outgoing=places.outgoing[known],
                 )
-                # A class that is present under a name shared with the missing one is no candidate.
+                # A present class may share its name with the missing class; then the score is -inf.
                 values = score(own).clamp(min=-BEYOND)
                 found[known] = self.scores(values)
             return found
@@ -117,7 +117,7 @@ class Translation:
         return translated
 
     def _score_row(self, score: RelationScore, batch: Batch, row: int, found: Tensor) -> None:
-        """Fill in what the model says of one scene; (A, n, n)."""
+        """Fill in the scores (A, n, n) of one scene."""
         classes = batch.classes[row]
         own = torch.where(classes >= 0, self.own[classes.clamp(min=0)], -1)
         kept = (own >= 0).nonzero().squeeze(1)
@@ -129,7 +129,7 @@ class Translation:
         holds, observed = torch.zeros(A, n, n), torch.zeros(A, n, n, dtype=torch.bool)
         pair = (slice(None), place[:, None], place[None, :])
         told = (slice(None), kept[:, None], kept[None, :])
-        # Where two classes are one to the model, what is told of either is told of it.
+        # Classes that the model pools share all their given relations.
         for a, i, j in batch.observed[row][told].nonzero().tolist():
             observed[a, place[i], place[j]] = True
             holds[a, place[i], place[j]] += batch.holds[row][told][a, i, j]
@@ -143,7 +143,7 @@ class Translation:
             room=torch.tensor([-1]),
         )
         values = score(small)[0].clamp(min=-BEYOND)[pair]
-        # Of two things that it calls by one name the model says nothing.
+        # The model cannot relate two objects of the same pooled class.
         apart = place[:, None] != place[None, :]
         found[told] = torch.where(apart, values, torch.tensor(self.unknown))
 

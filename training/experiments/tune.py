@@ -1,10 +1,10 @@
-"""`python -m training tune`: a search on validation scenes that optuna stores, samples and prunes.
+"""`python -m training tune`: search for settings on validation scenes with optuna.
 
-<folder>/<configuration>/study.log   every trial, as optuna's journal
-                         <digest>/   of a trial's configuration: its curve, reports and checkpoint
+<folder>/<configuration>/study.log   all trials, as a journal of optuna
+                         <digest>/   curve, reports and checkpoint of a trial
                          best.toml   the best configuration
 
-A space is a TOML file of settings with their choices or intervals:
+A search space is a TOML file of settings with choices or intervals:
 
     "machine.H1" = [100, 200, 400]
     "training.weight_decay" = { low = 0.01, high = 0.1, log = true }
@@ -55,16 +55,16 @@ FIGURES = {
     "MRR": ("T2 missing", "MRR"),
     "R-precision": ("T1a relations", "R-precision, instance counts"),
 }
-"""What trials are judged by: name to task and metric of the evaluation's tables."""
+"""Task and metric of the evaluation, by name; trials are judged by these metrics."""
 
 _BY: dict[By, tuple[str, ...]] = {
     "mrr": ("MRR",),
     "r-precision": ("R-precision",),
     "both": tuple(FIGURES),
 }
-# Trials must differ by the space alone: all learn from the same scenes with the same seed.
+# All trials use the same scenes and seed, so that they differ only in the searched settings.
 _FIXED = ("data.", "training.seed", "training.threads")
-# Median pruning needs so many finished trials, and so great a share of a run.
+# Median pruning starts after this number of finished trials and this share of a run.
 _RIVALS = 4
 _WARM_UP = 1 / 3
 
@@ -82,24 +82,26 @@ class _Interval(BaseModel):
 def tune(
     configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
     space: Annotated[
-        Path | None, typer.Option(help="what may vary; by default the shipped one of its name")
+        Path | None, typer.Option(help="TOML file of the search space; by default the shipped one")
     ] = None,
-    trials: Annotated[int, typer.Option(min=1, help="trials, earlier ones among them")] = 20,
-    by: Annotated[By, typer.Option(help="the figure to maximise")] = "both",
-    seed: Annotated[int, typer.Option(help="of the sampler")] = 0,
-    epochs: Annotated[int | None, typer.Option(min=1, help="for shorter cycles")] = None,
-    prune: Annotated[bool, typer.Option(help="give up on trials below the median")] = True,
+    trials: Annotated[
+        int, typer.Option(min=1, help="number of trials, including earlier ones")
+    ] = 20,
+    by: Annotated[By, typer.Option(help="metric to maximise")] = "both",
+    seed: Annotated[int, typer.Option(help="seed of the sampler")] = 0,
+    epochs: Annotated[int | None, typer.Option(min=1, help="epochs of a trial")] = None,
+    prune: Annotated[bool, typer.Option(help="stop trials below the median")] = True,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
-    folder: Annotated[Path, typer.Option("--folder", help="for trials and results")] = Path(
+    folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
         "runs/tuning"
     ),
-    fresh: Annotated[bool, typer.Option("--fresh", help="forget earlier trials")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="delete earlier trials")] = False,
 ) -> None:
-    """Search for better settings by validation scenes alone.
+    """Search for better settings on validation scenes only.
 
-    The configuration as it is comes first, then optuna's draws. The best one is written to
-    <folder>/<configuration>/best.toml. Ctrl-C keeps finished trials; the same command goes on from
-    there.
+    The first trial is the unchanged configuration; optuna samples the others. The best
+    configuration is written to <folder>/<configuration>/best.toml. After Ctrl-C, the same command
+    continues; finished trials are kept.
     """
     with resumable(console):
         original = load_config(configuration)
@@ -115,13 +117,13 @@ def tune(
         search.run(study, trials + 1)
     console.print(_table(study, original.name))
     if not _finished(study):
-        console.print("[red]error:[/red] no trial finished")
+        console.print("[red]error:[/red] all trials failed or were stopped early")
         raise typer.Exit(1)
     _conclude(search, study, original)
 
 
 def shipped_spaces() -> dict[str, Path]:
-    """The spaces that come with the package, by the name of their configuration."""
+    """Return the shipped search spaces by the name of their configuration."""
     folder = Path(__file__).parents[1] / "configs/spaces"
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
@@ -130,31 +132,31 @@ def _space(config: Config, path: Path | None) -> Path:
     shipped = shipped_spaces()
     if path is None and config.name not in shipped:
         raise ConfigError(
-            f"no search space comes with {config.name}, only with {', '.join(shipped)}: name a "
+            f"no shipped search space for {config.name}, only for {', '.join(shipped)}: name a "
             "TOML file with --space"
         )
     return path or shipped[config.name]
 
 
 def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
-    """Read a space; each of its values must fit the configuration.
+    """Read a search space; all its values must be valid in the configuration.
 
     Raises:
-        ConfigError: no such file, not TOML, an entry that is neither choices nor an interval, or a
-            setting that does not exist, does not fit or must not vary.
+        ConfigError: the file is missing or not TOML, an entry is neither choices nor an interval,
+            or a setting is unknown, invalid or fixed.
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ConfigError(f"no search space {path}") from error
+        raise ConfigError(f"search space {path} does not exist") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not TOML: {error}") from error
     if not values:
-        raise ConfigError(f"{path.name} names no setting")
+        raise ConfigError(f"{path.name} contains no settings")
     found = {}
     for name, entry in values.items():
         if name.startswith(_FIXED):
-            raise ConfigError(f"{name!r} is no setting to search: all trials share it")
+            raise ConfigError(f"{name!r} is fixed: all trials share it, so it cannot be searched")
         try:
             found[name] = _distribution(entry)
         except (ValueError, ValidationError) as error:
@@ -192,13 +194,14 @@ def _first_line(error: Exception) -> str:
 
 
 class Search:
-    """Trials of a study: train, report every epoch, judge on all validation scenes.
+    """Trials of a study: train, report each epoch, and measure on all validation scenes.
 
     Args:
-        folder: of the study.
-        config: what all trials share.
-        space: what they differ in.
-        by: the figure to maximise.
+        folder: folder of the study.
+        config: the common configuration.
+        data: the scenes.
+        space: the settings to search.
+        by: metric to maximise.
     """
 
     def __init__(
@@ -212,13 +215,13 @@ class Search:
         self.folder, self.config, self.data, self.space, self.by = folder, config, data, space, by
 
     def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
-        """The study on disk, made where there is none.
+        """Open the study on disk or create it.
 
         Args:
             scenes: digest of the scenes.
 
         Raises:
-            ConfigError: the folder holds a search over another configuration or other scenes.
+            ConfigError: the folder holds a search with another configuration, scenes or metric.
         """
         import optuna
         from optuna.storages.journal import JournalFileBackend
@@ -236,26 +239,26 @@ class Search:
             if prune
             else optuna.pruners.NopPruner(),
         )
-        # A resumed sampler of the same seed would draw the same first points again.
+        # With the same seed, a resumed sampler would repeat its first points.
         study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.trials))
         identity = {"config": self.config.digest, "scenes": scenes, "by": self.by}
         if study.user_attrs.setdefault("identity", identity) != identity:
             raise ConfigError(
-                f"{self.folder} holds a search over another configuration or other scenes, or by "
-                "another figure; give --fresh or another folder"
+                f"{self.folder} holds a search with another configuration, scenes or metric; use "
+                "--fresh or another folder"
             )
         study.set_user_attr("identity", identity)
         return study
 
     def run(self, study: Study, trials: int) -> None:
-        """Run until so many trials are over, the configuration as it is first."""
+        """Run until the study has this number of trials; the first uses the unchanged settings."""
         import optuna
         from optuna.trial import TrialState
 
         if not study.trials:
             study.enqueue_trial({}, user_attrs={"as it is": True})
         for halted in study.get_trials(states=(TrialState.RUNNING,)):
-            # Stopped in the middle: its checkpoint lies in its folder.
+            # An interrupted trial is queued again and resumes from its checkpoint.
             original = halted.user_attrs.get("as it is", False)
             study.enqueue_trial(halted.params, user_attrs={"as it is": original})
             study.tell(halted.number, state=TrialState.FAIL)
@@ -276,11 +279,11 @@ class Search:
             console.print(f"{shown(settings)}: {reason or value}", markup=False)
 
     def value_of(self, trial: Trial, settings: Mapping[str, Any]) -> float:
-        """Train and judge one trial.
+        """Train and measure one trial.
 
         Raises:
-            FloatingPointError: it diverged.
-            optuna.TrialPruned: its best epoch is below the median of earlier trials.
+            FloatingPointError: the training diverged.
+            optuna.TrialPruned: the best epoch is below the median of earlier trials.
         """
         import optuna
 
@@ -322,7 +325,7 @@ class Search:
         return self.metrics(trainer.config.digest)
 
     def metrics(self, digest: str) -> dict[str, Metric]:
-        """`FIGURES` of a finished trial over all validation scenes."""
+        """Return `FIGURES` of a finished trial, over all validation scenes."""
         texts = (
             (self.folder / digest[:12] / f"{source}.json").read_text(encoding="utf-8")
             for source in sorted({scene.source for scene in self.data.validation.scenes})
@@ -336,7 +339,7 @@ class Search:
 
 
 def shown(settings: Mapping[str, Any]) -> str:
-    """Settings in one line."""
+    """Format settings in one line."""
     return ", ".join(f"{name.partition('.')[2]} {v}" for name, v in settings.items()) or "as it is"
 
 
@@ -361,7 +364,7 @@ def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str,
 
 
 def _table(study: Study, title: str) -> Table:
-    """Trials from best to worst, those without figures last."""
+    """Return a table of trials from best to worst; trials without a value come last."""
     table = Table(*FIGURES, "state", "settings", title=title)
     trials = [trial for trial in study.trials if "settings" in trial.user_attrs]
     for trial in sorted(trials, key=lambda t: math.inf if t.value is None else -t.value):
@@ -374,7 +377,7 @@ def _table(study: Study, title: str) -> Table:
 
 
 def _conclude(search: Search, study: Study, original: Config) -> None:
-    """Write the best configuration, with the original's own number of epochs."""
+    """Write the best configuration with the original number of epochs."""
     best = study.best_trial
     base = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
     settings, digest = best.user_attrs["settings"], best.user_attrs["digest"]
@@ -382,14 +385,14 @@ def _conclude(search: Search, study: Study, original: Config) -> None:
     figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
     comment = [
         f"{original.name}, {shown(settings)}.",
-        f"On validation scenes, {search.config.training.epochs} epochs: {figures}.",
+        f"Validation scenes, {search.config.training.epochs} epochs: {figures}.",
     ]
     if settings and base is not None:
         ours, theirs = search.metrics(digest), search.metrics(base.user_attrs["digest"])
         gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
-        comment.append(f"Minus {original.name} as it is, paired by scenes: {', '.join(gaps)}.")
+        comment.append(f"Difference to {original.name}, paired by scenes: {', '.join(gaps)}.")
         comment.append(
-            f"The best of {len(study.trials)} flatters itself: train both with more seeds."
+            f"The best of {len(study.trials)} trials is biased upwards: train both with more seeds."
         )
     path = search.folder / "best.toml"
     text = "".join(f"# {line}\n" for line in comment) + "\n" + config_toml(tuned)

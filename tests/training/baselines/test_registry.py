@@ -172,14 +172,14 @@ def test_a_place_tells_what_is_missing(train, validation):
 @named(EVERY)
 def test_nothing_to_learn_from_is_an_error(baseline, validation):
     empty = tensors([scene([], annotated=False)])
-    with pytest.raises(ValueError, match="no objects in 1 training scenes"):
+    with pytest.raises(ValueError, match="the 1 training scenes contain no objects"):
         baseline.fit(empty, validation, STRUCTURE)
 
 
 @named([one for one in EVERY if one.learns_relations])
 def test_no_relation_to_learn_from_is_an_error(baseline, validation):
     bare = tensors([scene([0, 1], annotated=False)])
-    with pytest.raises(ValueError, match="no relation was observed in 1 training scenes"):
+    with pytest.raises(ValueError, match="the 1 training scenes contain no observed relation"):
         baseline.fit(bare, validation, STRUCTURE)
 
 
@@ -191,7 +191,7 @@ def test_densities_beat_independent_classes(train, validation):
 
 @named([one for one in EVERY if one is not DENSITY])
 def test_nothing_to_choose_by_is_an_error(baseline, train):
-    with pytest.raises(ValueError, match="no scene"):
+    with pytest.raises(ValueError, match=r"no scene|all scenes"):
         baseline.fit(train, tensors([scene([0])]), STRUCTURE)
 
 

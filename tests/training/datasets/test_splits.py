@@ -107,5 +107,5 @@ def test_bad_requests_are_refused() -> None:
     scenes = collection("a", 3)
     with pytest.raises(ValueError, match="protocol must be"):
         split(scenes, seed=0, protocol="house")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="share one scene_id"):
+    with pytest.raises(ValueError, match="have the same scene_id"):
         split([*scenes, scenes[0]], seed=0)

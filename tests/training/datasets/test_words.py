@@ -58,8 +58,8 @@ def test_classes_have_the_vector_of_their_label_or_alias(tmp_path: Path) -> None
     [
         ({"words": None}, "words: is missing"),
         ({"words": np.array([1, 2, 3, 4, 5])}, "words: must be 1 to"),
-        ({"words": np.array(["a", "A", "b", "c", "d"])}, "words: has a word twice"),
-        ({"words": np.array(["a", {}, 1, 2, 3], dtype=object)}, "words: must be plain"),
+        ({"words": np.array(["a", "A", "b", "c", "d"])}, "words: contains a word twice"),
+        ({"words": np.array(["a", {}, 1, 2, 3], dtype=object)}, "words: must be a plain array"),
         ({"words": WORDS[:0], "vectors": VECTORS[:0]}, "words: must be 1 to"),
         ({"vectors": VECTORS[1:]}, "vectors: must be 5 rows of int8"),
         ({"vectors": VECTORS.astype(np.float32)}, "vectors: must be 5 rows of int8"),
@@ -83,7 +83,9 @@ def test_malformed_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         with pytest.raises(DatasetError, match=r"vectors\.npz"):
             read_word_vectors(path)
     monkeypatch.setattr(words, "MAX_BYTES", 64)
-    with pytest.raises(DatasetError, match=r"vectors\.npz, words: must be plain and at most"):
+    with pytest.raises(
+        DatasetError, match=r"vectors\.npz, words: must be a plain array of at most"
+    ):
         read_word_vectors(save(tmp_path))
 
 

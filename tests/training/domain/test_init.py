@@ -90,7 +90,7 @@ def test_every_bad_line_is_named_up_to_a_bound(tmp_path) -> None:
     path = tmp_path / "scenes.jsonl"
     path.write_text("\n".join([*good, *bad, *["[]"] * 30]))
     output = invoke("init", "lab", path, "--output", tmp_path / "lab", code=1)
-    assert "34 lines are no scenes" in output
+    assert "34 lines are not scenes" in output
     for line, reason in (
         (4, "not JSON"), (5, "lacks label"), (6, "names an object that is not in the scene"),
         (7, "is on line 1 already"),
@@ -106,8 +106,8 @@ def test_every_bad_line_is_named_up_to_a_bound(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("Lab One",), "lower case"),
-        (("indoor-triway",), "is shipped"),
+        (("Lab One",), "lower-case words"),
+        (("indoor-triway",), "shipped configuration"),
         (("lab", "--format", "csv"), "unknown format"),
     ],
 )
@@ -122,7 +122,7 @@ def test_too_few_scenes_are_told(tmp_path) -> None:
     write_jsonl(SCENES[:3], path)
     assert "cannot be split" in invoke("init", "lab", path, "--output", tmp_path / "o", code=1)
     path.write_text("")
-    assert "no scene in it" in invoke("init", "lab", path, "--output", tmp_path / "o", code=1)
+    assert "contains no scene" in invoke("init", "lab", path, "--output", tmp_path / "o", code=1)
 
 
 def test_a_name_that_tells_no_format_is_copied_as_one_that_does(tmp_path) -> None:

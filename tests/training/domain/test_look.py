@@ -49,27 +49,27 @@ def test_objects_alone_teach_no_relation() -> None:
 
 def test_both_sides_of_a_pair_contradict_each_other_in_either_wording() -> None:
     count, examples = finding(
-        "both ways", scene("a", "cup", "pot", relations=[(0, "left", 1), (0, "right", 1)])
+        "both directions", scene("a", "cup", "pot", relations=[(0, "left", 1), (0, "right", 1)])
     )
     assert count == 1
     assert "cup (0) and pot (1)" in examples[0]
     agreed = scene("a", "cup", "pot", relations=[(0, "left", 1), (1, "right", 0)])
-    assert finding("both ways", agreed) == (0, [])
+    assert finding("both directions", agreed) == (0, [])
 
 
 def test_what_carries_its_own_carrier_is_found() -> None:
     circle = [(0, "on-top", 1), (1, "on-top", 2), (2, "on-top", 0), (3, "on-top", 0)]
-    count, (example,) = finding("circle", scene("a", "cup", "tray", "box", "pen", relations=circle))
+    count, (example,) = finding("cycle", scene("a", "cup", "tray", "box", "pen", relations=circle))
     assert count == 1
     assert "pen" not in example
-    assert finding("circle", scene("a", "cup", "tray", "box", relations=circle[:2])) == (0, [])
+    assert finding("cycle", scene("a", "cup", "tray", "box", relations=circle[:2])) == (0, [])
     supports = scene("b", "cup", "tray", supported_by=["1", "0"])
-    assert finding("circle", supports)[0] == 1
+    assert finding("cycle", supports)[0] == 1
 
 
 def test_on_top_of_what_is_above_it() -> None:
     scenes = scene("a", "cup", "table", relations=[CUP_ON_TABLE, (1, "above", 0)])
-    assert finding("on top of", scenes)[0] == 1
+    assert finding("on-top of", scenes)[0] == 1
 
 
 def test_copies_in_other_groups_are_found() -> None:

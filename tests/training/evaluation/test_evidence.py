@@ -145,5 +145,5 @@ def test_a_planted_cheater_is_caught(monkeypatch):
 
     monkeypatch.setattr(evidence, "missing_probabilities", cheat)
     setting = Setting(DATA, STRUCTURE, limit=None)
-    with pytest.raises(LeakError, match="something leaks"):
+    with pytest.raises(LeakError, match="leaks information"):
         missing_evidence_task(Contender(artifact=room_model()), setting)

@@ -97,7 +97,7 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         ("", "row: Field required"),
         ('[[row]]\nname = "x"', "row.0.what: Field required"),
         (ONE.format(name="x", rest="change = {}"), "row.0.change: Extra inputs"),
-        (ONE.format(name="x", rest=""), "x: it changes nothing in indoor-triway"),
+        (ONE.format(name="x", rest=""), "x: the row does not change indoor-triway"),
         (ONE.format(name="x y", rest='from = "seed-rbm"'), "x y: String should match"),
         (ONE.format(name="x", rest='from = "nobody"'), "x: no configuration 'nobody'"),
         (ONE.format(name="x", rest='changes = { "a.b" = 1 }'), "x: no setting 'a.b'"),
@@ -105,8 +105,11 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         (ONE.format(name="x", rest='changes = { "machine.without" = ["g"] }'), "no weights g"),
         (SEED.format(settings='"machine.N" = 0'), "machine.G is defined for the local form"),
         (SEED.format(settings='"machine.G" = 0, "machine.N" = 9'), "machine.N is defined for the"),
-        (ONE.format(name="indoor-triway", rest='from = "seed-rbm"'), "two rows are called indoor"),
-        (ONE.format(name="x", rest='from = "seed-rbm"') * 2, "two rows are called x"),
+        (
+            ONE.format(name="indoor-triway", rest='from = "seed-rbm"'),
+            "two rows have the name indoor",
+        ),
+        (ONE.format(name="x", rest='from = "seed-rbm"') * 2, "two rows have the name x"),
     ],
 )
 def test_bad_rows_say_what_is_wrong(tmp_path, text, message):

@@ -151,7 +151,7 @@ def test_the_shuffled_control_has_a_page_for_each_task(finished, task, rows):
     assert {cell["row"] for cell in control["cells"]} == rows | MACHINES
     assert {gap["row"] for gap in control["differences"]} == (rows | MACHINES) - {control["ours"]}
     text = (finished[1] / "shuffled" / task / "results.md").read_text()
-    assert f"Above {control['ours']} with the whole interval: " in text
+    assert f"above {control['ours']} over the whole interval: " in text
 
 
 def test_the_control_learns_from_other_scenes_and_is_asked_about_the_same(finished, results):
@@ -180,9 +180,9 @@ def test_rows_above_the_yardstick_are_named():
         for source in ("x", "pooled")
     )
     text = shuffled_text("T2 missing", Results("popularity", (), differences))
-    assert "Above popularity with the whole interval: sees more by 0.200." in text
+    assert "above popularity over the whole interval: sees more by 0.200." in text
     none = shuffled_text("T2 missing", Results("popularity", (), ()))
-    assert "with the whole interval: no row." in none
+    assert "over the whole interval: none." in none
 
 
 def test_plots_lie_beside_the_results(finished):
@@ -223,7 +223,7 @@ def test_every_trial_is_kept(finished):
     [
         (("--baseline", "nobody"), "unknown baselines ['nobody']"),
         (("--task", "T9"), "unknown task 'T9'"),
-        (("--shuffled", "--task", "T4"), f"only {', '.join(YARDSTICKS)} are asked"),
+        (("--shuffled", "--task", "T4"), f"only the tasks {', '.join(YARDSTICKS)}"),
     ],
 )
 def test_bad_requests_are_named(tmp_path, others, message):
@@ -268,7 +268,7 @@ def test_configurations_of_one_data_section_are_a_domain(tmp_path):
     found = read_domains(["indoor-rbm", "open-triway", "indoor-triway"])
     assert [domain.name for domain in found] == ["indoor", "open"]
     assert [config.name for config in found[0].configs] == ["indoor-rbm", "indoor-triway"]
-    with pytest.raises(ConfigError, match="two configurations are called indoor-rbm"):
+    with pytest.raises(ConfigError, match="two configurations have the name indoor-rbm"):
         read_domains(["indoor-rbm", "indoor-rbm"])
     with pytest.raises(ConfigError, match="different data sections"):
         read_domains([write(tmp_path), write(tmp_path, variant="rbm", rooms=50)])
@@ -314,7 +314,7 @@ def test_recall_curves_follow_the_figures():
 
 
 def test_a_summary_needs_our_row():
-    with pytest.raises(ValueError, match="no report of ours"):
+    with pytest.raises(ValueError, match="the reports lack the row ours"):
         summarise({}, "ours")
 
 
@@ -351,11 +351,11 @@ def test_a_folder_of_another_row_or_other_scenes_is_refused(tmp_path):
     measure_rows(_plan(tmp_path), [row("1")], print)
     with pytest.raises(BenchmarkError, match="another configuration of row"):
         measure_rows(_plan(tmp_path), [row("2")], print)
-    with pytest.raises(BenchmarkError, match="learnt from other scenes"):
+    with pytest.raises(BenchmarkError, match="other training scenes"):
         measure_rows(_plan(tmp_path, "other scenes"), [row("1")], print)
     # Nor one that does not say what it learnt from.
     (tmp_path / "row/seed-0/row.json").write_text(json.dumps({"identity": "1"}))
-    with pytest.raises(BenchmarkError, match="learnt from other scenes"):
+    with pytest.raises(BenchmarkError, match="other training scenes"):
         measure_rows(_plan(tmp_path), [row("1")], print)
 
 

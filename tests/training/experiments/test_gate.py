@@ -86,7 +86,7 @@ def test_what_was_measured_at_relations_gives_way_to_nothing_that_was_not(
         return
     with pytest.raises(WorseError) as refused:
         ask()
-    assert "nothing shows how new does at T1a relations, T3b placement" in str(refused.value)
+    assert "old was measured in T1a relations, T3b placement, but new was not" in str(refused.value)
     assert "worse" not in str(refused.value)
 
 
@@ -98,7 +98,7 @@ def test_an_alias_serves_a_model_or_nothing_that_can_be_compared_with(tmp_path) 
     assert found.holder.config is None  # random weights do not say how they were trained
     new = seat(store, "fresh")
     assert (new.target, new.holder) == (None, None)
-    assert "nothing is served as fresh yet" in new.note
+    assert "fresh is a new alias" in new.note
     corrupt(store.root, "home", "1.0.0")
     broken = seat(store, "default")
     assert str(broken.target) == "home@1.0.0"

@@ -71,7 +71,7 @@ def test_a_random_split_leaves_no_group_untouched_that_it_learnt_from(tmp_path) 
     try:
         groups = {scene.group for scene in held_out(a, b, SCENES, tmp_path).scenes}
     except ConfigError as error:
-        assert "nothing is held out for both" in str(error)  # noqa: PT017
+        assert "no common held-out scenes" in str(error)  # noqa: PT017
         groups = set()
     assert not groups & learnt
 
@@ -103,5 +103,5 @@ def test_a_model_of_other_sources_has_seen_nothing(tmp_path) -> None:
 
 
 def test_who_does_not_say_what_was_held_out_cannot_come_first(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="does not say how its scenes were split"):
+    with pytest.raises(ConfigError, match="does not state how its scenes were split"):
         held_out(BASELINES, side("b"), SCENES, tmp_path)

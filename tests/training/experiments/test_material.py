@@ -103,7 +103,7 @@ def test_every_part_needs_scenes(tmp_path):
     write_scenes(tmp_path, "flats")
     scenes = material(tmp_path)
     for part in scenes.parts:
-        with pytest.raises(ConfigError, match=f"no scene is in the {part} part"):
+        with pytest.raises(ConfigError, match=f"the {part} part contains no scenes"):
             Material.of(replace(scenes, parts=scenes.parts | {part: []}))
 
 
@@ -149,7 +149,7 @@ def test_the_control_leaves_relations_out_as_well(unrelated):
 def test_a_control_of_relations_alone_needs_some(unrelated, tmp_path):
     (domain,) = read_domains([str(unrelated / "config.toml")])
     options = Options(unrelated, ("T1a relations",), quick=True)
-    with pytest.raises(ValueError, match="flats has no relations to shuffle"):
+    with pytest.raises(ValueError, match="flats contain no relations to shuffle"):
         compare_on_shuffled(domain, tmp_path, options)
 
 

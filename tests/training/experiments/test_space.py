@@ -46,8 +46,8 @@ def test_choices_and_intervals_are_read(tmp_path):
         ('"training.rate" = [0.1]', "no setting 'training.rate': training has optimiser"),
         ('"epochs" = [3]', "no setting 'epochs': name it section.entry"),
         ('"training.epochs" = [0]', "training.epochs: Input should be greater"),
-        ('"training.seed" = [0, 1]', "'training.seed' is no setting to search"),
-        ('"data.limit" = [20]', "'data.limit' is no setting to search"),
+        ('"training.seed" = [0, 1]', "'training.seed' is fixed"),
+        ('"data.limit" = [20]', "'data.limit' is fixed"),
         ('"machine.H1" = [', "is not TOML"),
         ('"machine.H1" = 3', "write a list of choices, or"),
         ('"machine.H1" = []', "write a list of choices, or"),
@@ -55,7 +55,7 @@ def test_choices_and_intervals_are_read(tmp_path):
         ('"machine.H1" = { low = 3, high = 2 }', "low must be below high"),
         ('"machine.H1" = { low = 0, high = 2, log = true }', "low"),
         ('"machine.H1" = { low = "a", high = 2 }', "machine.H1: low"),
-        ("", "names no setting"),
+        ("", "contains no settings"),
     ],
 )
 def test_bad_spaces_say_what_is_wrong(tmp_path, text, message):
@@ -64,7 +64,7 @@ def test_bad_spaces_say_what_is_wrong(tmp_path, text, message):
 
 
 def test_a_missing_space_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"no search space .*nowhere.toml"):
+    with pytest.raises(ConfigError, match=r"search space .*nowhere.toml does not exist"):
         load_space(tmp_path / "nowhere.toml", CONFIG)
 
 
