@@ -46,15 +46,15 @@ router = APIRouter(
     generate_unique_id_function=operation_id,
 )
 
-# The schemas in the routes describe the answers. Validation of an answer would cost as much as its
-# JSON; the tests validate.
+# The schemas in the routes only document the answers. Validating an answer would take as long as
+# writing its JSON, so the tests do it instead.
 
 
 def begin(http: Request) -> serving.Request:
-    """The request as the models see it.
+    """Return the request as the serving layer uses it.
 
     Raises:
-        NotReadyError: nothing has been loaded yet.
+        NotReadyError: the models are not loaded yet.
     """
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
     found: serving.Request = runtime.request(
@@ -65,46 +65,46 @@ def begin(http: Request) -> serving.Request:
 
 @router.post(
     "/relations",
-    summary="How do these objects stand to each other?",
+    summary="Which relations hold between these objects?",
     response_model=RelationsAnswer,
 )
 async def relations(asked: RelationsRequest, http: Request) -> bytes:
-    """The likeliest relations between the objects of a scene, best first."""
+    """The most probable relations between the objects of a scene, best first."""
     return written(await questions.relations(begin(http), asked))
 
 
 @router.post(
     "/missing",
-    summary="What else should be here, and where?",
+    summary="Which objects are missing, and where would they stand?",
     response_model=MissingAnswer,
 )
 async def missing(asked: MissingRequest, http: Request) -> bytes:
-    """The likeliest absent objects, and where each would stand.
+    """The most probable missing objects, each with its most probable places.
 
-    A class that is present is never proposed again: how many chairs a table wants is outside the
-    models.
+    The answer proposes only classes that the scene does not contain: the models do not count
+    objects of one class.
     """
     return written(await questions.missing(begin(http), asked))
 
 
 @router.post(
     "/outliers",
-    summary="What does not belong here, or stands in the wrong place?",
+    summary="Which objects do not belong here, or stand in the wrong place?",
     response_model=OutliersAnswer,
 )
 async def outliers(asked: OutliersRequest, http: Request) -> bytes:
-    """Every object, least fitting first, and every given relation, least likely first.
+    """All objects, least fitting first, and all observed relations, least probable first.
 
-    Instances of one class are scored alike; only `misplaced` tells them apart.
+    Objects of the same class get the same score; only `misplaced` differs between them.
     """
     return written(await questions.outliers(begin(http), asked))
 
 
 @router.post(
     "/generate",
-    summary="What would a scene like this look like?",
+    summary="What does a scene like this look like?",
     response_model=GenerateAnswer,
 )
 async def generate(asked: GenerateRequest, http: Request) -> bytes:
-    """Scenes drawn from the model that contain the evidence; the same seed draws the same ones."""
+    """Scenes sampled from the model, given the evidence; the same seed gives the same scenes."""
     return written(await questions.generate(begin(http), asked))
