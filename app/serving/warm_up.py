@@ -1,4 +1,4 @@
-"""One real question of each kind to a model before anybody depends on it."""
+"""Warm-up: ask a model one real question of each kind before it serves requests."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from app.scene.scene import Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 
 STEPS = 1
-"""Gibbs sweeps of the drawing: more take their time and warm nothing further."""
+"""Gibbs sweeps per generated scene; one sweep is enough to compile the kernels."""
 
 
 def warm_up(artifact: Artifact) -> None:
-    """Ask everything once, with and without given relations and with poses: the first call of a
-    compiled loop compiles it.
+    """Ask all questions once, with observed relations, without them, and with poses.
+
+    The first call of a kernel compiles it.
 
     Raises:
         ValueError: an answer is not finite.
-        Exception: whatever the model raises.
+        Exception: any exception of the model.
     """
     scene = _scene(artifact.vocabulary)
     bare = replace(scene, relations=None)
@@ -33,7 +34,7 @@ def warm_up(artifact: Artifact) -> None:
     if len(scene.objects) > 1:
         questions.missing(artifact, bare, at=("on-top", 0))
         questions.missing(artifact, scene, at=("under", 0))
-    # With threshold 0 every object is an outlier: reasons and companions are asked for, too.
+    # With threshold 0 every object is an outlier, so its explanation is computed as well.
     _, outliers, misplaced = questions.outliers(artifact, scene, threshold=0.0)
     for one in scenes[1:]:
         outliers += questions.outliers(artifact, one).outliers
@@ -45,11 +46,11 @@ def warm_up(artifact: Artifact) -> None:
     numbers += [entry.probability for entry in misplaced]
     numbers += [entry.log_score for entry in generated]
     if not all(map(math.isfinite, significant(numbers))):
-        raise ValueError("the model gives answers that are not finite")
+        raise ValueError("an answer of the model is not finite")
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """Three kinds of things, or as many as there are, in a row; one is said to be on another."""
+    """Return a scene of up to three classes in a row, with one observed relation."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
         SceneObject(str(place), vocabulary.labels[index], index, position=(1.0, 0.5 * place, 0.5))
