@@ -5,8 +5,8 @@ code. But this code also contains functions and constants of other files. So the
 directory is a digest of all these files, of the versions of Python, numba, llvmlite and numpy, and
 of the CPU. `python -m app.compile` fills the directory before the first start.
 
-The directory contains pickled code: whoever can write to it can run code in the service. Only the
-user of the service may access it. The service refuses a directory that other users can change.
+The directory contains pickled code: a user who can write to it can run code in the service. So only
+the user of the service may access it. The service refuses a directory that other users can change.
 """
 
 from __future__ import annotations

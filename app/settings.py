@@ -88,7 +88,9 @@ class Settings(BaseSettings):
     )
 
     host: Annotated[str, Field(min_length=1, description="address to listen on")] = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535, description="0 = any free port")] = 8000
+    port: Annotated[
+        int, Field(ge=0, le=65535, description="port to listen on; 0 = any free port")
+    ] = 8000
     store: Annotated[Path, Field(description="directory of published models")] = Path("model_store")
     store_poll: Annotated[
         float,

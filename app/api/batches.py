@@ -118,7 +118,7 @@ def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
     response_model=BatchAnswer[RelationsAnswer],
 )
 async def relations_batch(asked: BatchRequest[RelationsRequest], http: Request) -> bytes:
-    """As `POST /relations`, for up to 256 scenes."""
+    """Answer `POST /relations` for up to 256 scenes."""
     return await _answer_each(http, asked, RelationsRequest, questions.relations)
 
 
@@ -128,7 +128,7 @@ async def relations_batch(asked: BatchRequest[RelationsRequest], http: Request) 
     response_model=BatchAnswer[MissingAnswer],
 )
 async def missing_batch(asked: BatchRequest[MissingRequest], http: Request) -> bytes:
-    """As `POST /missing`, for up to 256 scenes."""
+    """Answer `POST /missing` for up to 256 scenes."""
     return await _answer_each(http, asked, MissingRequest, questions.missing)
 
 
@@ -138,5 +138,5 @@ async def missing_batch(asked: BatchRequest[MissingRequest], http: Request) -> b
     response_model=BatchAnswer[OutliersAnswer],
 )
 async def outliers_batch(asked: BatchRequest[OutliersRequest], http: Request) -> bytes:
-    """As `POST /outliers`, for up to 256 scenes."""
+    """Answer `POST /outliers` for up to 256 scenes."""
     return await _answer_each(http, asked, OutliersRequest, questions.outliers)

@@ -228,7 +228,7 @@ INTERNAL_ERROR: Final = ProblemType(
 UPGRADE_REQUIRED: Final = ProblemType(
     "upgrade-required",
     426,
-    "This address is for WebSockets",
+    "This route is for WebSockets",
     "GET /stream opens a WebSocket of version 13. Send its handshake as the first request of a "
     "connection, or after the answers to all earlier requests. docs/stream.md describes the rest.",
 )

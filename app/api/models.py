@@ -145,7 +145,7 @@ async def move_alias(
     alias: Annotated[
         str,
         Path(
-            description="`default`, or any name of your own",
+            description="`default`, or another name of your choice",
             openapi_examples={"default": {"summary": "the default model", "value": "default"}},
         ),
     ],

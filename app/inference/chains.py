@@ -7,7 +7,7 @@ the end, because in the local form they do not act on the other units.
 The stored scene is sampled with these weights given the evidence,
 
     log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
-            - 6 [drawn under another room type than t],
+            - 6 [sampled under another room type than t],
 
 with h1 at its mean given the scene. If the store has no scene of room type t, the last term is
 h1·Q[t].
@@ -261,7 +261,7 @@ class ConditionedChains:
         return x[0].astype(np.float32), m2[0]
 
     def _logits(self, classes: Places, h1: Bits) -> Floats:
-        """ℓ between the classes, one instance each, (A, n, n)."""
+        """Return the logits between classes with one instance each, (A, n, n)."""
         n, A = len(classes), self._machine.spec.A
         ends = _present(classes, *all_pairs(n), np.zeros(n, np.float32))
         mean, _ = self._chains.units.normal(h1[None].astype(np.float32), ends, known=True)

@@ -412,7 +412,7 @@ class FreeUnits(RelationUnits):
 
     ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1
 
-    Other triples do not have a unit: they are no evidence, and their log-odds are `NO_UNIT`.
+    Other triples do not have a unit: they do not act as evidence. Their log-odds are `NO_UNIT`.
 
     Args:
         weights: weights of the machine.

@@ -50,7 +50,7 @@ class RegistryError(Exception):
 
 
 class ArtifactError(RegistryError):
-    """One artifact cannot be used.
+    """An artifact is not usable.
 
     Attributes:
         code: machine-readable kind of failure.

@@ -99,7 +99,7 @@ def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
     except (ValueError, RecursionError):
         if complete:
             raise ArtifactError("invalid_manifest", f"{MANIFEST} is not JSON") from None
-        raise ArtifactError("truncated", f"{MANIFEST} is cut off or not JSON") from None
+        raise ArtifactError("truncated", f"{MANIFEST} is truncated or not JSON") from None
     if not isinstance(members, dict):
         raise ArtifactError("invalid_manifest", f"{MANIFEST} is not a JSON object")
     return members

@@ -194,7 +194,7 @@ def prepare(
         try:
             warm_up(artifact)
         except Exception:
-            # A broken model must not stop the other models, whatever it raises.
+            # An exception of a broken model must not stop the other models.
             subject = f"{key[0]}@{key[1]}"
             _logger.exception("%s failed its warm-up", subject)
             failures[key] = Failure(

@@ -99,7 +99,7 @@ class LookUps:
         self, vocabulary: Vocabulary, label: str, *, is_room: bool, limit: int
     ) -> tuple[Match, ...] | None:
         """Return the entries nearest to an unknown label; None after ``limit`` look-ups."""
-        key = id(vocabulary), label, is_room  # the request keeps its models
+        key = id(vocabulary), label, is_room  # the id stays valid: the request keeps its models
         if key not in self._found:
             if len(self._found) >= limit:
                 return None
@@ -345,7 +345,7 @@ def read_scene(
             objects.append(_scene_object(ids[place], entry, index, optical=optical))
     room = None if request.room_type is None else _room(request.room_type, unknown, faults)
     if not objects and not may_be_empty and not faults.found:
-        faults.add(Reason.INVALID, ("objects",), "the model knows none of the objects")
+        faults.add(Reason.INVALID, ("objects",), "the model does not know any of these objects")
     if faults.found:
         faults.raise_any()
 
@@ -364,15 +364,13 @@ def read_scene(
 
 def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
     if len(request.objects) > limits.objects:
-        faults.add(
-            Reason.INVALID, ("objects",), f"must not hold more than {limits.objects} objects"
-        )
+        faults.add(Reason.INVALID, ("objects",), f"must have at most {limits.objects} objects")
     if request.relations is None:
         if request.relations_complete:
             faults.add(Reason.INVALID, ("relations_complete",), "requires relations")
     elif len(request.relations) > limits.relations:
         faults.add(
-            Reason.INVALID, ("relations",), f"must not hold more than {limits.relations} relations"
+            Reason.INVALID, ("relations",), f"must have at most {limits.relations} relations"
         )
     if faults.found:
         faults.raise_any()

@@ -85,7 +85,7 @@ class StreamScene:
                 faults.add(Reason.INVALID, ("objects", place, "id"), "another object has this id")
         scene = self._scene.after(message)
         if len(scene.objects) > request.limits.objects:
-            text = f"the scene would hold more than {request.limits.objects} objects"
+            text = f"the scene would have more than {request.limits.objects} objects"
             faults.add(Reason.INVALID, ("objects",), text)
         faults.raise_any()
         try:
