@@ -112,8 +112,8 @@ REFRESH_REFUSED: Final = ProblemType(
     "refresh-refused",
     409,
     "The new state of the store was refused",
-    "A version in the store failed its verification or its warm-up, or an alias points to no "
-    "usable version. The service still serves the versions that it served before. "
+    "A version in the store failed its verification or its warm-up, or the target of an alias is "
+    "not usable. The service still serves the versions that it served before. "
     "`failures` lists each refused version or alias with the reason.",
 )
 STORE_NOT_WRITABLE: Final = ProblemType(
@@ -128,7 +128,7 @@ STORE_BUSY: Final = ProblemType(
     503,
     "Another process is writing to the store",
     "That process holds the lock of the store, for example while it publishes a version. "
-    "Send the request again after the seconds in Retry-After.",
+    "Send the request again after the time in Retry-After.",
 )
 BODY_TOO_LARGE: Final = ProblemType(
     "body-too-large",
@@ -142,7 +142,7 @@ BODIES_FULL: Final = ProblemType(
     "The service holds too many bytes of request bodies",
     "The bodies of all requests in progress may hold at most SCENE_HELD_BODY_BYTES together. The "
     "service always accepts a body of at most 64 KiB that arrives in one piece. Send the request "
-    "again after the seconds in Retry-After.",
+    "again after the time in Retry-After.",
 )
 UNSUPPORTED_MEDIA_TYPE: Final = ProblemType(
     "unsupported-media-type",
@@ -164,7 +164,7 @@ UNKNOWN_LABELS: Final = ProblemType(
     "`errors` points at each unknown label and suggests the nearest known labels. With "
     "`unknown_labels` set to `ignore`, the service ignores unknown labels and lists them in "
     "`ignored`. With `nearest`, it maps each to the most similar class and lists it in `mapped`. "
-    "It refuses a label that resembles no class. GET /models/{name}/vocabulary lists every label.",
+    "It refuses a label without a similar class. GET /models/{name}/vocabulary lists every label.",
 )
 CONTRADICTORY_EVIDENCE: Final = ProblemType(
     "contradictory-evidence",
@@ -187,8 +187,8 @@ QUEUE_FULL: Final = ProblemType(
     "Too many requests are waiting",
     "The queue of requests (SCENE_QUEUE_REQUESTS) or the queue of this model's scenes "
     "(SCENE_QUEUE_ROWS) is full. The service also refuses a request that would spend too much of "
-    "its time in the queue. The service computed no part of the answer. Send the request again "
-    "after the seconds in Retry-After.",
+    "its time in the queue. The service did not start the computation. Send the request again "
+    "after the time in Retry-After.",
 )
 DEADLINE_PASSED: Final = ProblemType(
     "deadline-passed",
@@ -202,14 +202,14 @@ DRAINING: Final = ProblemType(
     503,
     "The service is shutting down",
     "The service finishes the requests in progress and refuses new requests. Send the request to "
-    "another instance, or again after the seconds in Retry-After.",
+    "another instance, or again after the time in Retry-After.",
 )
 NOT_READY: Final = ProblemType(
     "not-ready",
     503,
     "The service is not ready",
     "Either the service is still starting, or its default model is not usable. GET /models says "
-    "why. Send the request again after the seconds in Retry-After.",
+    "why. Send the request again after the time in Retry-After.",
 )
 MODEL_UNAVAILABLE: Final = ProblemType(
     "model-unavailable",
@@ -236,7 +236,7 @@ TOO_MANY_STREAMS: Final = ProblemType(
     "too-many-streams",
     503,
     "Too many streams are open",
-    "The process already has SCENE_MAX_STREAMS open streams. Try again after the seconds in "
+    "The process already has SCENE_MAX_STREAMS open streams. Try again after the time in "
     "Retry-After. Until then, send the questions as POST requests.",
 )
 

@@ -137,7 +137,7 @@ class Calibration(Frozen):
             listed classes.
         evidence: weights of observed relations.
         popularity: (V,) log-odds of each class in a training scene; empty: equal for all classes.
-        popularity_weight: exponent alpha of the prior of an intruder, popularity^alpha.
+        popularity_weight: alpha; the prior of an intruder is proportional to popularity^alpha.
         outlier_thresholds: minimum probability of an outlier.
         short_list_thresholds: outlier thresholds for scenes of 1, 2, ... classes without structure;
             larger scenes use `outlier_thresholds`.

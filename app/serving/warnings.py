@@ -79,7 +79,7 @@ def _add(
 def _distant(given: Scene, request: SceneRequest) -> list[SceneObject]:
     """Return the objects far from the viewer.
 
-    In a world-fixed frame without a viewpoint, the median position stands in for the viewer.
+    In a world-fixed frame without a viewpoint, the median position replaces the viewer.
     """
     placed = [(thing, thing.position) for thing in given.objects if thing.position is not None]
     centre: Point = (0.0, 0.0, 0.0)
