@@ -26,7 +26,7 @@ def bedroom(page: Page) -> None:
 
 
 def wrong(page: Page) -> None:
-    page.get_by_role("tab", name="Outliers").click()
+    page.get_by_role("tab", name="Wrong").click()
 
 
 def relations(page: Page) -> None:
@@ -43,7 +43,7 @@ def imagine(page: Page) -> None:
 
 def two_models(page: Page) -> None:
     other = page.locator("#second option", has_text="indoor-rbm").last.get_attribute("value")
-    page.get_by_label("compare with").select_option(other)
+    page.get_by_label("versus").select_option(other)
 
 
 PICTURES: dict[str, tuple[Callable[[Page], None], Literal["light", "dark"], ViewportSize]] = {

@@ -37,7 +37,7 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     # Another model that knows all of the example's labels.
     references = [str(one.get_attribute("value")) for one in page.locator("#second option").all()]
     (second,) = [name for name in references if name.startswith("indoor-rbm@")]
-    page.get_by_label("compare with").select_option(second)
+    page.get_by_label("versus").select_option(second)
     page.locator("#list .name").first.click()
     board.settle()
     board.column("missing").get_by_text("Send this request from a program").click()
@@ -45,7 +45,7 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     page.get_by_role("button", name="Actions for bed").click()
     found["menu"] = complaints(board)
     page.keyboard.press("Escape")
-    for tab in ("Outliers", "Relations", "Generate"):
+    for tab in ("Wrong", "Relations", "Generate"):
         board.tab(tab)
         found[tab] = complaints(board)
     page.get_by_text("Contexts that stay on").click()
@@ -126,7 +126,7 @@ def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
     # Questions are tabs; suggestions are accepted by Enter.
     page.get_by_role("tab", name="Missing").focus()
     press("ArrowRight")
-    expect(page.get_by_role("tab", name="Outliers")).to_have_attribute("aria-selected", "true")
+    expect(page.get_by_role("tab", name="Wrong")).to_have_attribute("aria-selected", "true")
     press("End")
     expect(page.get_by_role("tab", name="Generate")).to_have_attribute("aria-selected", "true")
     press("Home")
@@ -185,7 +185,7 @@ def test_nothing_moves_for_who_wants_no_motion(open_board: OpenBoard) -> None:
 @pytest.mark.slow
 def test_a_narrow_page_does_not_scroll_sideways(open_board: OpenBoard) -> None:
     board = open_board(scene=None, width=320)
-    for tab in ("Missing", "Outliers", "Relations", "Generate"):
+    for tab in ("Missing", "Wrong", "Relations", "Generate"):
         board.tab(tab)
         wide = board.page.evaluate(
             "[...document.querySelectorAll('body *')].filter((one) =>"

@@ -175,7 +175,7 @@ def test_what_is_missing_at_a_place_is_asked_from_an_objects_menu(
 def test_outliers_are_marked_with_what_speaks_against_them(
     bedroom: Board, api: httpx.Client
 ) -> None:
-    bedroom.tab("Outliers")
+    bedroom.tab("Wrong")
     answer = ask(api, "outliers", bedroom.scene)
     rows = bedroom.rows("outliers")
     heading = rows.index("In the wrong place?")
@@ -222,7 +222,7 @@ def test_what_stands_in_the_wrong_place_is_counted_and_said(bedroom: Board) -> N
 
 
 def test_the_alarm_can_be_set_elsewhere(bedroom: Board, api: httpx.Client) -> None:
-    bedroom.tab("Outliers")
+    bedroom.tab("Wrong")
     bedroom.slide("Alarm from", 5)
     answer = ask(api, "outliers", bedroom.scene, threshold=0.05)
     found = bedroom.page.locator("#board .object.outlier")
@@ -283,7 +283,7 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
 
 
 def test_words_on_the_board_cover_no_others(bedroom: Board) -> None:
-    for tab in ("Missing", "Outliers", "Relations"):
+    for tab in ("Missing", "Wrong", "Relations"):
         bedroom.tab(tab)
         boxes = [
             box
@@ -325,7 +325,7 @@ def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> No
     shown = bedroom.page.locator("#second option")
     assert set(references) <= {option.get_attribute("value") for option in shown.all()}
     (second,) = [name for name in references if name.startswith("indoor-rbm@")]
-    bedroom.page.get_by_label("compare with").select_option(second)
+    bedroom.page.get_by_label("versus").select_option(second)
     bedroom.settle()
     for number, model in enumerate(("default", second)):
         answer = ask(api, "missing", bedroom.scene, top_k=5, model=model)
@@ -342,7 +342,7 @@ def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> No
     assert {text.split(" %")[0].rsplit(" ", 1)[0] for text in bedroom.ghosts} <= {
         one["label"] for one in answer["missing"]
     }
-    bedroom.page.get_by_label("compare with").select_option("")
+    bedroom.page.get_by_label("versus").select_option("")
     bedroom.settle()
     expect(bedroom.column("missing", 1)).to_be_hidden()
 
@@ -354,8 +354,8 @@ def test_a_label_that_a_model_does_not_know_is_told_at_the_object_and_can_be_lef
     board = open_board(scene, allow=("422",))
     expect(board.page.locator("#list li").nth(1).locator(".error")).to_contain_text("bed")
     expect(board.column("missing").get_by_role("alert")).to_contain_text("bedd: ")
-    board.page.get_by_label("compare with").select_option(index=3)
-    second = board.page.get_by_label("compare with").input_value()
+    board.page.get_by_label("versus").select_option(index=3)
+    second = board.page.get_by_label("versus").input_value()
     told = board.page.locator("#list li").nth(1).locator(".error")
     expect(told).to_contain_text("default: ")
     expect(told).to_contain_text(f"{second}: ")

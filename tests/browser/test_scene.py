@@ -104,7 +104,7 @@ def test_what_stands_on_something_moves_with_it(open_board: OpenBoard) -> None:
 @pytest.mark.slow
 def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> None:
     board = open_board()
-    board.tab("Outliers")  # where no suggestion lies over the chair
+    board.tab("Wrong")  # where no suggestion lies over the chair
     before = place(board, "chair", "outliers")
     board.drag(board.thing("chair").locator(".box"), 61, 37)
     snapped = place(board, "chair", "outliers")
@@ -124,7 +124,7 @@ def test_dragging_moves_and_snaps_and_can_be_undone(open_board: OpenBoard) -> No
 @pytest.mark.slow
 def test_handles_resize_and_turn(open_board: OpenBoard) -> None:
     board = open_board()
-    board.tab("Outliers")
+    board.tab("Wrong")
     board.thing("desk").focus()
     board.drag(board.page.locator(".handles .resize"), 30, 20)
     (desk, _) = board.body("outliers")["objects"]
