@@ -1,4 +1,4 @@
-"""``python -m app``: serve with the settings of the environment."""
+"""``python -m app``: start the service with the settings of the environment."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from app.settings import Settings
 
 
 def main() -> int:
-    """Serve until stopped.
+    """Serve until the process is stopped.
 
     Returns:
-        The exit status: 2 where the settings make no sense.
+        The exit status: 2 for invalid settings; else see `serve`.
     """
     began = monotonic()
     try:
@@ -33,8 +33,8 @@ def main() -> int:
     return serve(settings, began)
 
 
-# Threshold of the garbage collector's youngest generation. An answer has some two hundred
-# containers, all freed by reference counts. The default of 700 costs 4 to 8 % of a request's time.
+# Threshold of the garbage collector's youngest generation. An answer has about 200 containers,
+# which reference counting frees. The default of 700 costs 4 to 8 % of a request's time.
 _YOUNG = 10_000
 
 
@@ -43,24 +43,26 @@ _M_MMAP_THRESHOLD, _LARGE = -3, 128 * 1024
 
 
 def _give_back_what_is_large() -> None:
-    """Let the C library return blocks of 128 KiB and more to the system as soon as they are freed.
+    """Make the C library return freed blocks of 128 KiB or more to the system at once.
 
-    It does so at first, and would for ever larger ones alone once such were freed: bodies of
-    megabytes would leave 20 MB of holes.
+    By default, the C library raises this threshold whenever a large block is freed. Request bodies
+    of several megabytes would then leave 20 MB of unused memory.
     """
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
 
 
 def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
-    """Sockets for all addresses of a host; a connection is refused until the server listens.
+    """Bind sockets to all addresses of a host, without listening.
 
     Args:
-        send_timeout: seconds after which Linux ends a connection whose client acknowledges no
-            bytes. On other systems only a proxy bounds that.
+        host: name or address.
+        port: port; 0 for any free port.
+        send_timeout: seconds after which Linux closes a connection whose client does not
+            acknowledge the bytes sent. On other systems only a proxy can limit this time.
 
     Raises:
-        OSError: the host has no usable address, or the port is not free.
+        OSError: the host does not have a usable address, or the port is in use.
     """
     bound: list[socket.socket] = []
     problem: OSError | None = None
@@ -76,7 +78,7 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
                 place.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
             place.bind(address)
         except OSError as error:
-            # A name such as localhost may have an address of a kind that the machine lacks.
+            # A name such as localhost may have an IPv6 address although the machine lacks IPv6.
             if error.errno not in {errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT}:
                 raise
             problem = error
@@ -88,7 +90,7 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
 
 
 def _refuse_address(settings: Settings, error: OSError) -> int:
-    """Say why the service cannot listen where it should; the exit status."""
+    """Print why the service cannot listen on its address; return the exit status."""
     place = f"{settings.host}:{settings.port}"
     if error.errno == errno.EADDRINUSE:
         reason = f"SCENE_PORT: {place} is in use by another program; set SCENE_PORT to a free one"
@@ -103,32 +105,33 @@ def serve(settings: Settings, began: float) -> int:
     """Serve from this process until it is stopped.
 
     Args:
-        began: `time.monotonic()` when the start began.
+        settings: settings of the service.
+        began: `time.monotonic()` at the start of the process.
 
     Returns:
-        The exit status: not 0 where the service did not start.
+        The exit status: 0, or 3 if the service could not start.
     """
     try:
         sockets = _bind(settings.host, settings.port, settings.client_timeout)
     except OSError as error:
         return _refuse_address(settings, error)
-    # What starting makes stays: looking through it for garbage takes a fifth of the time. The
-    # runtime turns the collector on again when it serves.
+    # Objects of the start stay in use. Searching them for garbage would take a fifth of the start.
+    # The runtime enables the collector again when it serves.
     gc.disable()
     gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
     _give_back_what_is_large()
-    # Products of one question are small, and threads for them would take cores from other
-    # processes. numpy reads this when it is imported.
+    # Matrix products of a question are small; threads would take cores from other processes.
+    # numpy reads this variable at its import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from app.server import build
 
     server = build(settings, began)
-    # Ctrl-C has ended the server in order by the time it comes up here.
+    # On Ctrl-C, the server shuts down in order and raises KeyboardInterrupt afterwards.
     with suppress(KeyboardInterrupt):
         try:
             server.run(sockets)
         except OSError as error:
-            # Two services that start at once can both bind; one of them listens first.
+            # Two services that start together can both bind, but only one of them can listen.
             if server.started or error.errno != errno.EADDRINUSE:
                 raise
             return _refuse_address(settings, error)

@@ -1,7 +1,7 @@
-"""``python -m app.compile``: compile loops for this machine, and sources, before they are run.
+"""``python -m app.compile``: compile kernels and sources for this machine before the first start.
 
-The service compiles by itself where it finds nothing compiled, and starts a minute or so later;
-where it cannot keep the result, it does so at every start.
+Otherwise, the first start compiles the kernels, which takes about a minute. If the service cannot
+store the result, it compiles at every start.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from app.settings import Settings
 
 
 def main() -> int:
-    """Ask every model of the store everything once; then turn all sources into byte code.
+    """Warm up every model of the store, which compiles the kernels; then compile all sources.
 
     Returns:
-        The exit status: 1 where one of them cannot be used.
+        The exit status: 1 if a model, an alias or the store is not usable.
     """
     settings = Settings()
     dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))
@@ -29,7 +29,7 @@ def main() -> int:
     asyncio.run(runtime.start())
     runtime.stop()
     compileall.compile_dir(Path(__file__).parent, quiet=1)
-    # The runtime has logged each of them.
+    # The runtime has logged each failure.
     return 1 if runtime.models.failures else 0
 
 

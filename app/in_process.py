@@ -1,4 +1,4 @@
-"""The service inside this process, as something that carries a client's requests."""
+"""The service inside this process, as an httpx transport for a client."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from scene_client.schemas import FieldError
 
 
 class _Given(Settings):
-    """Settings that no environment changes: its variables are meant for services."""
+    """Settings that ignore environment variables, which configure separate services."""
 
     @classmethod
     def settings_customise_sources(
@@ -36,13 +36,13 @@ class _Given(Settings):
 
 
 class InProcess(httpx.BaseTransport):
-    """The application, on an event loop of its own in a thread of its own.
+    """The application on its own event loop, in its own thread.
 
     Args:
         store: directory of published models.
 
     Attributes:
-        admin_key: of this application; a new random key.
+        admin_key: random admin key of this application.
 
     Raises:
         InvalidRequestError: the store is not a directory.
@@ -69,7 +69,7 @@ class InProcess(httpx.BaseTransport):
         thread = Thread(target=_live, args=(app, started, ending), daemon=True, name="scene")
         thread.start()
         self._loop = started.result()
-        # Runs at the latest when the program ends: a thread that goes on would keep it from that.
+        # Runs at the end of the program at the latest, so that the thread ends first.
         self._finalize = weakref.finalize(self, _end, self._loop, ending, thread)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
@@ -83,7 +83,7 @@ class InProcess(httpx.BaseTransport):
 
     async def _answer(self, request: httpx.Request) -> httpx.Response:
         response = await self._asgi.handle_async_request(request)
-        # Its body can only be read on this loop.
+        # The body can only be read on this event loop.
         body = await response.aread()
         return httpx.Response(response.status_code, headers=response.headers, content=body)
 

@@ -1,4 +1,4 @@
-"""The application and its lifespan; nothing else."""
+"""The application and its lifespan."""
 
 from __future__ import annotations
 
@@ -12,32 +12,31 @@ from app.serving.runtime import Runtime
 from app.settings import Settings
 
 _DESCRIPTION = """
-Ask a Boltzmann machine about a scene: how its objects stand to each other, what is missing, what
-does not belong, what a scene like it would look like. Positions are metres in the axes of
-`frame_id`; objects are named by their ids, or by their labels where those are unambiguous.
-A robot whose scene changes all the time streams it: `GET /stream`, a WebSocket, takes updates and
-answers with the newest answers; docs/stream.md is its contract.
-Every failure is a problem document (RFC 9457) whose `type` a program can branch on.
-The figures in the examples illustrate; a model's own depend on what it was trained on.
+Ask a Boltzmann machine four questions about a scene: which relations hold between its objects,
+which objects are missing, which objects do not belong, and what a similar scene looks like.
+Positions are in metres, in the axes of `frame_id`. Objects are named by their ids, or by their
+labels if only one object has the label. Robots with frequent scene changes can open a stream: the
+WebSocket `GET /stream` accepts updates and sends the newest answers (docs/stream.md).
+Every failure is a problem document (RFC 9457); programs can branch on its `type`.
+The figures in the examples are illustrations. Real figures depend on the model.
 """
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """The service.
+    """Create the application of the service.
 
     Args:
-        settings: by default those of the environment.
+        settings: settings of the service; read from the environment if missing.
 
     Raises:
-        pydantic.ValidationError: the environment's settings make no sense.
+        pydantic.ValidationError: the environment holds an invalid setting.
     """
     settings = settings or Settings()
     runtime = Runtime(settings)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        # Before the first connection is accepted: nobody is kept waiting, and nobody sees a
-        # service that is alive and cannot answer for want of a second's patience.
+        # Load the models before the server accepts connections, so that clients need not wait.
         await runtime.start()
         yield
         runtime.stop()

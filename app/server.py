@@ -1,4 +1,4 @@
-"""The server: uvicorn's, which drains before it stops."""
+"""The server: uvicorn with a graceful shutdown."""
 
 from __future__ import annotations
 
@@ -20,29 +20,30 @@ from app.serving.runtime import Runtime
 from app.serving.stream import Streams
 from app.settings import Settings
 
-# Seconds that an idle connection is kept. A proxy in front must close its own first, or it sends
-# requests on connections that are about to be closed.
+# Seconds that an idle connection is kept open. A proxy in front must close idle connections
+# earlier, or it may send a request on a connection that this server is closing.
 KEEP_ALIVE: Final = 20
 
-# Seconds that streams have at least for their last message.
+# Minimum seconds that streams have for their last message.
 LEAVE: Final = 0.3
 
 _logger = logging.getLogger("app.server")
 
 
 class Server(uvicorn.Server):
-    """Ends in three steps on SIGTERM.
+    """A server that shuts down in three steps on SIGTERM.
 
-    First new requests are refused, readiness is off, and streams are closed. The listening socket
-    closes after ``drain_seconds``. In this time a load balancer sees that readiness is off. Then
-    requests in progress are finished. A second signal, or Ctrl-C, skips the first step.
+    First it refuses new requests, turns readiness off and closes the streams. After
+    ``drain_seconds``, in which load balancers notice the missing readiness, it closes the listening
+    socket. Then it finishes the requests in progress. A second signal, or Ctrl-C, skips the first
+    step.
 
     Args:
-        config: of uvicorn.
-        runtime: drained before the end.
-        streams: drained before the end.
-        drain_seconds: from SIGTERM until the listening socket is closed.
-        began: `time.monotonic()` when the start began.
+        config: configuration of uvicorn.
+        runtime: drained before the shutdown.
+        streams: drained before the shutdown.
+        drain_seconds: seconds from SIGTERM until the listening socket is closed.
+        began: `time.monotonic()` at the start of the process.
     """
 
     def __init__(
@@ -61,10 +62,10 @@ class Server(uvicorn.Server):
         self._began = began
 
     async def startup(self, sockets: list[socket] | None = None) -> None:
-        """Load the models, accept connections from then on, and say where.
+        """Load the models, accept connections and log the address.
 
         Raises:
-            OSError: another program began to listen on the same port in the meantime.
+            OSError: another program has started to listen on the same port.
         """
         try:
             await super().startup(sockets)
@@ -91,7 +92,7 @@ class Server(uvicorn.Server):
             _logger.info("ready: %s", details)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Uvicorn's handler of signals."""
+        """Handle a signal to end the process."""
         if sig == signal.SIGTERM and not self._runtime.draining:
             self._runtime.drain()
             self._closing_at = monotonic() + max(self._drain_seconds, LEAVE)
@@ -100,8 +101,8 @@ class Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
-        """Whether to close the socket now; asked ten times a second."""
-        # Here, and not where signals are handled: that is between any two steps of the loop.
+        """Return whether to close the socket now; uvicorn calls this ten times per second."""
+        # Not in handle_exit(), because a signal handler can interrupt the event loop anywhere.
         if self._runtime.draining:
             self._streams.drain()
         if self._closing_at is not None and monotonic() >= self._closing_at:
@@ -118,16 +119,17 @@ def _listens(place: socket) -> bool:
 
 
 def _page(host: str, port: int) -> str:
-    """The address of the page, as a browser on the same machine takes it."""
+    """Return the address of the page for a browser on the same machine."""
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 # nosec B104
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
 def build(settings: Settings, began: float) -> Server:
-    """The service behind a server of its own, not started yet.
+    """Build the server of the service without starting it.
 
     Args:
-        began: `time.monotonic()` when the start began.
+        settings: settings of the service.
+        began: `time.monotonic()` at the start of the process.
     """
     app = create_app(settings)
     config = uvicorn.Config(
@@ -146,14 +148,14 @@ def build(settings: Settings, began: float) -> Server:
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,
         server_header=False,
-        # The service uses neither a client's address nor its scheme: it believes no X-Forwarded-*.
+        # X-Forwarded-* is ignored: the service uses neither the client's address nor its scheme.
         proxy_headers=False,
         timeout_graceful_shutdown=settings.drain_timeout,
     )
     if settings.is_open:
         _logger.warning(
-            "SCENE_HOST lets other machines in, and SCENE_API_KEY is not set: whoever reaches "
-            "port %d may ask",
+            "SCENE_HOST admits other machines and SCENE_API_KEY is not set: every machine that "
+            "reaches port %d can use the service",
             settings.port,
         )
     return Server(config, app.state.runtime, app.state.streams, settings.drain_seconds, began)

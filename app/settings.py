@@ -1,4 +1,4 @@
-"""Every knob of the service, typed, read from the environment (prefix ``SCENE_``)."""
+"""The settings of the service, read from environment variables with the prefix ``SCENE_``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from scene_client.schemas import MAX_RELATIONS
 
 MAX_OBJECTS = 256
-"""The contract's limit on objects in one scene; settings may lower it, never raise it."""
+"""Maximum number of objects in a scene; a setting can lower it, but not raise it."""
 
 
 _EXPORTER = ("opentelemetry.sdk.trace", "opentelemetry.exporter.otlp.proto.http")
@@ -26,7 +26,7 @@ _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT
 def _is_installed(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ModuleNotFoundError:  # a package above it is missing already
+    except ModuleNotFoundError:  # its parent package is missing
         return False
 
 
@@ -46,10 +46,10 @@ _HOST: Final = re.compile(r"[a-z0-9_]([a-z0-9._-]*[a-z0-9_])?")
 
 
 def _in_host_header(text: str) -> str:
-    """A name or an address as it stands in a Host header.
+    """Return a name or an address in the spelling of a Host header.
 
     Raises:
-        ValueError: it is neither.
+        ValueError: the text is neither a name nor an address.
     """
     name = text.lower()
     if _HOST.fullmatch(name):
@@ -58,7 +58,7 @@ def _in_host_header(text: str) -> str:
 
 
 def _is_origin(text: str) -> bool:
-    """Whether a browser would send this text, to the letter, as the origin of a page."""
+    """Return whether a browser would send exactly this text as the origin of a page."""
     try:
         parts = urlsplit(text)
         port = parts.port
@@ -72,10 +72,10 @@ def _is_origin(text: str) -> bool:
 
 
 class Settings(BaseSettings):
-    """What an operator may choose. The defaults are safe: loopback only, no admin routes.
+    """The settings of an operator. The defaults are safe: loopback only, admin routes off.
 
     Raises:
-        pydantic.ValidationError: a value makes no sense; every message names its variable.
+        pydantic.ValidationError: a value is invalid; every message names its variable.
     """
 
     model_config = SettingsConfigDict(
@@ -88,7 +88,9 @@ class Settings(BaseSettings):
     )
 
     host: Annotated[str, Field(min_length=1, description="address to listen on")] = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535, description="0 = any free port")] = 8000
+    port: Annotated[
+        int, Field(ge=0, le=65535, description="port to listen on; 0 = any free port")
+    ] = 8000
     store: Annotated[Path, Field(description="directory of published models")] = Path("model_store")
     store_poll: Annotated[
         float,
@@ -96,20 +98,21 @@ class Settings(BaseSettings):
             ge=0,
             le=3600,
             allow_inf_nan=False,
-            description="seconds between two looks for changes of the store; 0 = never",
+            description="seconds between two checks of the store for changes; 0 = never",
         ),
     ] = 5
     admin_key: Annotated[
         SecretStr | None,
         Field(
-            description="key of the admin routes, at least 16 characters; without it they are off"
+            description="key of the admin routes, at least 16 characters; without it, these routes "
+            "refuse every request"
         ),
     ] = None
     api_key: Annotated[
         SecretStr | None,
         Field(
-            description="key of every route but health and pages, at least 16 characters and not "
-            "the admin key; without it those routes are open"
+            description="key of all routes except health checks and pages; at least 16 characters, "
+            "different from the admin key; without it, these routes are open"
         ),
     ] = None
     cors_origins: Annotated[
@@ -117,8 +120,8 @@ class Settings(BaseSettings):
         NoDecode,
         BeforeValidator(_words),
         Field(
-            description="origins whose pages a browser lets read answers, as in "
-            "`https://panel.example:8443`, parted by commas; none by default"
+            description="origins whose pages may use the service, separated by commas, for example "
+            "`https://panel.example:8443`; none by default"
         ),
     ] = ()
     allowed_hosts: Annotated[
@@ -126,55 +129,72 @@ class Settings(BaseSettings):
         NoDecode,
         BeforeValidator(_words),
         Field(
-            description="names and addresses that clients may use for this service, parted by "
-            "commas and without ports; `*` allows all; by default those of this machine, and "
-            "SCENE_HOST where that is one address"
+            description="names and addresses that clients may use for this service, separated by "
+            "commas, without ports; `*` allows all; default: the names of this machine, and "
+            "SCENE_HOST if it is a single address"
         ),
     ] = ()
     max_connections: Annotated[
         int,
-        Field(ge=1, le=2**20, description="connections from which on requests get a plain 503"),
+        Field(
+            ge=1,
+            le=2**20,
+            description="maximum number of connections; beyond it, requests get a plain 503",
+        ),
     ] = 1024
     max_body_bytes: Annotated[
-        int, Field(ge=1024, le=64 * 2**20, description="largest request body")
+        int, Field(ge=1024, le=64 * 2**20, description="maximum size of a request body in bytes")
     ] = 2 * 2**20
     held_body_bytes: Annotated[
         int,
-        Field(ge=2**20, le=2**36, description="bytes of all request bodies that are held at once"),
+        Field(
+            ge=2**20,
+            le=2**36,
+            description="maximum total size in bytes of the bodies of all requests in progress",
+        ),
     ] = 64 * 2**20
     max_objects: Annotated[
-        int, Field(ge=1, le=MAX_OBJECTS, description="most objects in one scene")
+        int, Field(ge=1, le=MAX_OBJECTS, description="maximum number of objects in a scene")
     ] = MAX_OBJECTS
     max_relations: Annotated[
-        int, Field(ge=0, le=MAX_RELATIONS, description="most relations given in one scene")
+        int,
+        Field(ge=0, le=MAX_RELATIONS, description="maximum number of stated relations in a scene"),
     ] = 4096
     max_answer_bytes: Annotated[
-        int, Field(ge=2**16, le=2**30, description="largest answer to one request")
+        int, Field(ge=2**16, le=2**30, description="maximum size of an answer in bytes")
     ] = 16 * 2**20
     max_weights_bytes: Annotated[
-        int, Field(ge=1024, le=2**40, description="largest weights file of a version")
+        int, Field(ge=1024, le=2**40, description="maximum size of a weights file in bytes")
     ] = 2**30
     queue_rows: Annotated[
         int,
         Field(
             ge=256,
             le=2**20,
-            description="most scenes that wait for a model, or are under way there",
+            description="maximum number of scenes that wait for a model or are being computed",
         ),
     ] = 4096
     queue_requests: Annotated[
-        int, Field(ge=1, le=2**20, description="most requests that wait to be read")
+        int, Field(ge=1, le=2**20, description="maximum number of queued requests")
     ] = 256
     request_timeout_ms: Annotated[
         int,
-        Field(ge=1, le=600_000, description="of requests that send no X-Request-Timeout-Ms"),
+        Field(
+            ge=1,
+            le=600_000,
+            description="deadline in milliseconds of requests without X-Request-Timeout-Ms",
+        ),
     ] = 10_000
     max_request_timeout_ms: Annotated[
         int,
-        Field(ge=1, le=600_000, description="longest deadline that a client may choose"),
+        Field(
+            ge=1,
+            le=600_000,
+            description="maximum deadline in milliseconds that a client may choose",
+        ),
     ] = 60_000
     max_streams: Annotated[
-        int, Field(ge=0, le=4096, description="most streams a process has at once")
+        int, Field(ge=0, le=4096, description="maximum number of open streams of a process")
     ] = 64
     stream_idle: Annotated[
         float,
@@ -182,15 +202,15 @@ class Settings(BaseSettings):
             ge=1,
             le=86_400,
             allow_inf_nan=False,
-            description="seconds a stream may be silent",
+            description="seconds without a message after which the service closes a stream",
         ),
     ] = 300
     drain_seconds: Annotated[
         float,
-        Field(ge=0, le=300, description="from SIGTERM until the listening socket is closed"),
+        Field(ge=0, le=300, description="seconds from SIGTERM until the listening socket closes"),
     ] = 1.0
     drain_timeout: Annotated[
-        int, Field(ge=1, le=3600, description="seconds that work under way may take after that")
+        int, Field(ge=1, le=3600, description="seconds after that for requests in progress")
     ] = 25
     client_timeout: Annotated[
         float,
@@ -198,20 +218,20 @@ class Settings(BaseSettings):
             ge=0.1,
             le=3600,
             allow_inf_nan=False,
-            description="seconds a client may take to send a request's body, to acknowledge what "
-            "it is sent, and to answer a stream's pings",
+            description="seconds that a client may take to send a request body, to acknowledge an "
+            "answer, and to answer the ping of a stream",
         ),
     ] = 20
     retry_after: Annotated[
-        int, Field(ge=1, le=3600, description="seconds named in Retry-After when not ready")
+        int, Field(ge=1, le=3600, description="seconds in the Retry-After header of 429 and 503")
     ] = 2
     metrics: Annotated[bool, Field(description="answer GET /metrics")] = True
     opentelemetry: Annotated[
-        bool, Field(description="send traces to where OTEL_EXPORTER_OTLP_ENDPOINT says")
+        bool, Field(description="send traces to the collector in OTEL_EXPORTER_OTLP_ENDPOINT")
     ] = False
-    docs: Annotated[
-        bool, Field(description="serve the visual page, /docs, /redoc and /openapi.json")
-    ] = True
+    docs: Annotated[bool, Field(description="serve the board, /docs, /redoc and /openapi.json")] = (
+        True
+    )
     root_path: Annotated[
         str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")
     ] = ""
@@ -219,16 +239,18 @@ class Settings(BaseSettings):
         Literal["debug", "info", "warning", "error", "critical"], BeforeValidator(_lower)
     ] = "info"
     log_format: Annotated[Literal["json", "plain"], BeforeValidator(_lower)] = "json"
-    access_log: Annotated[bool, Field(description="one line a request, never its payload")] = True
+    access_log: Annotated[bool, Field(description="log one line per request, without payload")] = (
+        True
+    )
 
     @property
     def secrets(self) -> list[str]:
-        """What no log may hold."""
+        """The keys, which logs must mask."""
         return [key.get_secret_value() for key in (self.admin_key, self.api_key) if key]
 
     @property
     def accepted_hosts(self) -> frozenset[str] | None:
-        """What a Host header may name, without the port; None where it may name anything."""
+        """Allowed names in a Host header, without ports; None if every name is allowed."""
         if _ANY_HOST in self.allowed_hosts:
             return None
         if self.allowed_hosts:
@@ -237,7 +259,7 @@ class Settings(BaseSettings):
 
     @property
     def is_open(self) -> bool:
-        """Whether other machines may ask without a key."""
+        """Whether other machines can use the service without a key."""
         is_local = self.host.startswith("127.") or self.host in {"localhost", "::1"}
         return self.api_key is None and not is_local
 
@@ -254,7 +276,7 @@ class Settings(BaseSettings):
         try:
             _in_host_header(value)
         except ValueError:
-            raise ValueError("SCENE_HOST must be an address or a name") from None
+            raise ValueError("SCENE_HOST must be a name or an IP address") from None
         return value
 
     @field_validator("allowed_hosts")
@@ -264,15 +286,15 @@ class Settings(BaseSettings):
             return tuple(name if name == _ANY_HOST else _in_host_header(name) for name in value)
         except ValueError:
             raise ValueError(
-                "SCENE_ALLOWED_HOSTS must list names and addresses without scheme, port and "
-                "wildcard, or be *"
+                "SCENE_ALLOWED_HOSTS must be *, or a list of names and addresses without scheme, "
+                "port and wildcard"
             ) from None
 
     @field_validator("store")
     @classmethod
     def _is_directory(cls, value: Path) -> Path:
         if not value.is_dir():
-            raise ValueError(f"SCENE_STORE must be an existing directory, and {value} is none")
+            raise ValueError(f"SCENE_STORE must be an existing directory, but is {value}")
         return value
 
     @field_validator("max_request_timeout_ms")
@@ -294,9 +316,9 @@ class Settings(BaseSettings):
                 "SCENE_OPENTELEMETRY needs the packages of the dependency group telemetry "
                 "(pip install '.[telemetry]')"
             )
-        # The framework would start without one and send nothing.
+        # Without an endpoint, FastAPI would start but never send a trace.
         if not any(map(os.environ.get, _ENDPOINTS)):
-            raise ValueError(f"SCENE_OPENTELEMETRY needs {_ENDPOINTS[0]}, the collector's URL")
+            raise ValueError(f"SCENE_OPENTELEMETRY needs {_ENDPOINTS[0]}, the URL of a collector")
         return value
 
     @field_validator("admin_key", "api_key")
@@ -305,11 +327,11 @@ class Settings(BaseSettings):
         if value is None:
             return None
         key = value.get_secret_value()
-        # The key travels in a header, so it must survive one; a short one can be tried out.
+        # A header must be able to carry the key, and a short key could be guessed.
         if len(key) < 16 or not (key.isascii() and key.isprintable()) or " " in key:
             raise ValueError(
                 f"SCENE_{str(info.field_name).upper()} must have at least 16 printable ASCII "
-                "characters and no space"
+                "characters, without spaces"
             )
         return value
 
@@ -320,7 +342,8 @@ class Settings(BaseSettings):
     ) -> SecretStr | None:
         if value is not None and value == info.data.get("admin_key"):
             raise ValueError(
-                "SCENE_API_KEY must differ from SCENE_ADMIN_KEY: clients are not administrators"
+                "SCENE_API_KEY must differ from SCENE_ADMIN_KEY, because clients must not "
+                "administer the service"
             )
         return value
 
@@ -330,6 +353,6 @@ class Settings(BaseSettings):
         if not all(map(_is_origin, value)):
             raise ValueError(
                 "SCENE_CORS_ORIGINS must list origins as browsers send them: http or https, host "
-                "in lower case, port where it is not the usual one, no path and no wildcard"
+                "in lower case, port only if it is not the default port, without path and wildcard"
             )
         return value

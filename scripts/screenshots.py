@@ -35,15 +35,15 @@ def relations(page: Page) -> None:
 
 
 def imagine(page: Page) -> None:
-    page.get_by_role("tab", name="Imagine").click()
+    page.get_by_role("tab", name="Generate").click()
     page.locator("#generate").get_by_label("Room").select_option("kitchen")
-    page.get_by_role("button", name="Draw a scene").click()
+    page.get_by_role("button", name="Generate a scene").click()
     page.locator("#sweep[aria-valuetext='after 50 sweeps']").wait_for()
 
 
 def two_models(page: Page) -> None:
     other = page.locator("#second option", has_text="indoor-rbm").last.get_attribute("value")
-    page.get_by_label("beside it").select_option(other)
+    page.get_by_label("versus").select_option(other)
 
 
 PICTURES: dict[str, tuple[Callable[[Page], None], Literal["light", "dark"], ViewportSize]] = {

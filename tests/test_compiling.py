@@ -100,8 +100,8 @@ def start(package: Path, **variables: str) -> tuple[Any, str]:
 def test_a_second_start_compiles_nothing(package: Path) -> None:
     answer, log = start(package)
     assert (answer["result"], answer["compiled"]) == (EXPECTED, [1, 1])
-    assert "compiling loops" in log
-    assert "compiling loop 1 of 2" in log
+    assert "compiling kernels" in log
+    assert "compiling kernel 1 of 2" in log
     (folder,) = (package.parent / ".numba_cache").glob("loops-*")
     assert Path(answer["path"]).is_relative_to(folder)
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -166,7 +166,7 @@ def test_without_a_folder_beside_the_package_the_users_own_is_used(
     (package.parent / ".numba_cache").write_text("in the way")
     answer, log = start(package)
     assert Path(answer["path"]).is_relative_to(tmp_path / "home" / "cache" / "scene-boltzmann")
-    assert "compiled loops are kept in" in log
+    assert "compiled kernels are stored in" in log
 
 
 def test_only_old_folders_of_ours_are_removed(package: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""HTTP and nothing else: routes, problems, middleware, documentation."""
+"""The HTTP layer: routes, problems, middleware, documentation."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from app.settings import Settings
 def build(
     settings: Settings, runtime: Runtime, lifespan: Lifespan[Any], **metadata: str
 ) -> FastAPI:
-    """The application that answers for ``runtime``.
+    """Build the application that serves ``runtime`` over HTTP.
 
     Args:
         settings: limits, keys, origins, pages.
-        runtime: what answers.
-        lifespan: starts and stops it.
+        runtime: the models and the queue of requests.
+        lifespan: starts and stops ``runtime``.
         **metadata: title, description and version for the documentation.
     """
     app = openapi.DocumentedAPI(
@@ -55,7 +55,7 @@ def build(
     problems.install(app)
     routes = (*questions.router.routes, *batches.router.routes)
     asked = [route for route in routes if isinstance(route, JSONRoute)]
-    # Where requests are traced, the framework must see the route.
+    # FastAPI creates the traces, so traced requests must pass through its router.
     direct = (
         {}
         if settings.opentelemetry
@@ -65,7 +65,7 @@ def build(
     app.router.routes.extend(asked)
     for router in (
         stream.router,
-        # First: of routes with one address, the first names the methods of a 405.
+        # First: if several routes share a path, the first sets the Allow header of a 405.
         models.administration,
         models.changes,
         models.router,

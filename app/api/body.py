@@ -1,4 +1,4 @@
-"""Strict reading of JSON bodies; docs/decisions/http.md says why each leniency is refused."""
+"""Strict reading of JSON bodies; docs/decisions/http.md gives the reason for each rule."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from app.settings import Settings
 from scene_client.schemas import FieldError
 
 MAX_MEMBERS: Final = 32
-"""Most members of a JSON object; no request needs as many.
+"""Maximum number of members of a JSON object; valid requests have fewer.
 
-Each unknown member is reported, which takes a hundred times its memory.
+The report about an unknown member takes a hundred times the memory of the member.
 """
 
 SMALL: Final = 64 * 1024
-"""Bytes of a body that is always accepted, if it has arrived when it is read.
+"""Maximum size in bytes of a body that is always accepted if it arrives in one piece.
 
-Unfinished bodies of one client do not refuse the usual requests of the others.
+So unfinished bodies of one client do not block the usual requests of other clients.
 """
 
 
 class Bodies:
-    """Bounds the size of each body, its time, and the bytes of all bodies held at once.
+    """Limits on the size and the transfer time of each body, and on the size of all bodies.
 
     Args:
-        settings: of the service.
+        settings: settings of the service.
 
     Attributes:
-        held: bytes of all bodies that are being read or answered.
+        held: bytes of the bodies of all requests in progress.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -49,10 +49,10 @@ class Bodies:
         self.held = 0
 
     async def read(self, receive: Receive) -> bytes:
-        """A whole body; the caller takes its bytes from `held` when they are answered.
+        """Read a whole body; the caller subtracts its length from `held` after the answer.
 
         Raises:
-            ProblemError: the body is too large, too slow, one too many, or broke off.
+            ProblemError: the body is too large, too slow or incomplete, or too many bytes are held.
         """
         body: bytes | bytearray = b""
         try:
@@ -61,7 +61,10 @@ class Bodies:
                 while more:
                     message = await receive()
                     if message["type"] != "http.request":
-                        raise ProblemError(catalogue.BAD_REQUEST, "The body broke off.")
+                        raise ProblemError(
+                            catalogue.BAD_REQUEST,
+                            "The connection closed before the body was complete.",
+                        )
                     part, more = message.get("body", b""), message.get("more_body", False)
                     is_whole = not (more or body)
                     self.held += len(part)
@@ -73,13 +76,13 @@ class Bodies:
                     if len(body) > self.limit:
                         raise too_large(self.limit)
                     if self.held > self.budget and not (is_whole and len(body) <= SMALL):
-                        detail = f"All bodies together must not exceed {self.budget} bytes."
+                        detail = f"The bodies of all requests exceed {self.budget} bytes."
                         raise ProblemError(catalogue.BODIES_FULL, detail)
         except TimeoutError:
             self.held -= len(body)
             raise ProblemError(
                 catalogue.REQUEST_TIMEOUT,
-                f"The body did not come within {self.patience:g} seconds.",
+                f"The body did not arrive within {self.patience:g} seconds.",
                 headers={"Connection": "close"},
             ) from None
         except BaseException:
@@ -89,17 +92,17 @@ class Bodies:
 
 
 def parse(body: bytes) -> Any:
-    """One JSON value, read as every receiver would read it.
+    """Parse one JSON value; accept only texts that all JSON parsers read alike.
 
-    Refused: anything but UTF-8, a byte order mark, NaN and Infinity, lone surrogates, nesting
-    deeper than 200, integers of more than 4,300 digits, and a member name used twice in one object.
+    Refused: encodings other than UTF-8, a byte order mark, NaN and Infinity, lone surrogates,
+    nesting deeper than 200, integers of more than 4,300 digits, duplicate names in an object.
 
     Raises:
-        ProblemError: of kind `catalogue.NOT_JSON`; or `catalogue.INVALID_REQUEST`, where an object
-            has more than `MAX_MEMBERS` members.
+        ProblemError: `catalogue.NOT_JSON` for such a text; `catalogue.INVALID_REQUEST` if an
+            object has more than `MAX_MEMBERS` members.
     """
     try:
-        # The strict parser judges; the lenient one, which alone can see repeated names, reads.
+        # from_json() is strict, but only the decoder of the standard library sees repeated names.
         from_json(body, allow_inf_nan=False)
         return _DECODER.decode(body.decode())
     except _TooManyMembersError:
@@ -107,10 +110,10 @@ def parse(body: bytes) -> Any:
         errors = [FieldError(pointer="#", message=detail)]
         raise ProblemError(catalogue.INVALID_REQUEST, detail, errors=errors) from None
     except _RepeatedNameError:
-        detail = "An object has two members of one name."
+        detail = "An object has two members with the same name."
         raise ProblemError(catalogue.NOT_JSON, detail) from None
     except ValueError as error:
-        # The parser's message has the reason and the position, and none of the input.
+        # The message of the parser has the reason and the position, but no part of the input.
         detail = f"The body is not valid JSON: {error}."
         raise ProblemError(catalogue.NOT_JSON, detail) from None
 
@@ -147,17 +150,17 @@ def _is_json(content_type: bytes) -> bool:
 
 
 class JSONRoute(APIRoute):
-    """A route whose body is strict JSON, validated once, and whose endpoint answers with bytes.
+    """A route that validates a strict JSON body once and whose endpoint returns bytes.
 
-    FastAPI documents it. It does not read the body, which it would do leniently. The endpoint is
-    given the validated body as ``asked``, the HTTP request as ``http``, and path parameters.
+    FastAPI documents the route, but does not read the body: its parser is too lenient. The endpoint
+    receives the validated body as ``asked``, the HTTP request as ``http`` and the path parameters.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request.
 
         Raises:
-            ProblemError, ServingError: it cannot be answered.
+            ProblemError, ServingError: the service cannot answer the request.
         """
         if scope["method"] not in (self.methods or ()):
             await super().handle(scope, receive, send)
@@ -166,7 +169,7 @@ class JSONRoute(APIRoute):
         self.check(http)
         kind = next((value for name, value in scope["headers"] if name == b"content-type"), b"")
         if not _is_json(kind):
-            detail = "The body must be sent as application/json."
+            detail = "Content-Type must be application/json."
             raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, detail)
         bodies: Bodies = scope["app"].state.bodies
         body = await bodies.read(receive)
@@ -190,11 +193,11 @@ class JSONRoute(APIRoute):
             bodies.held -= len(body)
 
     def check(self, http: Request) -> None:
-        """Refuse a request before its body is read; here none is."""
+        """Hook to refuse a request before its body is read; this class refuses none."""
 
 
 class AdminJSONRoute(JSONRoute):
-    """The same for clients with the admin key."""
+    """A `JSONRoute` that requires the admin key."""
 
     def check(self, http: Request) -> None:
         """See `check_admin`."""
@@ -202,14 +205,14 @@ class AdminJSONRoute(JSONRoute):
 
 
 def check_admin(http: Request) -> None:
-    """Return if the request carries the admin key.
+    """Check that the request carries the admin key.
 
     Raises:
-        ProblemError: of kind `catalogue.UNAUTHORIZED`, also where no key is configured.
+        ProblemError: `catalogue.UNAUTHORIZED` without the key, or if no admin key is configured.
     """
     if not carries(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
         raise ProblemError(
             catalogue.UNAUTHORIZED,
-            "This route needs the service's admin key.",
+            "This route needs the admin key of the service.",
             headers={"WWW-Authenticate": "Bearer"},
         )

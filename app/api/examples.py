@@ -24,7 +24,7 @@ _UNKNOWN: Final = {
     "type": "/problems/unknown-labels",
     "title": "The model does not know some of the labels",
     "status": 422,
-    "detail": "The request has 1 fault; see errors.",
+    "detail": "The request has 1 error; see errors.",
     "instance": f"/problems/unknown-labels#{_ID}",
     "request_id": _ID,
     "errors": [

@@ -1,4 +1,4 @@
-"""The one ASGI middleware: ids, access log, metrics, hosts, origins, keys and admission."""
+"""The only ASGI middleware: ids, access log, metrics, hosts, origins, keys and admission."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ API_KEY: Final = "X-API-Key"
 ADMIN_KEY: Final = "X-Admin-Key"
 
 CANCELLED: Final = "cancelled"
-"""The outcome of a request that the server gave up while it stopped."""
+"""Outcome of a request that the server cancelled during its shutdown."""
 OTHER: Final = "other"
-"""The outcome of a failure without a problem document, as of an asset's impossible range."""
+"""Outcome of a failure without a problem document, such as an invalid Range of a static file."""
 
 HEALTH: Final = ("/health/live", "/health/ready")
-"""Ends of paths that answer under every Host header.
+"""Suffixes of the paths that answer to every Host header.
 
-Orchestrators and load balancers ask by the address of a replica, and learn only yes or no.
+Orchestrators and load balancers use the address of a replica. They learn only yes or no.
 """
 
-# Orchestrators ask for health without credentials; the pages are the same for every installation
-# and hold nothing of this one. Every other path needs a key. docs/security.md gives the reasons.
+# Paths without a key. Orchestrators check health without credentials. The pages are the same in
+# every installation and contain no data of it. docs/security.md gives the reasons.
 OPEN_ROUTES: Final = frozenset(
     {
         "/health/live",
@@ -55,21 +55,21 @@ OPEN_ROUTES: Final = frozenset(
     }
 )
 _OPEN_FOLDERS: Final = ("/docs/", "/redoc/", "/static/", "/problems/")
-# By their ends, because a proxy may leave a prefix on.
+# Suffixes, because a proxy may leave a prefix in the path.
 _NOT_QUEUED: Final = (*HEALTH, "/metrics")
 
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 _TIMEOUT: Final = re.compile(rb"[1-9][0-9]{0,5}")
 _HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?")
-# Clients may invent methods; these are defined by RFC 9110 and RFC 5789.
+# Methods of RFC 9110 and RFC 5789. Clients may send any other word, which metrics must not count.
 _METHODS: Final = frozenset(
     ("GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH")
 )
 _SWITCHED: Final = 101
-# RFC 6455: the server met a condition that it did not expect.
+# Close code of RFC 6455 for an internal error.
 _DEFECT: Final = 1011
 
-# Browsers do not guess the media type. They cache no answer (`_NOT_KEPT`).
+# With these headers, browsers do not guess the media type and send no Referer.
 _ALWAYS: Final = (
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
@@ -81,21 +81,21 @@ _access = logging.getLogger("app.access")
 
 
 class Gateway:
-    """Every request passes it, in this order.
+    """The steps of every request, in this order.
 
-    1. It gets an id, which `X-Request-Id` echoes; a log line and the metrics follow its end. A
+    1. Request id: the response returns it as `X-Request-Id`, and the access log names it. A
        client's own id is kept if it has 1 to 128 unreserved URI characters or colons.
-    2. The Host header must name this service: a page whose name is made to point at this machine
-       after it was loaded (DNS rebinding) has the service's own origin for its browser.
-    3. Pages of other origins are answered where the settings list them.
-    4. A service with an API key asks for it, or for the admin key.
-    5. It gets a deadline and waits in the backlog until it may begin.
+    2. Host header: it must name this service. Otherwise an attacker could point the name of a
+       page at this machine, and browsers would treat both as one origin (DNS rebinding).
+    3. Origin: pages of other origins get an answer only if the settings list the origin.
+    4. Key: with an API key configured, the request needs this key or the admin key.
+    5. Admission: the request gets a deadline and waits in the backlog until it may start.
 
     Args:
         app: the application.
-        settings: of the service.
-        runtime: whose backlog and metrics are used.
-        direct: routes by path that need nothing of the framework; it takes 15 µs to find them.
+        settings: settings of the service.
+        runtime: owner of the backlog and the metrics.
+        direct: routes by path that bypass the router of the framework, which takes 15 µs.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Gateway:
         self._admitted: ASGIApp = CrossOrigin(self._admit, origins) if origins else self._admit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one connection."""
+        """Serve one request or stream."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -147,7 +147,7 @@ class Gateway:
                 detail = "SCENE_ALLOWED_HOSTS does not list the name in the Host header."
                 problem = ProblemError(catalogue.HOST_REFUSED, detail)
                 await answer(problem, scope, receive, send_completed)
-        except ProblemError as refused:  # the preflight of another origin
+        except ProblemError as refused:  # refused preflight request of another origin
             await answer(refused, scope, receive, send_completed)
         except Exception:
             raise
@@ -158,18 +158,18 @@ class Gateway:
             self._note(scope, record, perf_counter() - began)
 
     def _is_known(self, headers: Sequence[tuple[bytes, bytes]], path: str) -> bool:
-        """Whether the Host header names this service, or the path is a health check."""
+        """Return whether the Host header names this service or the path is a health check."""
         given = [value for name, value in headers if name == b"host"]
         host = _HOST.fullmatch(given[0].lower()) if len(given) == 1 else None
         return (host is not None and host[1] in (self._hosts or ())) or path.endswith(HEALTH)
 
     async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check key and size, wait for the request's turn, and answer every failure."""
+        """Check key and size, wait for admission, and answer every failure."""
         try:
             if self._settings.api_key is not None and not self._may_enter(scope):
                 raise ProblemError(
                     catalogue.UNAUTHORIZED,
-                    "This service needs its API key, or for administration its admin key.",
+                    "This service needs its API key, or the admin key for administration.",
                     headers={"WWW-Authenticate": "Bearer"},
                 )
             if scope["type"] == "http":
@@ -193,11 +193,11 @@ class Gateway:
                 await route.handle(scope, receive, send)
             else:
                 await self._app(scope, receive, send)
-        except Exception as error:  # noqa: BLE001 - answered, logged, and raised if half sent
+        except Exception as error:  # noqa: BLE001 - _fail() answers and logs every error
             await self._fail(error, scope, receive, send)
 
     async def _fail(self, error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a failure as far as no answer has begun."""
+        """Answer a failure, or close the connection if a response has started already."""
         problem = from_exception(error)
         record: Record = scope["state"]["record"]
         if problem.status_code == 500:
@@ -207,17 +207,17 @@ class Gateway:
             return
         record.outcome = problem.kind.slug
         if scope["type"] == "http":
-            # Half an answer cannot be taken back: the server breaks the connection off.
+            # The response is incomplete: raising the error makes the server close the connection.
             record.status = 500
             raise error
-        with suppress(OSError):  # the client has gone
+        with suppress(OSError):  # the client has closed the connection
             await send({"type": "websocket.close", "code": _DEFECT})
 
     def _draining(self) -> ProblemError:
-        # Without the header a client would send its next request here as well.
+        # Without this header a client would send its next request on the same connection.
         return ProblemError(
             catalogue.DRAINING,
-            "The service finishes the requests in progress, and then ends.",
+            "The service finishes the requests in progress and then stops.",
             headers={"Connection": "close"},
         )
 
@@ -233,24 +233,24 @@ class Gateway:
     def _chosen(self, value: bytes) -> float:
         longest = self._settings.max_request_timeout_ms
         if not _TIMEOUT.fullmatch(value) or int(value) > longest:
-            detail = f"{TIMEOUT_HEADER} must be a whole number, from 1 to {longest} milliseconds."
+            detail = f"{TIMEOUT_HEADER} must be a whole number from 1 to {longest} (milliseconds)."
             raise ProblemError(catalogue.BAD_REQUEST, detail)
         return int(value) / 1e3
 
     def _check_size(self, value: bytes) -> None:
         limit = self._settings.max_body_bytes
-        # Servers have checked that it is a number; len() guards int() where one has not.
+        # Most servers check the header. len() guards int() against very long numbers.
         if value.isdigit() and (len(value) > 18 or int(value) > limit):
             raise too_large(limit)
 
     def _note(self, scope: Scope, record: Record, seconds: float) -> None:
-        """Count a request and log it."""
+        """Write the metrics and the access log of a request."""
         status = record.status or 500
         if status >= 400 and record.outcome == SUCCESS:
             record.outcome = OTHER
         asked = scope.get("method", "GET")
         method = asked if asked in _METHODS else "-"
-        # The template of the route: the path may hold anything.
+        # Template of the route: a raw path may contain private data.
         route = getattr(scope.get("route"), "path", "-")
         took = None if status == _SWITCHED else seconds
         self._metrics.answered(route, method, record.outcome, took, record.serialise_seconds)
@@ -264,7 +264,7 @@ class Gateway:
                 **record.known(),
             }
             message = f"{method} {route} {status} {seconds * 1e3:.2f} ms"
-            # As `_access.info` does, without its search for the line of the caller.
+            # Faster than `_access.info`, which searches for the line of its caller.
             _access.handle(
                 _access.makeRecord(
                     "app.access", logging.INFO, "", 0, message, (), None, extra={"entry": entry}
@@ -283,40 +283,40 @@ def _completed(headers: Sequence[tuple[bytes, bytes]], request_id: bytes) -> lis
 
 
 def too_large(limit: int) -> ProblemError:
-    """The problem of a body of more than ``limit`` bytes."""
+    """Return the problem for a body of more than ``limit`` bytes."""
     detail = f"The body must not be larger than {limit} bytes."
     return ProblemError(catalogue.BODY_TOO_LARGE, detail)
 
 
 def carries(headers: Headers, name: str, expected: SecretStr | None) -> bool:
-    """Whether a key stands in its own header or, without that, as a bearer token.
+    """Return whether a request carries a key, in its own header or else as a bearer token.
 
     Args:
-        headers: of the request.
-        name: the key's own header.
-        expected: the key; no request carries one that is not configured.
+        headers: headers of the request.
+        name: name of the header for the key.
+        expected: the configured key; without one the result is False.
     """
     scheme, _, token = headers.get("authorization", "").partition(" ")
     given = headers.get(name) or (token.strip() if scheme.lower() == "bearer" else "")
     secret = expected.get_secret_value() if expected else ""
-    # In constant time, and first: neither the key nor whether there is one shows in the clock.
+    # Constant time, and always compared: the response time must not reveal the key or its presence.
     equal = hmac.compare_digest(given.encode(), secret.encode())
     return equal and bool(secret)
 
 
 class CrossOrigin(CORSMiddleware):
-    """Lets pages of the listed origins ask and read, without cookies, and no others.
+    """Allow pages of the listed origins to send GET and POST requests, without cookies.
 
     Args:
         app: the application.
-        origins: as browsers send them.
+        origins: allowed values of the Origin header.
     """
 
     def __init__(self, app: ASGIApp, origins: tuple[str, ...]) -> None:
         super().__init__(
             app,
             allow_origins=origins,
-            # Administration is for people at a terminal: a page needs neither PUT nor its key.
+            # No PUT and no admin key header: administration is for the command line only.
             allow_methods=("GET", "POST"),
             allow_headers=(
                 "Authorization",
@@ -329,29 +329,30 @@ class CrossOrigin(CORSMiddleware):
         )
 
     def preflight_response(self, request_headers: Headers) -> Response:
-        """The answer to a browser that asks first.
+        """Answer a preflight request (CORS).
 
         Raises:
-            ProblemError: of kind `catalogue.ORIGIN_REFUSED`.
+            ProblemError: `catalogue.ORIGIN_REFUSED`.
         """
         response = super().preflight_response(request_headers)
         if response.status_code != 200:
             raise ProblemError(
                 catalogue.ORIGIN_REFUSED,
-                "The origin, the method or a header is not allowed.",
+                "The service does not allow the origin, the method or a header of this request.",
                 headers={"Vary": response.headers["vary"]},
             )
         return response
 
 
 def may_connect(headers: Headers, origins: Sequence[str]) -> bool:
-    """Whether a WebSocket is asked for by a page of these origins or of ours, or by no page.
+    """Return whether a client may open a WebSocket.
 
-    Browsers send no preflight for WebSockets and let the page read the messages; no page can change
-    its Origin header.
+    Allowed are pages of the service, pages of the listed origins, and clients without an Origin
+    header. Browsers send no preflight for WebSockets, but a page cannot change its Origin header.
 
     Args:
-        origins: as browsers send them.
+        headers: headers of the handshake.
+        origins: allowed values of the Origin header.
     """
     origin = headers.get("origin")
     if origin is None or origin in origins:

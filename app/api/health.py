@@ -1,7 +1,7 @@
-"""Liveness and readiness, in our spelling and in that of the Open Inference Protocol.
+"""Liveness and readiness, on own routes and on those of the Open Inference Protocol.
 
-Alive is a process that answers. Ready is one whose default model has answered a real question; a
-model that was refused keeps the service not ready where it is the default.
+A process is live if it answers. It is ready if its default model has answered a real question in
+the warm-up.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MOD
 
 @router.get("/health/live", summary="Is the process alive?", responses=problems())
 async def health_live() -> Health:
-    """Answers as long as the process does, whatever its models do."""
+    """Status 200 while the process runs, whatever the state of its models."""
     return Health(status="live")
 
 
 @router.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
 async def health_ready(runtime: RuntimeDep) -> Health:
-    """Status 200 when the default model answers, 503 when it does not."""
+    """Status 200 if the default model is usable, else 503."""
     runtime.check_ready()
     return Health(status="ready")
 

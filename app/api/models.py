@@ -1,4 +1,4 @@
-"""What can be asked, and changing it."""
+"""Routes that list the models, and administration routes that change aliases and versions."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ Reference = Annotated[
         openapi_examples={"alias": {"summary": "the default model", "value": "default"}},
     ),
 ]
-Version = Annotated[str, Path(description="as GET /models lists it")]
+Version = Annotated[str, Path(description="a version that GET /models lists")]
 
-# For the documentation alone: a stranger's body is not read, and dependencies are resolved later.
+# For the documentation only. The routes check the key themselves, before they read the body.
 _SCHEMES: Final = [
     Security(APIKeyHeader(name=ADMIN_KEY, scheme_name="admin-key", auto_error=False)),
     Security(HTTPBearer(scheme_name="admin-key-as-bearer-token", auto_error=False)),
 ]
 
 
-# A coroutine: the framework runs plain functions in a thread, at 100 µs a hop.
+# A coroutine, because FastAPI runs plain functions in a thread, which costs 100 µs.
 async def _runtime(http: Request) -> Runtime:
     runtime: Runtime = http.app.state.runtime
     return runtime
@@ -70,7 +70,7 @@ changes = APIRouter(
     response_model_exclude_none=True,
 )
 async def list_models(runtime: RuntimeDep) -> ModelList:
-    """Everything in the store, with what was refused and why."""
+    """All models, versions and aliases of the store, with a reason for each refused version."""
     return describe.everything(runtime.models)
 
 
@@ -87,11 +87,11 @@ async def show_model(name: Reference, runtime: RuntimeDep) -> ModelSummary:
     response_model_exclude_none=True,
 )
 async def show_version(name: Reference, version: Version, runtime: RuntimeDep) -> VersionDetails:
-    """Metrics, data, terms and card of a version; of a refused one, why."""
+    """Metrics, training data, terms and card of a version; for a refused version, the reason."""
     return describe.version(runtime.models, name, version)
 
 
-@router.get("/{name}/vocabulary", summary="The words of a model", responses=_USABLE)
+@router.get("/{name}/vocabulary", summary="The vocabulary of a model", responses=_USABLE)
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> VocabularyAnswer:
     """Object classes with their aliases, relations and room types."""
     return describe.vocabulary(runtime.models.resolve(name))
@@ -99,21 +99,21 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> VocabularyAns
 
 @router.get("/{name}/contexts", summary="The hidden units of a model", responses=_USABLE)
 async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
-    """Each hidden unit by its strongest objects; `context` of `/generate` names units by number."""
-    # In a thread: the first time takes a fifth of a second.
+    """Hidden units with their strongest objects; `context` of `/generate` uses their numbers."""
+    # In a thread, because the first call takes 0.2 s.
     return await asyncio.to_thread(describe.contexts, runtime.models.resolve(name))
 
 
 @administration.post(
     "/refresh",
-    summary="Take over what the store holds now",
+    summary="Load the current state of the store",
     responses=queued(catalogue.UNAUTHORIZED, catalogue.REFRESH_REFUSED),
     response_model_exclude_none=True,
 )
 async def refresh_models(http: Request) -> RefreshAnswer:
-    """Load, verify and warm everything in the store, then swap it in at once.
+    """Load, verify and warm up all versions in the store, then replace all served models at once.
 
-    What is served now goes on answering meanwhile, and for good if anything is wrong with the new.
+    The models served now answer in the meantime. If a new model fails, they stay in place.
     """
     check_admin(http)
     runtime: Runtime = http.app.state.runtime
@@ -122,7 +122,7 @@ async def refresh_models(http: Request) -> RefreshAnswer:
 
 @changes.put(
     "/aliases/{alias}",
-    summary="Promote or roll back",
+    summary="Point an alias at another version",
     responses=queued(
         catalogue.NOT_JSON,
         catalogue.UNAUTHORIZED,
@@ -145,14 +145,14 @@ async def move_alias(
     alias: Annotated[
         str,
         Path(
-            description="`default`, or any name of your own",
+            description="`default`, or another name of your choice",
             openapi_examples={"default": {"summary": "the default model", "value": "default"}},
         ),
     ],
     asked: AliasRequest,
     http: Request,
 ) -> bytes:
-    """Let an alias lead to a version that is served; the store remembers it."""
+    """Point an alias at a served version, and save the alias in the store."""
     runtime: Runtime = http.app.state.runtime
     answer = await runtime.move_alias(alias, asked, http.state.request_id)
     return answer.model_dump_json(exclude_none=True).encode()

@@ -1,4 +1,4 @@
-"""What Prometheus reads."""
+"""Metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ router = APIRouter(tags=["monitoring"])
 async def show_metrics(runtime: RuntimeDep) -> PlainTextResponse:
     """Counters, gauges and histograms in the text format.
 
-    docs/operations.md says what each of them means.
+    docs/operations.md explains each metric.
     """
-    # Many series take over 10 ms to write out: others are served meanwhile.
+    # In a thread: many series take more than 10 ms to format.
     text = await asyncio.to_thread(runtime.metrics.exposition)
     return PlainTextResponse(text, media_type=CONTENT_TYPE)

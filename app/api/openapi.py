@@ -1,4 +1,4 @@
-"""The OpenAPI document: stable operation ids, and every error a route can answer with."""
+"""The OpenAPI document: stable operation ids, and all problems of each route."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ERRORS: Final = {
     catalogue.CONTRADICTORY_EVIDENCE: [
         FieldError(
             pointer="#/relations/1",
-            message="contradicts an earlier relation, which says the opposite of this pair",
+            message="contradicts an earlier relation of this pair, which is the opposite",
         )
     ],
 }
@@ -42,17 +42,17 @@ _KEY_SCHEMES: Final = {
 }
 TAGS: Final = [
     {"name": "questions", "description": "The four questions about one scene."},
-    {"name": "batches", "description": "The same about many scenes, each answered on its own."},
-    {"name": "models", "description": "What can be asked, and what each model knows."},
-    {"name": "administration", "description": "Changing what is served; needs the admin key."},
-    {"name": "health", "description": "For orchestrators."},
-    {"name": "monitoring", "description": "For Prometheus."},
-    {"name": "inference protocol", "description": "Open Inference Protocol spellings."},
+    {"name": "batches", "description": "The same questions about many scenes in one request."},
+    {"name": "models", "description": "The models, their versions and their vocabularies."},
+    {"name": "administration", "description": "Change the served models, with the admin key."},
+    {"name": "health", "description": "Health checks for orchestrators."},
+    {"name": "monitoring", "description": "Metrics for Prometheus."},
+    {"name": "inference protocol", "description": "Routes of the Open Inference Protocol."},
 ]
 
 
 def problems(*kinds: ProblemType) -> Responses:
-    """The ``responses`` of a route that may answer with these problems, or fail."""
+    """Return the ``responses`` of a route with these problems and the internal error."""
     responses: Responses = {}
     for kind in (*kinds, catalogue.INTERNAL_ERROR):
         response = responses.setdefault(
@@ -76,7 +76,7 @@ def problems(*kinds: ProblemType) -> Responses:
 
 
 def queued(*kinds: ProblemType) -> Responses:
-    """The same of a route whose requests wait for their turn, and may have a deadline."""
+    """Return the ``responses`` of a route whose requests pass through admission control."""
     return problems(
         *kinds,
         catalogue.BAD_REQUEST,
@@ -99,12 +99,12 @@ def described(example: Example) -> dict[str, Any]:
 
 
 def operation_id(route: APIRoute) -> str:
-    """The name of the route's function: generated clients call the operation by it."""
+    """Return the name of the route's function; generated clients use it as the method name."""
     return route.name
 
 
 def _state_whole_numbers(node: Any) -> None:
-    """Bounds of integers as integers: the framework keeps doubles, which round the largest up."""
+    """Write the bounds of integers as integers; FastAPI writes floats, which round the largest."""
     if isinstance(node, dict):
         if node.get("type") == "integer":
             for bound in ("minimum", "maximum"):
@@ -118,10 +118,10 @@ def _state_whole_numbers(node: Any) -> None:
 
 
 class DocumentedAPI(FastAPI):
-    """FastAPI, whose document tells what the service really answers."""
+    """FastAPI with an OpenAPI document that describes the real answers of the service."""
 
     def openapi(self) -> dict[str, Any]:
-        """The framework's document, with examples, and problems in place of validation errors."""
+        """Return FastAPI's document with examples, and with problems for its validation errors."""
         if self.openapi_schema is None:
             document = super().openapi()
             schemas = document["components"]["schemas"]
@@ -156,15 +156,15 @@ def _timeout_parameter(most: int) -> dict[str, Any]:
         "name": TIMEOUT_HEADER,
         "in": "header",
         "required": False,
-        "description": "milliseconds that the client waits for the answer: work that has not "
-        "begun by then is dropped (504)",
+        "description": "time in milliseconds that the client waits for the answer; after it, the "
+        "service answers 504",
         "schema": {"type": "integer", "minimum": 1, "maximum": most},
-        "examples": {"second": {"summary": "a second", "value": min(1000, most)}},
+        "examples": {"second": {"summary": "one second", "value": min(1000, most)}},
     }
 
 
 def _refuse_other_hosts(document: dict[str, Any]) -> None:
-    """Say of each operation but health checks that it answers under some names only."""
+    """Add the host-refused problem to each operation except health checks."""
     kind = catalogue.HOST_REFUSED
     for path, operations in document["paths"].items():
         for operation in () if path.endswith(HEALTH) else operations.values():
@@ -172,7 +172,7 @@ def _refuse_other_hosts(document: dict[str, Any]) -> None:
 
 
 def _ask_for_keys(document: dict[str, Any]) -> None:
-    """Say of each operation that is not open, and not for administrators, that it needs a key."""
+    """Add the API key to each operation that is neither open nor for administration."""
     document["components"].setdefault("securitySchemes", {}).update(_KEY_SCHEMES)
     for path, operations in document["paths"].items():
         for operation in operations.values():

@@ -1,7 +1,7 @@
-"""Pages for people: interactive documentation and one page a problem type, none of it from outside.
+"""HTML pages: the board, the interactive documentation and a page for each problem type.
 
-The policy sent with each page lets a browser load from this service alone, so a forgotten link to
-another host fails visibly instead of leaking who reads the documentation.
+The Content-Security-Policy of each page lets a browser load files from this service only. So a
+forgotten link to another host fails, and that host learns nothing about the readers.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ STATIC: Final = Path(__file__).parents[1] / "static"
 _BOARD: Final = "board.html"
 _VENDOR: Final = "vendor/"
 
-# Swagger UI and Redoc style their elements inline and Redoc searches in a worker made from a blob;
-# neither needs inline script.
+# Swagger UI and Redoc use inline styles, and Redoc searches in a worker made from a blob. Inline
+# scripts stay forbidden.
 _POLICY: Final = "; ".join(
     (
         "default-src 'none'",
@@ -42,7 +42,7 @@ _POLICY: Final = "; ".join(
 )
 _HEADERS: Final = {"Content-Security-Policy": _POLICY}
 
-# The visual page is all our own: it has no inline style either.
+# Policy of the board, which has no inline styles.
 _STRICT_POLICY: Final = "; ".join(
     (
         "default-src 'none'",
@@ -81,7 +81,7 @@ def _page(title: str, body: str, *, root: str) -> HTMLResponse:
 
 @problems.get("/problems")
 async def list_problem_types() -> HTMLResponse:
-    """Every problem type, with links."""
+    """List all problem types, with links."""
     entries = "\n".join(
         f'<dt><a href="problems/{kind.slug}"><code>{kind.slug}</code></a> ({kind.status})</dt>'
         f"<dd>{escape(kind.title)}</dd>"
@@ -92,10 +92,10 @@ async def list_problem_types() -> HTMLResponse:
 
 @problems.get("/problems/{slug}")
 async def show_problem_type(slug: str) -> HTMLResponse:
-    """What a problem type means and what to do about it."""
+    """Show the cause and the remedy of a problem type."""
     kind = catalogue.PROBLEM_TYPES.get(slug)
     if kind is None:
-        raise ProblemError(catalogue.NOT_FOUND, "There is no problem type of this name.")
+        raise ProblemError(catalogue.NOT_FOUND, "No problem type has this name.")
     body = (
         f"<p><code>{kind.uri}</code>, status {kind.status}</p><p>{escape(kind.explanation)}</p>"
         '<p><a href="../problems">All problems</a></p>'
@@ -104,13 +104,16 @@ async def show_problem_type(slug: str) -> HTMLResponse:
 
 
 class Assets(StaticFiles):
-    """Files with entity tags; those of a library, whose folder names its version, never change."""
+    """Static files with entity tags; files of a vendored library never change.
+
+    The folder of such a library names its version.
+    """
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """A file, or 304 where the browser has it."""
+        """Return a file, or 304 if the browser already has it."""
         response = await super().get_response(path, scope)
         if response.status_code in {200, 304}:
-            # A browser that guesses how long to keep a module would mix those of two releases.
+            # Without "no-cache" a browser could mix modules of two releases.
             kept = path.startswith(_VENDOR)
             response.headers["Cache-Control"] = (
                 "public, max-age=31536000, immutable" if kept else "no-cache"

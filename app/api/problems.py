@@ -1,4 +1,4 @@
-"""Every failure as problem details (RFC 9457): no traceback, no file, no copy of the input."""
+"""Failures as problem details (RFC 9457), without traceback, file name or copy of the input."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from scene_client.validation import MAX_ERRORS, field_errors, pointer
 
 MEDIA_TYPE: Final = "application/problem+json"
 
-# The server can answer a handshake with more than 403.
+# ASGI extension: with it, the server can refuse a handshake with any response, not only with 403.
 _DENIAL: Final = "websocket.http.response"
 
 _logger = logging.getLogger("app.api")
@@ -59,10 +59,10 @@ _OF_REASON: Final = {
 
 
 class ProblemError(HTTPException):
-    """A failure with a name.
+    """A failure with its problem type.
 
-    Starlette hands `HTTPException` through where it wraps anything else, which a failure in the
-    middle of reading a body relies on.
+    It extends `HTTPException` because Starlette wraps all other exceptions that are raised while a
+    body is read.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class ProblemError(HTTPException):
         self.failures = list(failures)
 
     def describe(self, request_id: str) -> Problem:
-        """The problem as it is sent."""
+        """Return the problem document that the client receives."""
         return Problem(
             type=self.kind.uri,
             title=self.kind.title,
@@ -94,11 +94,11 @@ class ProblemError(HTTPException):
 
 
 def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
-    """The problem that an exception stands for; anything unforeseen is an internal error.
+    """Return the problem for an exception; an unexpected exception gives an internal error.
 
     Args:
-        error: what was raised.
-        at: where in the body the failing request stands (an entry of a batch).
+        error: the raised exception.
+        at: position of the failing request in the body, for an entry of a batch.
     """
     match error:
         case ProblemError():
@@ -139,41 +139,41 @@ def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
         case StoreBusyError():
             return ProblemError(catalogue.STORE_BUSY, str(error))
         case RefreshRefusedError():
-            detail = "What is served stays as it was; see failures."
+            detail = "The service still serves the previous versions; see failures."
             return ProblemError(catalogue.REFRESH_REFUSED, detail, failures=error.failures)
         case HTTPException() if error.status_code in _OF_STATUS:
             kind = _OF_STATUS[error.status_code]
             return ProblemError(kind, kind.title + ".", headers=error.headers)
         case _:
             return ProblemError(
-                catalogue.INTERNAL_ERROR, "The request failed; the service's log says why."
+                catalogue.INTERNAL_ERROR, "The request failed; the log of the service says why."
             )
 
 
 def _faulty(kind: ProblemType, errors: list[FieldError], count: int) -> ProblemError:
-    faults = f"{count} fault{'' if count == 1 else 's'}"
+    faults = f"{count} error{'' if count == 1 else 's'}"
     return ProblemError(kind, f"The request has {faults}; see errors.", errors=errors)
 
 
 def unfit(
     error: RequestValidationError | ValidationError, body: Any, *, at: Location = ()
 ) -> ProblemError:
-    """The problem of a body that does not fit its schema.
+    """Return the problem for a body that does not match its schema.
 
     Args:
-        error: what validation found.
-        body: what was validated.
-        at: where in the request ``body`` stands.
+        error: the error of the validation.
+        body: the validated value.
+        at: position of ``body`` in the request.
     """
     faults = error.errors()
-    # The framework's begin with where they were found: in the body.
+    # FastAPI puts "body" in front of each location.
     skip = 1 if isinstance(error, RequestValidationError) else 0
     errors = field_errors(faults, body, at=at, skip=skip)
     return _faulty(catalogue.INVALID_REQUEST, errors, len(faults))
 
 
 def report_defect(error: Exception, request_id: str) -> None:
-    """Log what a client is told nothing about."""
+    """Log an internal error; the client receives no details."""
     _logger.error("request failed", exc_info=error, extra={"request_id": request_id})
 
 
@@ -182,7 +182,7 @@ def _request_id(request: HTTPConnection) -> str:
 
 
 def respond(request: HTTPConnection, problem: ProblemError) -> Response:
-    """The problem as a response, and its name in the request's record."""
+    """Return the problem as a response, and store its slug in the record of the request."""
     record = request.scope.get("state", {}).get("record")
     if record is not None:
         record.outcome = problem.kind.slug
@@ -200,7 +200,7 @@ def respond(request: HTTPConnection, problem: ProblemError) -> Response:
 async def answer(problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
     """Answer a request, or the handshake of a WebSocket, with a problem."""
     if scope["type"] == "websocket" and _DENIAL not in scope.get("extensions", {}):
-        # Before it is accepted: the server answers the handshake with 403.
+        # Closing before the stream is accepted: the server answers the handshake with 403.
         await send({"type": "websocket.close", "code": 1008})
     else:
         await respond(HTTPConnection(scope), problem)(scope, receive, send)
@@ -214,11 +214,10 @@ Handler = Callable[[Request, Exception], Any]
 
 
 def install(app: FastAPI) -> None:
-    """Answer failures of ``app`` with problems, in place of the framework's own handlers.
+    """Answer failures of ``app`` with problems, in place of the handlers of the framework.
 
-    Defects are not among them: the framework raises them again after its handler has answered, and
-    the server then drops a connection that the client has just been told it may use again.
-    `middleware.defects.Defects` answers them.
+    `app.api.gateway.Gateway` answers unexpected exceptions. The framework would raise them again
+    after its answer, and the server would then close a connection that the client may reuse.
     """
     for kind in (HTTPException, RequestValidationError, ServingError):
         app.add_exception_handler(kind, _handle)

@@ -37,15 +37,15 @@ router = APIRouter(
     generate_unique_id_function=operation_id,
 )
 
-# The schemas in the routes describe the answers. Validation of an answer would cost as much as its
-# JSON; the tests validate.
+# The schemas in the routes only document the answers. Validating an answer would take as long as
+# writing its JSON, so the tests do it instead.
 
 
 def begin(http: Request) -> serving.Request:
-    """The request as the models see it.
+    """Return the request as the serving layer uses it.
 
     Raises:
-        NotReadyError: nothing has been loaded yet.
+        NotReadyError: the models are not loaded yet.
     """
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
     found: serving.Request = runtime.request(

@@ -1,4 +1,4 @@
-"""The WebSocket ``GET /stream``: updates in, the newest whole answer out; see docs/stream.md."""
+"""The WebSocket ``GET /stream``: scene updates in, answers out (docs/stream.md)."""
 
 from __future__ import annotations
 
@@ -39,34 +39,35 @@ from scene_client.stream_messages import (
 
 PATH: Final = "/stream"
 READING_SHARE: Final = 0.2
-"""Share of a core that the messages of one stream may take; beyond it they are read more slowly.
+"""Share of a core for reading the messages of one stream; beyond it, reading slows down.
 
-A small update takes 0.05 ms, an invalid one of 256 objects 36 ms: a count would treat both alike.
+The limit is in time, not in messages: a small update takes 0.05 ms, but an invalid update of
+256 objects takes 36 ms.
 """
 READING_BURST: Final = 1.0
-"""Seconds that they may take at once."""
+"""Processor seconds that a stream may use for reading in one burst."""
 LEAST_COST: Final = 0.25e-3
-"""Seconds that each message counts at least: its answer and its frame cost something, too."""
+"""Minimum cost of a message in seconds, for its frame and the answer to it."""
 
 Closing = tuple[int, str]
-"""Code and reason of the close (RFC 6455, section 7.4)."""
+"""Code and reason of a close frame (RFC 6455, section 7.4)."""
 
 router = APIRouter()
 
 
 @router.get(PATH, include_in_schema=False)
 async def plain_http() -> None:
-    """Refuse a request that is no WebSocket handshake."""
+    """Refuse a request that is not a WebSocket handshake."""
     raise ProblemError(
         catalogue.UPGRADE_REQUIRED,
-        "Ask for a WebSocket (RFC 6455).",
+        "This route only accepts WebSocket handshakes (RFC 6455).",
         headers={"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"},
     )
 
 
 @router.websocket(PATH)
 async def stream(socket: WebSocket) -> None:
-    """Scene updates in, answers out."""
+    """Run one stream, or refuse its handshake."""
     streams: Streams = socket.app.state.streams
     refusal = _refusal(socket, streams)
     if refusal is not None:
@@ -79,23 +80,23 @@ async def stream(socket: WebSocket) -> None:
 
 
 def _refusal(connection: HTTPConnection, streams: Streams) -> ProblemError | None:
-    """The answer to a handshake that opens no stream."""
+    """Return the problem for a handshake that the service refuses, else None."""
     settings: Settings = connection.app.state.settings
     runtime: Runtime = connection.app.state.runtime
     if not may_connect(connection.headers, settings.cors_origins):
-        return ProblemError(catalogue.ORIGIN_REFUSED, "No page of this origin may open a stream.")
+        return ProblemError(catalogue.ORIGIN_REFUSED, "Pages of this origin may not open a stream.")
     if runtime.draining:
-        return ProblemError(catalogue.DRAINING, "The service ends its streams.")
+        return ProblemError(catalogue.DRAINING, "The service is closing its streams.")
     if streams.is_full:
         return ProblemError(catalogue.TOO_MANY_STREAMS, f"{streams.limit} streams are open.")
     return None
 
 
 class _Conversation:
-    """One open stream: a task that listens, and a task that answers about the newest scene.
+    """One open stream, with a task that reads messages and a task that sends answers.
 
-    No answer is ever queued: messages that arrive while an answer is computed or sent are merged
-    into the scene, and the next answer covers them.
+    Answers are never queued. Messages that arrive while an answer is computed or sent update the
+    scene, and the next answer covers all of them.
     """
 
     def __init__(self, socket: WebSocket) -> None:
@@ -111,12 +112,12 @@ class _Conversation:
         self._due = asyncio.Event()
 
     def end(self) -> None:
-        """Let it end after the answer in progress."""
+        """Close the stream after the answer in progress."""
         self._is_ending = True
         self._due.set()
 
     async def run(self) -> None:
-        """Listen and answer until either task ends."""
+        """Read and answer until one of the two tasks ends."""
         listening = asyncio.create_task(self._listen())
         answering = asyncio.create_task(self._answer())
         closing = None
@@ -141,7 +142,7 @@ class _Conversation:
         bucket = TokenBucket(READING_SHARE, READING_BURST)
         settings = self._settings
         while True:
-            # A stream without `open` takes a place, as a request without its body does.
+            # Before `open`, the timeout is short: an idle connection occupies one of the streams.
             patience = settings.stream_idle if self._is_open else settings.client_timeout
             try:
                 async with asyncio.timeout(patience):
@@ -155,11 +156,11 @@ class _Conversation:
             began = thread_time()
             await self._hear(event)
             cost = max(LEAST_COST, thread_time() - began)
-            # Messages of one packet are at hand at once: other tasks get their turn in between.
+            # A packet may hold many messages. Let other tasks run between them.
             await asyncio.sleep(bucket.take(cost))
 
     async def _hear(self, event: Mapping[str, Any]) -> None:
-        """Obey one message, or say why not."""
+        """Carry out one message, or send a problem."""
         kind, seq, outcome = "-", None, SUCCESS
         try:
             value, kind, seq = _parsed(event)
@@ -178,7 +179,7 @@ class _Conversation:
             return
         is_first = isinstance(command, Open)
         if is_first == self._is_open:
-            raise _unfit("the first message, and no other, must be open")
+            raise _unfit("the first message must be open, and later messages must not be open")
         self._check_deadline(command)
         self._scene.take(command, self._request())
         if is_first:
@@ -224,7 +225,7 @@ class _Conversation:
             await self._send(written(message).decode())
 
     def _request(self) -> Request:
-        """A request to the service as it is now: after a promotion the new model answers."""
+        """Return a request on the current snapshot, so that a promoted model answers at once."""
         timeout = self._scene.timeout_ms or self._settings.request_timeout_ms
         return self._runtime.request(monotonic() + timeout / 1e3, self._request_id, self._record)
 
@@ -234,7 +235,7 @@ class _Conversation:
         await self._send(message.model_dump_json(exclude_none=True))
 
     async def _send(self, text: str) -> None:
-        """Send a message; a client that does not read in time counts as gone."""
+        """Send a message; a client that does not read it in time counts as disconnected."""
         try:
             async with asyncio.timeout(self._settings.client_timeout):
                 await self._socket.send_text(text)
@@ -243,10 +244,10 @@ class _Conversation:
 
 
 def _parsed(event: Mapping[str, Any]) -> tuple[Any, str, int | None]:
-    """A message, its type ("-": none or unknown) and its number, if it has a valid one."""
+    """Return a message, its type ("-" if missing or unknown) and its number, if that is valid."""
     text = event.get("text")
     if text is None:
-        raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, "Messages are JSON in text frames.")
+        raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, "Send JSON in text frames.")
     value = parse(text.encode())
     fields = value if isinstance(value, dict) else {}
     kind, seq = fields.get("type"), fields.get("seq")
@@ -258,7 +259,7 @@ def _parsed(event: Mapping[str, Any]) -> tuple[Any, str, int | None]:
 def _command(kind: str, value: Any) -> Command:
     form = COMMANDS.get(kind)
     if form is None:
-        raise _unfit("must be " + ", ".join(COMMANDS))
+        raise _unfit("must be one of " + ", ".join(COMMANDS))
     try:
         return form.model_validate(value)
     except ValidationError as error:
@@ -267,5 +268,5 @@ def _command(kind: str, value: Any) -> Command:
 
 def _unfit(message: str, field: str = "type") -> ProblemError:
     fault = FieldError(pointer=f"#/{field}", message=message)
-    detail = "The message has 1 fault; see errors."
+    detail = "The message has 1 error; see errors."
     return ProblemError(catalogue.INVALID_REQUEST, detail, errors=[fault])

@@ -1,7 +1,7 @@
-"""Traces for OpenTelemetry: the framework's own spans, off unless an operator asks for them.
+"""Traces for OpenTelemetry: the spans of FastAPI, off by default.
 
-Traces alone: metrics are Prometheus' (`app/serving/metrics.py`), and log records would carry
-messages of exceptions to another system.
+Only traces are exported. Metrics go to Prometheus (`app/serving/metrics.py`). Log records would
+carry exception messages to another system.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from fastapi.telemetry import TelemetryConfig
 from app import __version__
 
 _SERVICE: Final = "scene-boltzmann"
-# Asked every few seconds by machines: their spans would bury the others.
+# Machines poll these paths every few seconds. Their spans would outnumber all other spans.
 _UNTRACED: Final = ("/health", "/v2/health", "/metrics", "/static")
-# The framework takes these over as the client sent them.
+# FastAPI copies these attributes from the request without a check.
 _MADE_UP: Final = ("url.path", "url.query", "http.request.method_original")
 _REDACTED: Final = "REDACTED"
 
 
 def configuration(*, enabled: bool) -> TelemetryConfig:
-    """What `FastAPI` is told; off, it looks for no provider at all.
+    """Return the telemetry configuration of `FastAPI`; if off, no provider is looked up.
 
-    Where spans go is said by OpenTelemetry's own variables (``OTEL_EXPORTER_OTLP_ENDPOINT`` and
-    others); `Settings` has checked that the packages are there.
+    The variables of OpenTelemetry (``OTEL_EXPORTER_OTLP_ENDPOINT`` and others) set the destination
+    of the spans. `Settings` has checked that the packages are installed.
     """
     if not enabled:
         return TelemetryConfig(tracing=False, metrics=False, logs=False, auto_configure=False)
-    # Not there unless the group `telemetry` is installed.
+    # Only importable if the dependency group `telemetry` is installed.
     from opentelemetry.context import Context
     from opentelemetry.sdk.resources import SERVICE_NAME, SERVICE_VERSION, Resource
     from opentelemetry.sdk.trace import Span, SpanProcessor, TracerProvider
 
     class Redaction(SpanProcessor):
-        """Takes out of a span what a client may have made up; `http.route` says what was asked."""
+        """Redact attributes with text from the client; `http.route` still names the route."""
 
         def on_start(self, span: Span, parent_context: Context | None = None) -> None:
             for name in _MADE_UP:
@@ -51,7 +51,7 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
         tracing=True,
         metrics=False,
         logs=False,
-        # The exporter is made when the application starts, in the process that serves.
+        # The exporter starts with the application, in the worker process.
         auto_configure=True,
         tracer_provider=provider,
         exclude=_is_untraced,

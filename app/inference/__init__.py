@@ -1,7 +1,6 @@
-"""A trained machine answering: arrays in, arrays out.
+"""Inference with a trained machine: arrays in, arrays out.
 
-Symbols are those of the project's model page: v, r, h1, h2; b, c1, c2, W, J, Q; d, s, o, S, O, R,
-M, P, U.
+docs/models.md defines the symbols: v, r, h1, h2; b, c1, c2, W, J, Q; d, s, o, S, O, R, M, P, U.
 """
 
 from __future__ import annotations

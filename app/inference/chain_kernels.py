@@ -1,7 +1,7 @@
-"""Compiled loops of one Gibbs chain over contexts and objects.
+"""Compiled kernels of one Gibbs chain over contexts and objects.
 
-Formulas in `chains`. Every function works for one chain and takes its random numbers, uniform on
-[0, 1), so nothing depends on other chains. `beta` is one over the temperature.
+`chains` has the formulas. Each function works on one chain and receives its random numbers, uniform
+on [0, 1), so a chain is independent of other chains. `beta` is 1 / temperature.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from app.compiling import compiled, compiled_in_any_order, inlined
 from app.inference.elementary import exp, log, logistic
 
 PROPOSALS = 8
-"""Contexts that observed relations tie together are proposed in so many blocks."""
+"""Number of blocks in which h1 is proposed if relations are observed."""
 
 
 @inlined
@@ -22,14 +22,14 @@ def _softplus(x):
 
 @compiled
 def _bernoulli(logits, beta, uniform, on):
-    """on = 1 with probability sigmoid(beta logits)."""
+    """Sample on = 1 with probability sigmoid(beta logits)."""
     for i in range(len(logits)):
         on[i] = uniform[i] < logistic(beta * logits[i])
 
 
 @compiled
 def _add_rows(rows, on, total):
-    """total += sum of the rows where on (n,) is 1, four of them at a time."""
+    """Add the rows where on (n,) is 1 to total, four rows at a time."""
     which, count = np.empty(len(on), np.int64), 0
     for i in range(len(on)):
         which[count] = i
@@ -47,13 +47,16 @@ def _add_rows(rows, on, total):
 
 @compiled
 def sweeps(w, bias, always, held, held2, observed, beta, uniform, on, h1, h2):
-    """Gibbs sweeps over h1 (H1,), h2 (H2,) and on (V,), uint8 in place.
+    """Run Gibbs sweeps over h1 (H1,), h2 (H2,) and on (V,), uint8, in place.
 
     Args:
         w: `chains.Arrays`.
+        bias: (H1,) bias of h1.
         always, held, held2: (V,), (H1,), (H2,) uint8, classes and hidden units that stay on.
-        observed: relations that were seen, `chains.Observed`.
-        uniform: (sweeps, V + 2 H1 + H2 + PROPOSALS).
+        observed: observed relations, `chains.Observed`.
+        beta: 1 / temperature.
+        uniform: (sweeps, V + 2 H1 + H2 + PROPOSALS) random numbers.
+        on, h1, h2: presence of the classes and states of the hidden units; changed in place.
     """
     V, H1 = w.W.shape
     H2 = len(h2)
@@ -82,7 +85,7 @@ def sweeps(w, bias, always, held, held2, observed, beta, uniform, on, h1, h2):
 
 @compiled
 def _propose(w, x, held, observed, beta, h1, blocks, uniform):
-    """h1 given the objects and observed relations: block after block is proposed from p(h1 | v)."""
+    """Update h1 given objects and observed relations: propose block by block from p(h1 | v)."""
     H1 = len(x)
     proposal, block = np.empty(H1, np.uint8), np.empty(H1, np.int64)
     _bernoulli(x, beta, uniform, proposal)
@@ -115,7 +118,7 @@ def _propose(w, x, held, observed, beta, h1, blocks, uniform):
 
 @compiled
 def _observed_weight(through, observed, beta, terms):
-    """log p(observed r | v, h1)."""
+    """Compute log p(observed r | v, h1)."""
     _observed_logits(through.reshape(-1, observed.z.shape[1]), observed, terms)
     for e in range(len(terms)):
         logit = beta * terms[e]

@@ -1,18 +1,19 @@
-"""Scenes drawn by Gibbs chains, each with a random stream of its own.
+"""Sampling of scenes by Gibbs chains, each with its own random stream.
 
 For machines in the local form. A chain starts at a stored scene and makes its sweeps over h1, h2
-and v. With relations given, h1 is drawn by Metropolis–Hastings. Relations are drawn once, at the
-end: in the local form they do not act on the other units.
+and v. With observed relations, h1 is sampled by Metropolis–Hastings. Relations are sampled once, at
+the end, because in the local form they do not act on the other units.
 
-The stored scene is drawn with weights given the evidence,
+The stored scene is sampled with these weights given the evidence,
 
     log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
-            - 6 [drawn under another room type than t],
+            - 6 [sampled under another room type than t],
 
-h1 at its mean given the scene. Where no scene was drawn under t, the last term is h1·Q[t].
+with h1 at its mean given the scene. If the store has no scene of room type t, the last term is
+h1·Q[t].
 
-A chain costs microseconds a sweep, releases the interpreter's lock while it runs, and depends on
-nothing but its conditions and its stream: what else is drawn beside it makes no difference.
+A sweep takes microseconds and releases the interpreter's lock. The result of a chain depends only
+on its conditions and its stream, not on other chains.
 """
 
 from __future__ import annotations
@@ -35,29 +36,30 @@ Mask = NDArray[np.bool_]
 Bits = NDArray[np.uint8]
 
 OTHER_ROOM = np.float32(6.0)
-"""What a stored scene of another room type loses of its log weight."""
+"""Reduction of the log weight of a stored scene of another room type."""
 
-# Sweeps whose random numbers are drawn at once.
+# Number of sweeps whose random numbers are generated together.
 _AT_ONCE = 64
 
 
 def random_stream(seed: int, place: int) -> np.random.Generator:
-    """A stream of its own for each place of each seed.
+    """Return the random stream of a seed and a place; all streams are independent.
 
     Args:
         seed: any number from 0.
-        place: from 0; those of one seed are as independent as those of two.
+        place: number of the stream, from 0.
     """
     sequence = np.random.SeedSequence(seed, spawn_key=(place,))
     return np.random.Generator(np.random.PCG64(sequence))
 
 
 class Arrays(NamedTuple):
-    """Weights as the compiled loops take them; names as in `weights.layout` but for
+    """Weights for the compiled kernels; other names as in `weights.layout`.
 
     Attributes:
-        WT: (H1, V), W the other way round; JT: (H2, H1), J likewise.
-        directions: (H1, R K') what each unit of h1 adds to the R K' factors of relation logits.
+        WT: (H1, V), transpose of W.
+        JT: (H2, H1), transpose of J.
+        directions: (H1, R K') contribution of each h1 unit to the R K' factors of relation logits.
     """
 
     W: Floats
@@ -70,13 +72,13 @@ class Arrays(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """Relations that were seen, on or off: E units.
+    """Observed relations, on or off: E units.
 
     Attributes:
-        a: (E,) row of the factors: the relation, or 0 where units share none.
-        z: (E, K') and
-        base: (E,) the parts of its logit that depend on nothing else.
-        r: (E,) 1 where it holds, else 0.
+        a: (E,) row of the factors: the relation, or 0 if the units do not share factors.
+        z: (E, K') factors of each unit; constant during a chain.
+        base: (E,) logit of each unit without h1; constant during a chain.
+        r: (E,) 1 if the relation holds, else 0.
     """
 
     a: Places
@@ -87,14 +89,14 @@ class Observed(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What stays as it is in a chain.
+    """The fixed conditions of a chain.
 
     Attributes:
-        classes: (n,) int64, ascending, distinct: they are present.
-        log_counts: (n,) log of the instances of each.
-        given: the relations observed between them; None for none.
-        held, held2: units of h1 and h2 that are held on, distinct.
-        room: index of the room type; None where it is not known.
+        classes: (n,) int64, ascending, distinct classes that stay present.
+        log_counts: (n,) log of the number of instances of each class.
+        given: observed relations between these classes; None without observed relations.
+        held, held2: distinct units of h1 and h2 that stay on.
+        room: index of the room type; None if unknown.
     """
 
     classes: Places
@@ -107,13 +109,14 @@ class Conditions:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """The end of a chain.
+    """The final state of a chain.
 
     Attributes:
-        classes: (n,) int64, ascending: those present.
-        h1, h2: units of the context that are on, ascending.
-        logits: (A, n, n) of the relations between them at temperature 1.
-        r: (A, n, n) bool, the relations that are on. A class has none to itself but those observed.
+        classes: (n,) int64, present classes, ascending.
+        h1, h2: hidden units that are on, ascending.
+        logits: (A, n, n) logits of the relations between the classes at temperature 1.
+        r: (A, n, n) bool, relations that are on. Relations of a class to itself are on only if
+            observed.
     """
 
     classes: Places
@@ -124,13 +127,14 @@ class Drawn:
 
 
 class SceneChains:
-    """Chains of a machine.
+    """Gibbs chains of a machine.
 
     Args:
-        units: of the same machine.
+        weights: weights of the machine.
+        units: relation units of the machine; built if missing.
 
     Raises:
-        ValueError: a machine of another kind; see `fits`.
+        ValueError: the machine is not supported; see `fits`.
     """
 
     def __init__(self, weights: Weights, units: RelationUnits | None = None) -> None:
@@ -149,7 +153,7 @@ class SceneChains:
             c2=weights["c2"],
             directions=np.ascontiguousarray(shared.T, np.float32),
         )
-        # (N, H1) the means of h1 given the stored scenes.
+        # (N, H1) means of h1 given the stored scenes.
         self.mean: Floats = np.zeros((0, H1), np.float32)
         if weights.spec.N:
             x, _ = weights.with_second_layer(weights["c1"] + weights.scenes @ W)
@@ -157,15 +161,15 @@ class SceneChains:
 
     @staticmethod
     def fits(weights: Weights) -> bool:
-        """Whether the machine is one of those that this module is for."""
+        """Return whether this module supports the machine: local form, float32."""
         return weights.spec.is_local and weights["W"].dtype == np.float32
 
     def given(self, conditions: Conditions, temperature: float = 1.0) -> ConditionedChains:
-        """The chains of one request."""
+        """Return the chains of one request."""
         return ConditionedChains(self, conditions, temperature)
 
     def sample_weights(self, conditions: Conditions) -> NDArray[np.float64]:
-        """How likely each stored scene is chosen, (N,)."""
+        """Return the probability of each stored scene as the start of a chain, (N,)."""
         spec, Q, room = self.machine.spec, self.machine["Q"], conditions.room
         total = np.zeros(len(self.mean), np.float32)
         if room is not None and spec.C:
@@ -181,7 +185,7 @@ class SceneChains:
 
 
 class ConditionedChains:
-    """Chains under the same conditions, each at a stream of its own; see `SceneChains.given`."""
+    """Chains under the same conditions, each with its own stream; see `SceneChains.given`."""
 
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine, self._w = chains, chains.machine, chains.arrays
@@ -216,11 +220,11 @@ class ConditionedChains:
         return Observed(a, found.z, found.base, given.r[found.place])
 
     def draw(self, steps: int, stream: np.random.Generator) -> Drawn:
-        """The end of one chain.
+        """Run one chain and return its final state.
 
         Args:
-            steps: sweeps over contexts and objects.
-            stream: of this chain alone; it moves on.
+            steps: number of sweeps over contexts and objects.
+            stream: random stream of this chain.
         """
         V, H1 = self._w.W.shape
         on, mean = np.zeros(V, np.uint8), sigmoid(self._bias)
@@ -236,7 +240,7 @@ class ConditionedChains:
         return self.move(on | self._always, h1, h2, steps, stream)
 
     def move(self, on: Bits, h1: Bits, h2: Bits, steps: int, stream: np.random.Generator) -> Drawn:
-        """The same of a chain that stands at presence (V,) and contexts, all changed here."""
+        """Continue a chain from presence (V,) and hidden units, which change in place."""
         numbers = len(on) + 2 * len(h1) + len(h2) + kernels.PROPOSALS
         while steps > 0:
             uniform = stream.random((min(steps, _AT_ONCE), numbers), np.float32)
@@ -251,22 +255,23 @@ class ConditionedChains:
         return Drawn(classes, np.flatnonzero(h1), np.flatnonzero(h2), logits, r)
 
     def _context_bias(self, classes: Places, beta: float = 1.0) -> tuple[Floats, Floats]:
-        """x of h1 given present classes, (H1,), and the means of the second layer (H2,)."""
+        """Return x of h1 given present classes, (H1,), and means of the second layer, (H2,)."""
         base = self._bias + self._machine["W"][classes].sum(0)
         x, m2 = self._machine.with_second_layer(base[None], beta)
         return x[0].astype(np.float32), m2[0]
 
     def _logits(self, classes: Places, h1: Bits) -> Floats:
-        """ℓ between the classes, one instance each, (A, n, n)."""
+        """Return the logits between classes with one instance each, (A, n, n)."""
         n, A = len(classes), self._machine.spec.A
         ends = _present(classes, *all_pairs(n), np.zeros(n, np.float32))
         mean, _ = self._chains.units.normal(h1[None].astype(np.float32), ends, known=True)
         return mean.reshape(A, n, n)
 
     def _relations(self, classes: Places, logits: Floats, stream: np.random.Generator) -> Mask:
-        """r between different classes, (A, n, n); observed units keep their value.
+        """Sample r (A, n, n) between different classes; observed units keep their value.
 
-        A class stands in no relation to itself but those observed: nothing else depends on these.
+        Relations of a class to itself are off unless observed, because no other unit depends on
+        them.
         """
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
@@ -287,17 +292,18 @@ class ConditionedChains:
         return r
 
     def log_score(self, drawn: Drawn, shown: Mask, kept: Mask) -> float:
-        """How likely a drawn scene is, up to a constant of the model, at temperature 1.
+        """Return the log score of a sampled scene at temperature 1, up to a constant of the model.
 
             b·v + sum_k softplus(x_k) + log p(kept | v, h1)
 
-        Up to log Z this is log p(v), and how well the context that drew the relations explains
-        them. A second layer enters by its mean field m: x has J m, and c2·m and the entropy of m
-        are added, a lower bound on the sum over h2.
+        The first two terms are log p(v) + log Z. The last term is the log-probability of the
+        relations given the sampled context. A second layer enters by its mean field m: x contains
+        J m, and c2·m and the entropy of m are added. This is a lower bound on the sum over h2.
 
         Args:
-            shown: (n,) the classes that count as present.
-            kept: (A, n, n) the relations that count as on.
+            drawn: the sampled scene.
+            shown: (n,) classes that count as present.
+            kept: (A, n, n) relations that count as on.
         """
         listed = drawn.classes[shown]
         x, m = self._context_bias(listed)
@@ -316,6 +322,6 @@ def _marked(size: int, where: Places) -> Bits:
 
 
 def _present(classes: Places, i: Places, j: Places, log_counts: Floats) -> Ends:
-    """The classes at some places, which are certainly there."""
+    """Return the ends at some positions, with presence 1."""
     one = np.ones(i.shape, np.float32)
     return Ends(classes[i], classes[j], log_counts[i], log_counts[j], one, one)

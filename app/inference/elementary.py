@@ -1,8 +1,8 @@
-"""sigmoid and softplus of arrays; exp, log and logistic in single precision, for compiled loops.
+"""sigmoid and softplus of arrays; exp, log and logistic in single precision, for compiled kernels.
 
-In loops the C library's functions are called number by number; those here are plain arithmetic, so
-that the compiler applies them to a whole vector register at once. Errors are below 2 units in the
-last place (`tests/machines/test_elementary.py`).
+Kernels would call the functions of the C library for one number at a time. The functions here are
+plain arithmetic, so the compiler can apply them to a whole vector register. Their errors are below
+2 units in the last place (`tests/machines/test_elementary.py`).
 
 Source: range reduction and minimax polynomials of Moshier's Cephes library (`expf`, `logf`).
 """
@@ -24,9 +24,9 @@ Floats = NDArray[np.floating[Any]]
 _f = np.float32
 _i = np.int32
 
-# exp(x) is neither 0 nor infinite within these bounds; beyond them it stays at their values.
+# exp() clips its argument to these bounds, so that the result is neither 0 nor infinite.
 _LEAST, _LARGEST = _f(-87.0), _f(88.0)
-# ln 2 in two parts, so that a multiple of the first is exact.
+# ln 2 in two parts, so that multiples of the first part are exact.
 _LN2_HIGH, _LN2_LOW = _f(0.693359375), _f(-2.12194440e-4)
 _SQRT_HALF_BITS = _i(0x3F3504F3)
 _MANTISSA_BITS = _i(0x007FFFFF)
@@ -34,14 +34,14 @@ _ONE_BITS = _i(0x3F800000)
 
 
 def sigmoid(x: Floats) -> Floats:
-    """1 / (1 + e^-x); below -80 as there, since e^88 is the largest float32."""
+    """Compute 1 / (1 + e^-x); x is clipped at -80, because e^89 exceeds float32."""
     found: Floats = np.exp(np.minimum(-x, 80))
     found += 1
     return np.reciprocal(found, out=found)
 
 
 def softplus(x: Floats) -> Floats:
-    """log(1 + e^x)."""
+    """Compute log(1 + e^x)."""
     found: Floats = np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x)))
     return found
 
@@ -64,7 +64,7 @@ def _bits_of_float(_, value):  # noqa: ARG001
 
 @inlined
 def exp(x):
-    """e^x for float32, with x held within [-87, 88]."""
+    """Compute e^x for float32, with x clipped to [-87, 88]."""
     x = min(max(x, _LEAST), _LARGEST)
     n = np.floor(x * _f(1.44269504) + _f(0.5))
     r = x - n * _LN2_HIGH
@@ -81,7 +81,7 @@ def exp(x):
 
 @inlined
 def log(x):
-    """ln x for positive, normal float32."""
+    """Compute ln x for positive, normal float32."""
     bits = _bits_of_float(x) - _SQRT_HALF_BITS
     exponent = _f(bits >> _i(23))
     m = _float_of_bits((bits & _MANTISSA_BITS) + _SQRT_HALF_BITS) - _f(1.0)
@@ -100,17 +100,17 @@ def log(x):
 
 @inlined
 def exponent(x):
-    """The exponent e of x = m 2^e for positive, normal float32, int32."""
+    """Return the exponent e (int32) of x = m 2^e, for positive, normal float32."""
     return (_bits_of_float(x) >> _i(23)) - _i(127)
 
 
 @inlined
 def mantissa(x):
-    """The m in [1, 2) of the same."""
+    """Return the mantissa m in [1, 2) of x = m 2^e, for positive, normal float32."""
     return _float_of_bits((_bits_of_float(x) & _MANTISSA_BITS) | _ONE_BITS)
 
 
 @inlined
 def logistic(x):
-    """1 / (1 + e^-x)."""
+    """Compute 1 / (1 + e^-x)."""
     return _f(1.0) / (_f(1.0) + exp(-x))

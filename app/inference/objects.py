@@ -1,14 +1,14 @@
-"""Log-odds of classes, fast: exp(W) kept ready, one log for many factors.
+"""Fast log-odds of classes: exp(W) is precomputed, and many factors share one log.
 
-The context's part of an object's log-odds is a sum of logs,
+The contribution of the context to the log-odds of a class is a sum of logs,
 
     gain_i = sum_k [softplus(x_k + W_ik) - softplus(x_k)]
            = sum_k log(sigmoid(-x_k) + sigmoid(x_k) exp(W_ik))
 
-and every factor lies between 1 and exp(W_ik). So a group of factors can be multiplied before one
-log is taken, as long as the group's product stays within float32. Both terms of a factor are
-positive: nothing cancels, unlike in 1 + sigmoid(x) (exp(W) - 1), which is 0 for large x and a
-weight below -17. Weights in float64, or too large for float32, are summed log by log instead.
+and every factor lies between 1 and exp(W_ik). So the factors of a group are multiplied before one
+log is taken, as long as the product stays within float32. Both terms of a factor are positive, so
+digits do not cancel. The form 1 + sigmoid(x) (exp(W) - 1) would be 0 for large x and W below -17.
+For weights in float64, or too large for float32, each log is taken separately.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ Floats = NDArray[np.floating[Any]]
 Singles = NDArray[np.float32]
 Places = NDArray[np.int64]
 
-# Of log of a product: float32 spans exp(±87).
+# Maximum |log| of a product; float32 covers exp(±87).
 _LOG_RANGE = 80.0
-# Beyond it sigmoid(x) can underflow to 0 where sigmoid(x) exp(W) still counts.
+# With a larger W, sigmoid(x) can underflow to 0 although sigmoid(x) exp(W) is not negligible.
 _LARGEST_WEIGHT = 64.0
-# More factors a log gain nothing: by then the products take all the time.
+# Maximum number of factors per log; with more, the products dominate the time.
 _LARGEST_GROUP = 25
-# Classes are taken in tiles of so many at most, whose factors stay in the second-level cache.
+# Maximum number of classes per tile, so that the factors of a tile fit into the second-level cache.
 _TILE = 800
-# A tile is whole vector registers.
+# The width of a tile is a multiple of this, to fill whole vector registers.
 _LANES = 16
-# Hidden units whose factors of one class are multiplied side by side.
+# Number of hidden units whose factors are multiplied in parallel.
 _SIDE_BY_SIDE = 32
 _LN2 = np.float32(0.6931471805599453)
 _ONE = np.float32(1.0)
-# Logits whose odds, and the probabilities of both sides, are normal numbers in float32.
+# Maximum |logit| at which the odds and both probabilities are normal numbers in float32.
 _MOST_LOGIT = np.float32(80.0)
 
 
 def group_size(W: Floats) -> int:
-    """How many factors between 1 and exp(W) may be multiplied before a log must be taken.
+    """Return how many factors between 1 and exp(W) may be multiplied before taking a log.
 
-    0 where products of float32 are not safe at all.
+    0 means that products in float32 are not safe.
     """
     largest = float(np.abs(W).max()) if W.size else 0.0
     if W.dtype == np.float64 or largest > _LARGEST_WEIGHT:
@@ -55,46 +55,48 @@ def group_size(W: Floats) -> int:
 
 
 class ContextScorer:
-    """The gain of every object from hidden logits, for a machine whose weights do not change.
+    """Scorer of all classes for a machine with constant weights.
 
-    Every row is computed by itself with the same operations, so a row's bits do not depend on the
-    other rows.
+    Each row of the result is computed separately with the same operations, so its bits do not
+    depend on the other rows.
 
     Args:
-        W: (V, H1).
+        W: (V, H1) weights between classes and hidden units.
 
     Attributes:
         group: see `group_size`.
-        exp_w: (tiles, H1, classes of a tile) exp(W), where there is a group.
+        exp_w: (tiles, H1, classes of a tile) exp(W); only set if ``group`` is not 0.
 
     Raises:
-        ValueError: W holds NaN or infinity.
+        ValueError: W contains NaN or infinity.
     """
 
     exp_w: Singles
 
     def __init__(self, W: Floats) -> None:
         if not np.isfinite(W).all():
-            raise ValueError("W must be finite to score with")
+            raise ValueError("W must be finite")
         self.V, self.H1 = W.shape
         self._W, self.group = W, group_size(W)
         if self.group:
             tiles = -(-self.V // _TILE)
             width = -(-self.V // (tiles * _LANES)) * _LANES
-            # What fills up the last tile gains nothing: its factors are 1.
+            # The padding of the last tile has factors of 1.
             exp_w = np.ones((tiles * width, self.H1), dtype=np.float32)
             np.exp(W, out=exp_w[: self.V])
             tiled = exp_w.reshape(tiles, width, self.H1).swapaxes(1, 2)
             self.exp_w = np.ascontiguousarray(tiled)
 
     def gain(self, x: Floats) -> Floats:
-        """sum_k [softplus(x_k + W_ik) - softplus(x_k)], (..., V) in W's precision, for x (..., H1).
+        """Return sum_k [softplus(x_k + W_ik) - softplus(x_k)], (..., V), for x (..., H1).
+
+        The result has the precision of W.
 
         Raises:
-            ValueError: x is not (..., H1).
+            ValueError: the shape of x is not (..., H1).
         """
         if x.shape[-1:] != (self.H1,):
-            raise ValueError(f"x must be (..., {self.H1}), not {x.shape}")
+            raise ValueError(f"x must have the shape (..., {self.H1}), not {x.shape}")
         rows = x.reshape(-1, self.H1)
         if self.group:
             found: Floats = gains(rows.astype(np.float32), self.exp_w, self.group, self.V)
@@ -107,7 +109,7 @@ class ContextScorer:
 
 @inlined
 def _set_halves(x, off, on):
-    """sigmoid(-x) and sigmoid(x), from one exponential, and neither as a difference."""
+    """Set off = sigmoid(-x) and on = sigmoid(x) from one exponential, without a difference."""
     for k in range(len(x)):
         fall = exp(min(-x[k], _MOST_LOGIT))
         on[k] = _ONE / (_ONE + fall)
@@ -116,13 +118,14 @@ def _set_halves(x, off, on):
 
 @compiled
 def gains(x, exp_w, group, classes):
-    """Of contexts x (M, H1) and all V classes, (M, V).
+    """Return the gains of all V classes for contexts x (M, H1), (M, V).
 
-    Of a group's product only the exponent is set aside, and one log is taken in the end.
+    After each group, the exponent of the product is stored separately; one log is taken at the end.
 
     Args:
-        exp_w: see `ContextScorer`.
-        classes: V.
+        x: (M, H1) logits of the hidden units.
+        exp_w, group: see `ContextScorer`.
+        classes: number of classes V.
     """
     (tiles, units, width), M = exp_w.shape, len(x)
     found, off, on = np.empty((M, classes), np.float32), np.empty_like(x), np.empty_like(x)
@@ -136,7 +139,7 @@ def gains(x, exp_w, group, classes):
             product[:], exponents[:] = _ONE, np.int32(0)
             for start in range(0, units, group):
                 end = min(start + group, units)
-                # Two factors at a time halve the reads and writes of the product.
+                # Two factors at a time need half as many reads and writes of the product.
                 for k in range(start, end - 1, 2):
                     a1, b1, row1 = offs[k], ons[k], tile[k]
                     a2, b2, row2 = offs[k + 1], ons[k + 1], tile[k + 1]
@@ -156,13 +159,13 @@ def gains(x, exp_w, group, classes):
 
 @compiled
 def _gain(off, on, growth, group, product):
-    """sum_k log of (off + on e^W) / (off + on), for growth e^W (H1,); product is overwritten."""
+    """Return sum_k log((off + on growth) / (off + on)), growth = e^W (H1,); overwrite product."""
     size, total = len(off), np.float32(0.0)
     for first in range(0, size, group * _SIDE_BY_SIDE):
         product[:] = _ONE
         last = min(first + group * _SIDE_BY_SIDE, size)
         for start in range(first, last, _SIDE_BY_SIDE):
-            # Slices: the compiler takes eight numbers at a time where an index begins at 0.
+            # Slices, because the compiler vectorises loops whose index begins at 0.
             end = min(start + _SIDE_BY_SIDE, last)
             a, b, c = off[start:end], on[start:end], growth[start:end]
             for lane in range(len(a)):
@@ -176,10 +179,13 @@ def _gain(off, on, growth, group, product):
 
 @compiled
 def gains_without(y, share, W, group):
-    """The gain of each class, its share (n, H1) of y (H1,) taken out, (n,).
+    """Return the gain of each class at y (H1,) without the class's own share, (n,).
 
     Args:
-        W: (n, H1) of the classes.
+        y: (H1,) logits of the hidden units.
+        share: (n, H1) contribution of each class and its relations to y.
+        W: (n, H1) weights of the classes.
+        group: see `ContextScorer`.
     """
     found, growth = np.empty(len(W), np.float32), _exps(W)
     off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
@@ -191,12 +197,15 @@ def gains_without(y, share, W, group):
 
 @compiled
 def gains_without_others(y, share, W, rows, common, index, group):
-    """The gain of the classes in rows (N,), each other class of the scene taken out, (N, n).
+    """Return the gain of some classes without their own share and without each other class, (N, n).
 
     Args:
-        share: (n, H1) what each class and its relations add to y (H1,).
-        W: (n, H1) of the classes.
+        y: (H1,) logits of the hidden units.
+        share: (n, H1) contribution of each class and its relations to y.
+        W: (n, H1) weights of the classes.
+        rows: (N,) positions of the classes whose gain is returned.
         common, index: see `RelationUnits.common`.
+        group: see `ContextScorer`.
     """
     n, size = share.shape
     found, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
@@ -211,7 +220,7 @@ def gains_without_others(y, share, W, rows, common, index, group):
             for k in range(size):
                 both[k] = left[k] * down[k]
             if index[i, j] >= 0:
-                # Relations between the two go out with either, so they must not go out twice.
+                # Both shares contain the relations between the two classes: remove them only once.
                 again = twice[index[i, j]]
                 for k in range(size):
                     both[k] *= again[k]
@@ -221,11 +230,13 @@ def gains_without_others(y, share, W, rows, common, index, group):
 
 @compiled
 def reasons_for_absent(y, share, W, group):
-    """How the gain of absent classes (N,) changes by each class that is there, (N, n).
+    """Return the change of each absent class's gain by each present class, (N, n).
 
     Args:
-        share: (n, H1) what each class that is there adds to y (H1,).
-        W: (N, H1) of the absent classes.
+        y: (H1,) logits of the hidden units.
+        share: (n, H1) contribution of each present class to y.
+        W: (N, H1) weights of the absent classes.
+        group: see `ContextScorer`.
     """
     n, growth = len(share), _exps(W)
     found, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
@@ -242,7 +253,7 @@ def reasons_for_absent(y, share, W, group):
 
 @compiled
 def _exps(x):
-    """e^x of (N, H1)."""
+    """Compute e^x for x (N, H1)."""
     found = np.empty_like(x)
     for n in range(len(x)):
         row, into = x[n], found[n]
@@ -253,14 +264,14 @@ def _exps(x):
 
 @compiled
 def resampled(weight, against, classes, presence, closed, count):
-    """Systematic resampling of N samples by their weights given a scene, (M,) ascending.
+    """Resample N samples systematically by their weights given a scene; return (M,) ascending.
 
     Args:
-        weight: (N,) of a scene without listed classes.
-        against: (V, N) e^-l of each class in each sample.
-        classes, presence: (n,) the listed classes that count.
+        weight: (N,) log weights for a scene without listed classes.
+        against: (V, N) odds against each class in each sample, e^-l for log-odds l.
+        classes, presence: (n,) listed classes and their presence.
         closed: 1 - c, for the coverage c.
-        count: M.
+        count: number M of samples to return.
     """
     weight, below = weight.copy(), np.empty(len(weight))
     for i in range(len(classes)):
@@ -283,16 +294,17 @@ def resampled(weight, against, classes, presence, closed, count):
 
 @compiled
 def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
-    """Log-odds of the mean probability of each class over M completions, (V,).
+    """Return the log-odds of the mean probability of each class over M completions, (V,).
 
-    A completion adds the usable classes whose odds against, in its sample, are below `most`.
+    A completion adds each usable class whose odds against it, in the sample of the completion, are
+    below ``most``.
 
     Args:
         y: (H1,) logits of h1 without unlisted classes.
-        picked: (M,) the sample of each completion.
+        picked: (M,) sample of each completion.
         against: (V, N) odds against each class in each sample.
-        most: (V, M).
-        usable: (V,) bool.
+        most: (V, M) upper limit of these odds.
+        usable: (V,) bool, classes that a completion may add.
         bias: (V,) log-odds of each class without context.
         W, exp_w, group: see `ContextScorer`.
     """
@@ -313,13 +325,13 @@ def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
         _set_halves(completed[m], off, on)
         for i in range(V):
             if added[m, i]:
-                # softplus(y) - softplus(y - W): the class itself is taken out.
+                # softplus(y) - softplus(y - W) is the gain without the class itself.
                 row = W[i]
                 for k in range(size):
                     fall[k] = exp(-row[k])
                 gain[m, i] = -_gain(off, on, fall, group, product)
         for i in range(V):
-            # One exponential for both probabilities, and neither as a difference.
+            # Both probabilities from one exponential, without a difference.
             odds = exp(min(max(-bias[i] - gain[m, i], -_MOST_LOGIT), _MOST_LOGIT))
             p = _ONE / (_ONE + odds)
             here[i] += p

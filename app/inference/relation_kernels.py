@@ -1,6 +1,6 @@
-"""Compiled loops over relation units: the residual look-up, the mean field, implications.
+"""Compiled kernels of relation units: residual look-up, mean field, implications.
 
-Formulas in `relations` and, of implications, in `training/machines/implications.py`.
+`relations` has the formulas; `training/machines/implications.py` has those of the implications.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from app.compiling import compiled, compiled_in_any_order, inlined
 from app.inference.elementary import exp, log, logistic
 
 SPREAD, SHIFT = 2654435761, 16
-"""A pair's key times the first, shifted by the second, is the number of its bucket."""
+"""The bucket of a pair is (key * SPREAD) >> SHIFT, modulo the number of buckets."""
 
 _DAMPING = np.float32(0.8)
-# Relations that imply each other are drawn in twice so many groups.
+# Relations that imply each other are sampled in 2 * _GROUPS groups.
 _GROUPS = 4
-# One more neighbour says less and less.
+# Maximum number of neighbours that count: further neighbours add little information.
 _MOST = np.float32(3.0)
 
 
 @compiled
 def pair_rows(start, keys, pairs):
-    """The row of each pair (E,), i V + j; the last row, of nothing, where it has none."""
-    # A search by halves costs more: its branches are unpredictable.
+    """Return the row of each pair (E,), i V + j; unknown pairs get the last row, which is zero."""
+    # Buckets are faster than binary search, whose branches the processor cannot predict.
     found = np.empty(len(pairs), np.int64)
     for e in range(len(pairs)):
         pair = pairs[e]
@@ -37,12 +37,12 @@ def pair_rows(start, keys, pairs):
 
 @compiled_in_any_order
 def unit_terms(w, g, a, ends):
-    """Of units (E,): logits without U_e·h1, and z_e (E, K).
+    """Return the logits of units without U_e·h1, (E,), and their factors z_e (E, K).
 
     Args:
         w: `relations.SharedArrays`.
-        g: (A, K), whose products with z_e belong to the logit.
-        a: (E,) relation.
+        g: (A, K); the products g[a_e]·z_e are part of the logits.
+        a: (E,) relations.
         ends: `relations.Ends`, (E,) each.
     """
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
@@ -62,14 +62,16 @@ def unit_terms(w, g, a, ends):
 
 @compiled
 def pair_terms(w, first, ends, z, base):
-    """What the logits of pairs have whatever the context: z_e into (B, K, P'), the rest (B, R, P').
+    """Compute the parts of the logits of pairs that do not depend on the context.
 
     Args:
         w: `relations.SharedArrays`.
-        first: the first of the R relations.
-        ends: `relations.Ends`, (B, P) each; P' is P or more.
+        first: first of the R relations.
+        ends: `relations.Ends`, (B, P) each.
+        z: (B, K, P') receives the factors z_e; P' is at least P.
+        base: (B, R, P') receives the other terms.
     """
-    # By name: each access through the tuple would count a reference.
+    # Local names, because each access through the tuple would count a reference.
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
     for b in range(len(z)):
         subjects, objects, log_i, log_j = ends.i[b], ends.j[b], ends.log_i[b], ends.log_j[b]
@@ -87,11 +89,11 @@ def pair_terms(w, first, ends, z, base):
 
 @compiled_in_any_order
 def spreads(C, q):
-    """√3 σ of logits (B, R, P): the root of 3 q'C q.
+    """Return √3 σ = √(3 q'C q) of logits, (B, R, P).
 
     Args:
-        C: (B, R, r (r + 1) / 2) its lower half; entries off the diagonal are doubled.
-        q: (B, R, r, P).
+        C: (B, R, r (r + 1) / 2) lower half of C; entries off the diagonal are doubled.
+        q: (B, R, r, P) coordinates of each pair.
     """
     B, R, r, P = q.shape
     found, row = np.empty((B, R, P), np.float32), np.empty(P, np.float32)
@@ -114,16 +116,17 @@ def spreads(C, q):
 
 
 _ROOT_3 = np.float32(3.0**0.5)
-# Where three nodes are enough, as √3 σ.
+# Maximum √3 σ for which three nodes are enough.
 _NARROW = np.float32(0.75 * 3.0**0.5)
-# The trapezoidal rule beyond: positive nodes, in units of σ, and their weights against that of 0.
+# Trapezoidal rule for larger σ: step of the positive nodes in units of σ, and their weights
+# relative to the weight of node 0.
 _STEP = np.float32(0.25)
 _TAIL = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 
 
 @compiled
 def log_odds(means, spreads, least):
-    """See `relations.to_log_odds`: in place of means (E,), for √3 σ."""
+    """Replace means (E,) by log-odds; see `relations.to_log_odds`. Spreads are √3 σ."""
     wide = np.flatnonzero(spreads >= _NARROW)
     some = _wide_log_odds(means[wide], spreads[wide])
     one, four = np.float32(1.0), np.float32(4.0)
@@ -140,7 +143,7 @@ def log_odds(means, spreads, least):
 
 @compiled
 def _wide_log_odds(means, spreads):
-    """The same by the trapezoidal rule, without a least value."""
+    """Compute the log-odds by the trapezoidal rule, without a lower limit."""
     one, E = np.float32(1.0), len(means)
     u, step, q = np.empty(E, np.float32), np.empty(E, np.float32), np.ones(E, np.float32)
     on, off = np.empty(E, np.float32), np.empty(E, np.float32)
@@ -162,11 +165,12 @@ def _wide_log_odds(means, spreads):
 
 @compiled
 def accumulate(keys, weights, rows, size):
-    """Sums (size, K) of weighted rows by key; key -1 is left out.
+    """Sum weighted rows by key, (size, K); rows with key -1 are ignored.
 
     Args:
-        keys: (E,), or (2E,) for two keys of each row.
+        keys: (E,), or (2E,) for two keys per row.
         weights, rows: (E,) and (E, K).
+        size: number of keys.
     """
     found = np.zeros((size, rows.shape[1]), np.float32)
     for n in range(len(keys)):
@@ -180,7 +184,7 @@ def accumulate(keys, weights, rows, size):
 
 @compiled
 def expanded(G, a, z):
-    """U_e = G[a_e]'z_e, (E, H1)."""
+    """Compute U_e = G[a_e]'z_e, (E, H1)."""
     found = np.zeros((len(a), G.shape[2]), np.float32)
     for e in range(len(a)):
         into, shared, factors = found[e], G[a[e]], z[e]
@@ -199,7 +203,7 @@ def _set_means(x, out):
 
 @compiled_in_any_order
 def _products(rows, m, out):
-    """out = rows m."""
+    """Compute out = rows m."""
     for e in range(len(rows)):
         row, total = rows[e], np.float32(0.0)
         for k in range(len(row)):
@@ -209,7 +213,7 @@ def _products(rows, m, out):
 
 @compiled_in_any_order
 def _selected_products(rows, a, through, out):
-    """out_e = rows_e · through[a_e]."""
+    """Compute out_e = rows_e · through[a_e]."""
     for e in range(len(rows)):
         row, other, total = rows[e], through[a[e]], np.float32(0.0)
         for k in range(len(row)):
@@ -219,10 +223,13 @@ def _selected_products(rows, a, through, out):
 
 @compiled
 def normal_without_itself(y, U, base, slopes):
-    """Mean and √3 σ of logits of units (E,), for y without their own slopes.
+    """Return mean and √3 σ of the logits of units (E,), each at y without its own slope.
 
     Args:
-        U: (E, H1).
+        y: (H1,) logits of h1.
+        U: (E, H1) weights of the units.
+        base: (E,) logits without U_e·h1.
+        slopes: (E,) slopes of the units.
     """
     mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
     rest, m = np.empty_like(y), np.empty_like(y)
@@ -248,11 +255,14 @@ def _moments(row, m):
 
 @compiled
 def fixed_point(x, G, a, base, z, r, gate, sweeps):
-    """The mean field of `RelationUnits.fixed_point`: y (H1,) and slopes (E,).
+    """Compute the mean field of `RelationUnits.fixed_point`: y (H1,) and slopes (E,).
 
     Args:
-        G: (A, K, H1), U_e = G[a_e]'z_e; of length 0 where z (E, H1) is U.
-        r, gate: (E,).
+        x: (H1,) logits of h1 given the objects.
+        G: (A, K, H1), U_e = G[a_e]'z_e; empty if z (E, H1) is U itself.
+        a, base, z: see `relations.Units`.
+        r, gate: (E,) values of the relations, and presence of both ends.
+        sweeps: number of iterations.
     """
     E, (A, K, _) = len(a), G.shape
     y, m, logits = x.copy(), np.empty_like(x), np.empty(E, np.float32)
@@ -295,14 +305,15 @@ def _add_rows(weights, rows, out):
 
 @compiled
 def _no_steps(relations, n):
-    """Where steps lead, and what the paths of two steps say, before any relation holds.
+    """Return the empty step tables of a scene without relations.
 
-    A step is a relation in one direction: a from subject to object, A + a back.
+    A step follows a relation: step a leads from subject to object, step A + a leads back.
 
     Returns:
-        degree (2A, n), how many of each step lead from a class; near (2A, n, n), where they lead;
-        seen (n, n, 2A), of paths that begin with each step, the bits of their second; and what
-        paths say of the relations from class to class, (n, n, A).
+        degree: (2A, n) number of steps of each kind from each class.
+        near: (2A, n, n) targets of these steps.
+        seen: (n, n, 2A) for paths of two steps, by first step: bit set of the second steps.
+        paths: (n, n, A) shift of each relation between two classes by the paths between them.
     """
     steps = 2 * relations
     degree, near = np.zeros((steps, n), np.int64), np.empty((steps, n, n), np.int64)
@@ -312,8 +323,8 @@ def _no_steps(relations, n):
 
 @compiled
 def _hold(known, weight, a, i, j):
-    """Relation a holds between two different classes: count its two steps, and new paths."""
-    # By index: a slice of an array costs more than the few numbers read from it.
+    """Add relation a between classes i and j: count its two steps and the new paths."""
+    # Plain indices, because a slice costs more than the few numbers read from it.
     degree, near, seen, paths = known
     steps = len(degree)
     both = (a, i, j), (steps // 2 + a, j, i)
@@ -324,7 +335,7 @@ def _hold(known, weight, a, i, j):
         for d in range(steps):
             for at in range(degree[d, y]):
                 _add_path(seen, paths, weight, x, near[d, y, at], c, d)
-            # What a step leads to from x leads to x by the opposite step.
+            # Targets of step d from x lead to x by the opposite step.
             back = (d + steps // 2) % steps
             for at in range(degree[d, x]):
                 _add_path(seen, paths, weight, near[d, x, at], y, back, c)
@@ -341,17 +352,19 @@ def _add_path(seen, paths, weight, x, y, first, second):
 
 @compiled
 def _implied(known, weight, direct):
-    """What all that holds implies for each relation from class to class, (n, n, A).
+    """Return the shift of each relation by all relations that hold, (n, n, A).
 
     Args:
-        direct: whether the relations of a pair say something of each other.
+        known: tables of `_no_steps`.
+        weight: (F, A) implication weights.
+        direct: whether the relations of a pair shift each other.
     """
     degree, near, _, paths = known
     (steps, n), A = degree.shape, weight.shape[1]
     shift, degrees = paths.copy(), weight[steps + steps * steps :]
     out, into = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
     for c in range(steps):
-        # What leads into a class by one step leads out of it by the opposite one.
+        # A step into a class is the opposite step out of the class.
         back = (c + A) % steps
         for x in range(n):
             for b in range(A):
@@ -369,7 +382,7 @@ def _implied(known, weight, direct):
                 for b in range(A):
                     if direct:
                         shift[x, y, b] += weight[c, b]
-                    # Degrees are of all other classes than these two.
+                    # The degrees must not count the step between these two classes.
                     if degree[c, x] <= _MOST:
                         shift[x, y, b] -= degrees[c, b]
                     if degree[back, y] <= _MOST:
@@ -379,14 +392,15 @@ def _implied(known, weight, direct):
 
 @compiled
 def implied(weight, n, a, i, j):
-    """What relations that hold, of different classes, imply for all others, (2, n, n, A).
+    """Return the shifts of all relations by relations that hold, (2, n, n, A).
 
-    First all they do; then without what those of a pair imply for each other.
+    The first entry contains all shifts. In the second, the relations of a pair do not shift each
+    other.
 
     Args:
         weight: (F, A), see `RelationUnits.implication_weights`.
-        n: classes of the scene.
-        a, i, j: (E,).
+        n: number of classes in the scene.
+        a, i, j: (E,) relations that hold between different classes.
     """
     known = _no_steps(weight.shape[1], n)
     for e in range(len(a)):
@@ -398,15 +412,16 @@ def implied(weight, n, a, i, j):
 
 @compiled
 def draw_in_groups(weight, logits, free, uniform, other, r):
-    """Draw relations that imply each other into r (A, n, n): group after group, given all before.
+    """Sample relations that imply each other: group after group, given all earlier groups.
 
-    Groups are drawn too; a(i, j) and a(j, i) are never in one.
+    The groups are random; a(i, j) and a(j, i) are always in different groups.
 
     Args:
-        weight: (F, A), as above.
-        logits: (A, n, n) without implications.
-        free: (A, n, n) which relations to draw; the others stay as they are.
-        uniform, other: (A, n, n) in [0, 1), for relations and for groups.
+        weight: (F, A), see `RelationUnits.implication_weights`.
+        logits: (A, n, n) logits without implications.
+        free: (A, n, n) relations to sample; the others keep their value.
+        uniform, other: (A, n, n) random numbers in [0, 1), for relations and for groups.
+        r: (A, n, n) receives the samples.
     """
     A, n, _ = r.shape
     known, group = _no_steps(A, n), np.full(r.shape, -1, np.int64)
@@ -414,7 +429,7 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
         for i in range(n):
             for j in range(n):
                 if free[a, i, j]:
-                    # One draw for both ways says which comes first, in the sooner or later half.
+                    # One random number for both directions decides which direction comes first.
                     later = other[a, min(i, j), max(i, j)] < 0.5
                     half = _GROUPS if later == (i < j) else 0
                     group[a, i, j] = half + np.int64(2 * _GROUPS * other[a, i, j]) % _GROUPS

@@ -1,13 +1,13 @@
 """Probabilities of relations: p(r_e = 1) = E[sigmoid(ℓ_e(h1))] with ℓ_e(h1) = base_e + U_e·h1.
 
-The logit is a sum of many small independent terms and is approximated by a normal variable with
+The logit is a sum of many small independent terms. It is approximated by a normal variable with
 
     mean base_e + U_e·m   and variance   σ_e² = sum_k U_ek² m_k (1 - m_k)
 
-for the means m of h1, and the mean of its sigmoid by quadrature. Errors are measured in
-docs/decisions/inference.md. Which units exist, with their base and U, is the variant's:
-`FreeUnits` have a row of U each, `SharedUnits` form theirs from factors. Everything else stands
-once.
+for the means m of h1. The mean of its sigmoid is computed by quadrature, with the errors in
+docs/decisions/inference.md. The variant defines the units, with their base and U: each of the
+`FreeUnits` has its own row of U, and `SharedUnits` compute U from factors. All variants share the
+other code.
 """
 
 from __future__ import annotations
@@ -31,48 +31,53 @@ Places = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SWEEPS: Final = 10
-"""Of a mean field: enough to settle on the machines we ship; fixed, so that answers repeat."""
+"""Iterations of a mean field: enough to converge on the shipped machines. The number is fixed, so
+that answers are reproducible."""
 
 NO_UNIT: Final = np.float32(-30.0)
-"""No log-odds of a relation is below."""
+"""Lower limit of the log-odds of a relation."""
 
 NEVER: Final = np.float32(-1e4)
-"""The logit of a relation without a unit, which is off at any temperature."""
+"""Logit of a relation without a unit; the relation is off at any temperature."""
 
 Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 
 NOTHING: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
 
-# Pairs are filled up to a multiple of it: loops take so many numbers in one turn.
+# Pairs are padded to a multiple of this, to fill whole vector registers.
 _WHOLE: Final = 32
 
-# Of the variance of a logit on average, how much the directions F_a leave out. A probability
-# changes by a twentieth of what its variance loses. Of the 33 directions of `indoor-triway` 11
-# are kept: all would take twice the time of /relations, and change p by .005 at most.
+# Mean variance of a logit that the kept directions F_a may neglect. A probability changes by about
+# 1/20 of the neglected variance. `indoor-triway` keeps 11 of 33 directions. All 33 would double the
+# time of /relations and change p by at most 0.005.
 _LEFT_OUT: Final = 4e-3
 
 
 def to_log_odds(mean: Floats, spread: Floats) -> Floats:
-    """Log-odds of E[sigmoid(ℓ)] for normal logits of that mean and √3 σ, `NO_UNIT` at least.
+    """Return the log-odds of E[sigmoid(ℓ)] for normal logits ℓ; at least `NO_UNIT`.
 
-    Three nodes, 0 and ±√3 σ with weights 4 : 1 : 1, where σ < .75: off by .0003 at most in p. With
-    u = e^-|mean| and q = e^spread they are u/(1 + u), uq/(1 + uq) and u/(q + u), and nothing can
-    overflow. Wider ones by the trapezoidal rule, for any σ up to 10 and more.
+    For σ < 0.75, three nodes are used: 0 and ±√3 σ, with weights 4 : 1 : 1. The error in p is at
+    most 0.0003. With u = e^-|mean| and q = e^spread, the sigmoids are u/(1 + u), uq/(1 + uq) and
+    u/(q + u), which cannot overflow. For larger σ, up to 10 and more, the trapezoidal rule is used.
+
+    Args:
+        mean: means of the logits.
+        spread: √3 σ of the logits.
     """
     found = mean.ravel().astype(np.float32)
-    # Contiguous: for another layout the loop would be compiled again.
+    # Contiguous, because numba would compile the kernel again for another memory layout.
     kernels.log_odds(found, spread.ravel(), NO_UNIT)
     return found.reshape(mean.shape)
 
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """Relations that are given, on or off: E units between the n classes of a scene.
+    """Observed relations, on or off: E units between the n classes of a scene.
 
     Attributes:
-        a: (E,) relation.
-        i, j: (E,) places of subject and object class in the scene.
-        r: (E,) 1 where it holds, else 0.
+        a: (E,) relations.
+        i, j: (E,) positions of subject and object class in the scene.
+        r: (E,) 1 if the relation holds, else 0.
         g: (E,) presence of both ends.
     """
 
@@ -84,13 +89,13 @@ class Given:
 
 
 class Units(NamedTuple):
-    """Relation units that exist, of those asked for.
+    """The existing units among requested relations.
 
     Attributes:
-        place: (E,) which of those asked for.
-        a: (E,) relation.
+        place: (E,) index of each unit in the request.
+        a: (E,) relations.
         base: (E,) ℓ_e without U_e·h1.
-        z: (E, K') their factors: U_e = G[a]'z_e; U_e itself where there is no G.
+        z: (E, K') factors: U_e = G[a]'z_e. If G is empty, z_e is U_e itself.
     """
 
     place: Places
@@ -105,15 +110,16 @@ class Context:
 
     Attributes:
         classes: (n,) int64, distinct.
-        presence: (n,).
-        log_counts: (n,) log of the instances of each.
+        presence: (n,) presence of each class.
+        log_counts: (n,) log of the number of instances of each class.
         x: (H1,) logits of h1 given the objects.
-        y: (H1,) given the relations as well, as questions about relations see it.
-        given: the relations; None where there are none.
-        units: those of `given`.
-        slopes: of `units`, as questions about relations see them.
-        object_y, object_slopes: y and slopes as questions about objects see them.
-        through: (n, H1) what each class adds to y through the second layer; None with one layer.
+        y: (H1,) logits of h1 given objects and relations, for questions about relations.
+        given: observed relations; None without observed relations.
+        units: units of `given`.
+        slopes: slopes of `units`, for questions about relations.
+        object_y, object_slopes: y and slopes for questions about objects.
+        through: (n, H1) contribution of each class to y through the second layer; None with one
+            layer.
     """
 
     classes: Places
@@ -129,13 +135,13 @@ class Context:
     through: Floats | None
 
     def ends(self, i: Places, j: Places) -> Ends:
-        """The classes at some places."""
+        """Return the ends at positions i and j."""
         p, n = self.presence, self.log_counts
         return Ends(self.classes[i], self.classes[j], n[i], n[j], p[i], p[j])
 
 
 class Ends(NamedTuple):
-    """Subject and object classes, the logs of their counts, and their presence; one shape."""
+    """Subject and object classes, logs of their counts, and their presence; all of one shape."""
 
     i: Places
     j: Places
@@ -146,14 +152,15 @@ class Ends(NamedTuple):
 
 
 class Between(NamedTuple):
-    """The logits between the n classes of a scene, and what given relations say of them.
+    """The logits between the n classes of a scene, and the effects of observed relations.
+
+    Without observed relations, slopes, shift and apart are empty.
 
     Attributes:
-        mean, spread: (A, n, n) of the logits, see `RelationUnits.normal`.
-        slopes: (A, n, n), 0 for relations that are not given. Without any given relation, slopes,
-            shift and apart are empty.
-        shift: (A, n, n) what the given relations imply for each.
-        apart: the same without those of the pair itself.
+        mean, spread: (A, n, n) of the logits; see `RelationUnits.normal`.
+        slopes: (A, n, n) slopes of observed relations; 0 for other relations.
+        shift: (A, n, n) shift of each logit by implications of the observed relations.
+        apart: (A, n, n) the same shift without the observed relations of the pair itself.
     """
 
     mean: Floats
@@ -164,12 +171,14 @@ class Between(NamedTuple):
 
 
 class SharedArrays(NamedTuple):
-    """Weights of a Triway's units as the compiled loop takes them.
+    """Weights of a Triway's units for the compiled kernels.
 
     Attributes:
-        S, O: (V, K + 1), their last column 1.  s, o: (V, A).  n: (A, 2).
+        S, O: (V, K + 1); the last column is 1.
+        s, o: (V, A).
+        n: (A, 2).
         start, key: see `pair_rows`.
-        residual: (pairs + 1, A) w'; the last row is 0.
+        residual: (pairs + 1, A) residual weights w'; the last row is 0.
     """
 
     S: Floats
@@ -186,7 +195,8 @@ class RelationUnits(ABC):
     """The relation units of a machine.
 
     Attributes:
-        G: (A, K', H1) what the units of a relation share; of length 0 where each has a row of U.
+        G: (A, K', H1) weights shared by the units of a relation; empty if each unit has its own
+            row of U.
     """
 
     G: Floats
@@ -196,59 +206,62 @@ class RelationUnits(ABC):
 
     @abstractmethod
     def select(self, a: Places, ends: Ends) -> Units:
-        """The units of relations a (E,)."""
+        """Return the units of relations a (E,) between the ends."""
 
     @abstractmethod
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
     ) -> tuple[Floats, Floats]:
-        """Mean and √3 σ of logits between pairs (B, P), both (B, R, P), for means of h1 (B, H1).
+        """Return mean and √3 σ of the logits of pairs, both (B, R, P).
 
-        R is 1 where one relation is asked for, else A. A relation without a unit has mean `NEVER`.
+        A relation without a unit has the mean `NEVER`.
 
         Args:
-            known: the means are 0 or 1, so nothing varies.
+            means: (B, H1) means of h1.
+            ends: (B, P) pairs.
+            only: one relation (R = 1), or None for all (R = A).
+            known: whether all means are 0 or 1, so that the variance is 0.
         """
 
     def rows(self, units: Units) -> Floats:
-        """U of units, (E, H1)."""
+        """Return U of units, (E, H1)."""
         if not len(self.G):
             return units.z
         found: Floats = kernels.expanded(self.G, units.a, units.z)
         return found
 
     def rows_of(self, a: Places, i: Places, j: Places) -> Floats:
-        """U of relations a between classes i and j that have units, (E, H1)."""
+        """Return U of relations a between classes i and j, (E, H1), for relations with a unit."""
         none = np.zeros(len(a), np.float32)
         return self.rows(self.select(a, Ends(i, j, none, none, none, none)))
 
     def fixed_point(
         self, x: Floats, given: Given, ends: Ends, sweeps: int = SWEEPS
     ) -> tuple[Floats, Units, Floats]:
-        """The mean field given relations: y (H1,), the units, and their slopes.
+        """Compute the mean field given relations: y (H1,), the units and their slopes.
 
-        From x on, with m = sigmoid(y) and g the presence of both ends:
+        The iteration starts at y = x, with m = sigmoid(y) and g the presence of both ends:
 
             y = x + sum_e slope_e U_e,   slope_e = g_e (r_e - sigmoid(base_e + U_e·m))
         """
         units = self.select(given.a, ends)
         G, z = self.G, units.z
         if 2 * len(z) < G.shape[0] * G.shape[1]:
-            # Fewer rows of U than rows that the units share.
+            # With few units, rows of U are cheaper than the shared rows G.
             G, z = NOTHING, self.rows(units)
         r, g = given.r[units.place], given.g[units.place]
         y, slopes = kernels.fixed_point(x, G, units.a, units.base, z, r, g, sweeps)
         return y, units, slopes
 
     def between(self, context: Context) -> Between:
-        """Logits between the classes of a scene."""
+        """Return the logits between the classes of a scene."""
         n = len(context.classes)
         mean, spread = self.normal(sigmoid(context.y)[None], context.ends(*all_pairs(n)))
         shape = self._A, n, n
         return Between(mean.reshape(shape), spread.reshape(shape), *self.said(context))
 
     def said(self, context: Context) -> tuple[Floats, Floats, Floats]:
-        """`slopes`, `shift` and `apart` of `Between`."""
+        """Return `slopes`, `shift` and `apart` of `Between`."""
         given, units, n = context.given, context.units, len(context.classes)
         if given is None or units is None:
             return NOTHING, NOTHING, NOTHING
@@ -258,7 +271,7 @@ class RelationUnits(ABC):
         return slopes, *self.implied(context.x, n, given)
 
     def implied(self, x: Floats, n: int, given: Given) -> tuple[Floats, Floats]:
-        """`shift` and `apart` of `Between`, given the logits x of h1 given the objects."""
+        """Return `shift` and `apart` of `Between`; x are the logits of h1 given the objects."""
         weight = self.implication_weights(x)
         if not len(weight):
             return NOTHING, NOTHING
@@ -268,14 +281,18 @@ class RelationUnits(ABC):
         return shift, apart
 
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
-        """What each feature of the given relations says of each relation, (F, A), or empty."""
+        """Return the weight of each feature of observed relations for each relation, (F, A).
+
+        The result is empty for a machine without implications.
+        """
         del x, beta
         return NOTHING.reshape(0, 0)
 
     def log_odds(self, between: Between) -> Floats:
-        """Of all relations between the classes, each without itself to first order, (A, n, n).
+        """Return the log-odds of all relations between the classes, (A, n, n).
 
-        A small slope of a given unit itself changes ℓ_e(m) by slope_e σ_e².
+        The effect of an observed relation on itself is removed to first order: a small slope
+        changes ℓ_e(m) by slope_e σ_e².
         """
         mean, spread = between.mean, between.spread
         if len(between.slopes):
@@ -287,11 +304,14 @@ class RelationUnits(ABC):
     def without_itself(
         self, context: Context, a: Places, i: Places, j: Places, slopes: Floats, shift: Floats
     ) -> Floats:
-        """Of some units (E,), their own slopes taken out of y exactly, (E,).
+        """Return the log-odds of some relations, (E,), each without its own slope in y (exact).
 
         Args:
-            i, j: (E,) places.
-            shift: (A, n, n) or empty.
+            context: context of the scene.
+            a: (E,) relations.
+            i, j: (E,) positions of their ends.
+            slopes: (E,) slopes of the relations.
+            shift: (A, n, n) shift of `Between`, or empty.
         """
         units = self.select(a, context.ends(i, j))
         mean, spread = kernels.normal_without_itself(
@@ -305,17 +325,23 @@ class RelationUnits(ABC):
 
     @abstractmethod
     def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
-        """Of pairs of classes, places (P,), without all that is given of the pair, (2, A, P)."""
+        """Return the log-odds of pairs (P,) without the pair's observed relations, (2, A, P)."""
 
     def placement_log_odds(
         self, context: Context, candidates: Places, anchors: Places, only: int | None = None
     ) -> tuple[Floats, Floats]:
-        """Of absent candidates, were they there, to the anchors and back, (N, R, m) both.
+        """Return the log-odds of relations between absent candidates and anchors.
+
+        Each candidate is treated as present.
 
         Args:
+            context: context of the scene.
             candidates: (N,) classes.
-            anchors: (m,) places.
-            only: one relation; None for all A.
+            anchors: (m,) positions of classes in the scene.
+            only: one relation (R = 1), or None for all (R = A).
+
+        Returns:
+            (N, R, m) from candidate to anchor, and (N, R, m) from anchor to candidate.
         """
         m = len(anchors)
         shape = len(candidates), 2 * m
@@ -332,7 +358,7 @@ class RelationUnits(ABC):
         return found[:, :, :m], found[:, :, m:]
 
     def shares(self, context: Context) -> Floats:
-        """What each class and its relations add to y, (n, H1)."""
+        """Return the contribution of each class and its relations to y, (n, H1)."""
         found: Floats = context.presence[:, None] * self._W[context.classes]
         given, units = context.given, context.units
         if given is not None and units is not None:
@@ -342,7 +368,11 @@ class RelationUnits(ABC):
         return found
 
     def common(self, context: Context) -> tuple[Floats, Places]:
-        """What the relations between two classes add to y, (P, H1), and (n, n) which row; or -1."""
+        """Return the contribution of the relations between two classes to y.
+
+        Returns:
+            (P, H1) contributions, and (n, n) row of each pair of classes; -1 without relations.
+        """
         n = len(context.classes)
         given, units = context.given, context.units
         index = np.full((n, n), -1)
@@ -359,10 +389,13 @@ class RelationUnits(ABC):
         return found, np.maximum(index, index.T)
 
     def _sums(self, units: Units, keys: Places, slopes: Floats, size: int) -> Floats:
-        """Sums of slope_e U_e over the units of each key, (size, H1); -1 is left out.
+        """Sum slope_e U_e over the units of each key, (size, H1); key -1 is ignored.
 
         Args:
-            keys: (E,), or (2, E) for two keys of each unit.
+            units: the units.
+            keys: (E,), or (2, E) for two keys per unit.
+            slopes: (E,) slopes of the units.
+            size: number of keys.
         """
         if not len(self.G):
             summed: Floats = kernels.accumulate(keys.reshape(-1), slopes, units.z, size)
@@ -375,15 +408,16 @@ class RelationUnits(ABC):
 
 
 class FreeUnits(RelationUnits):
-    """Units of the triples seen in training alone, each with a row of U of its own.
+    """Units of the triples in the training scenes, each with its own row of U.
 
     ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1
 
-    Other triples have no unit: they say nothing, and their log-odds are `NO_UNIT`.
+    Other triples do not have a unit: they do not act as evidence. Their log-odds are `NO_UNIT`.
 
     Args:
-        U: (T, H1).
-        g: (T, 2); none for zeros.
+        weights: weights of the machine.
+        U: (T, H1) weights between units and h1.
+        g: (T, 2) weights of the presence of both ends; None for zeros.
     """
 
     def __init__(self, weights: Weights, U: Floats, g: Floats | None = None) -> None:
@@ -408,7 +442,7 @@ class FreeUnits(RelationUnits):
         self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
     ) -> tuple[Floats, Floats]:
         """See `RelationUnits`."""
-        del known  # means of 0 and 1 have no variance
+        del known  # the formula gives variance 0 for means of 0 and 1
         asked = _asked(self._A, only)
         shape = len(means), asked.stop - asked.start, ends.i.shape[1]
         b, a, p = (part.reshape(-1) for part in np.indices(shape))
@@ -428,7 +462,7 @@ class FreeUnits(RelationUnits):
         return mean, spread
 
     def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
-        """See `RelationUnits`; exactly."""
+        """See `RelationUnits`; exact."""
         del between
         ends = context.ends(np.stack([i, j], 1), np.stack([j, i], 1))
         y = np.tile(context.y, (len(i), 1))
@@ -442,11 +476,11 @@ class FreeUnits(RelationUnits):
 
 
 class SharedUnits(RelationUnits):
-    """A unit for every triple, whose weights but a sparse residual are shared; see `Triway`.
+    """A unit for every triple, with shared weights and a sparse residual; see `Triway`.
 
-    With z_e = (S_i * O_j, 1): U_e = G[a]'z_e, where G[a] are the rows of M[a], then P[a]. The
-    variance of a logit is q'C q, with coordinates q = Y[a] z_e in the directions F_a of largest
-    variance and C = F_a diag(m (1 - m)) F_a'.
+    With z_e = (S_i * O_j, 1): U_e = G[a]'z_e, where G[a] consists of the rows of M[a] and P[a]. The
+    variance of a logit is q'C q. Here q = Y[a] z_e are coordinates in the directions F_a of largest
+    variance, and C = F_a diag(m (1 - m)) F_a'.
     """
 
     def __init__(self, weights: Weights) -> None:
@@ -469,14 +503,14 @@ class SharedUnits(RelationUnits):
         self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
         F, self._Y = _directions(weights)
         self._F = F.reshape(-1, F.shape[2])
-        # Products of two directions: what C's lower half is made of, all but the diagonal twice.
+        # Products of two directions, for the lower half of C; off the diagonal they are doubled.
         p, q = np.tril_indices(F.shape[1])
         self._FF = _columns(F[:, p] * F[:, q] * np.where(p == q, 1, 2)[:, None])
         self._GT = _columns(self.G)
         self._B = weights["B"] if weights.spec.G else None
         if self._B is not None:
             gamma = weights["gamma"].swapaxes(1, 2).copy()
-            # No relation has a say in itself.
+            # A relation does not imply itself.
             gamma[:, range(A), range(A)] = 0
             self._gamma = gamma.reshape(len(gamma), -1)
 
@@ -503,7 +537,7 @@ class SharedUnits(RelationUnits):
         return mean[:, :, :P], spread[:, :, :P]
 
     def _of(self, asked: slice, rows: Floats, columns: Floats) -> Floats:
-        """Products of rows (B, H1) with the columns (H1, A n) of R relations, (B, R, n)."""
+        """Return the products of rows (B, H1) with the columns of R relations, (B, R, n)."""
         n = columns.shape[1] // self._A
         found: Floats = rows @ columns[:, asked.start * n : asked.stop * n]
         return found.reshape(len(rows), -1, n)
@@ -522,8 +556,8 @@ class SharedUnits(RelationUnits):
     def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
         """See `RelationUnits`; to first order.
 
-        ℓ_e(m) changes by sum_e' slope_e' cov(ℓ_e, ℓ_e'), cov = sum_k U_ek U_e'k m_k (1 - m_k),
-        over the given units e' of the pair, both ways.
+        ℓ_e(m) changes by sum_e' slope_e' cov(ℓ_e, ℓ_e'), cov = sum_k U_ek U_e'k m_k (1 - m_k).
+        The sum runs over the observed units e' of the pair in both directions.
         """
         A, P = self._A, len(i)
         start, end = np.concatenate([i, j]), np.concatenate([j, i])
@@ -531,10 +565,10 @@ class SharedUnits(RelationUnits):
         if len(between.slopes):
             m, classes = sigmoid(context.y), context.classes
             z = self._w.S[classes[start]] * self._w.O[classes[end]]
-            # (2, P, A, r): both ways of each pair.
+            # (2, P, A, r): both directions of each pair.
             q = (z @ self._Y.reshape(len(self._F), -1).T).reshape(2, P, A, -1)
             slopes = between.slopes[:, start, end].T.reshape(2, P, A, 1).copy()
-            # Of a class with itself the two ways are one.
+            # For a class with itself, both directions are the same unit.
             slopes[1, i == j] = 0
             pull = (slopes * q).sum(0).reshape(P, -1)
             back = (pull @ self._F) * (m * (1 - m)) @ self._F.T
@@ -547,26 +581,26 @@ class SharedUnits(RelationUnits):
 
 @lru_cache(maxsize=128)
 def all_pairs(n: int) -> tuple[Places, Places]:
-    """First and second place of all pairs of n, (1, n²) each."""
+    """Return the first and second position of all pairs of n classes, (1, n²) each."""
     every = np.arange(n)
     return np.repeat(every, n)[None], np.tile(every, n)[None]
 
 
 def _columns(matrices: Floats) -> Floats:
-    """Rows of all relations (A, n, H1) as columns (H1, A n): a product of few rows is faster."""
+    """Convert rows of all relations (A, n, H1) to columns (H1, A n), for faster products."""
     return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
 
 
 def _asked(relations: int, only: int | None) -> slice:
-    """All relations, or one. A slice copies nothing."""
+    """Return the slice of all relations, or of one; a slice avoids a copy."""
     return slice(0, relations) if only is None else slice(only, only + 1)
 
 
 def _pair_table(weights: Weights) -> tuple[Table, tuple[Places, Places]]:
-    """The pairs of classes that a triple has a weight for, as `pair_rows` takes them.
+    """Build the look-up table of `pair_rows` for the pairs of classes with a triple weight.
 
     Returns:
-        Buckets and keys; and of each triple the row of its pair, and its relation.
+        Buckets and keys; and the row of the pair and the relation of each triple.
     """
     size = weights.spec.V**2
     triples = weights.triple_keys
@@ -582,10 +616,10 @@ def _pair_table(weights: Weights) -> tuple[Table, tuple[Places, Places]]:
 
 
 def _directions(weights: Weights) -> tuple[Floats, Floats]:
-    """F (A, r, H1), and Y (A, r, K + 1) with q = Y z, z = (S_i * O_j, 1).
+    """Return the directions F (A, r, H1), and Y (A, r, K + 1) with q = Y z, z = (S_i * O_j, 1).
 
-    Directions of largest variance of U_e h1, over pairs of classes as often as the machine's
-    stored scenes have them, and with h1 as it is in these.
+    F are the directions of largest variance of U_e·h1. The frequencies of classes and the variance
+    of h1 come from the stored scenes of the machine.
     """
     spec = weights.spec
     rows = np.concatenate([weights["P"][:, None], weights["M"]], 1).astype(np.float64)
@@ -599,7 +633,7 @@ def _directions(weights: Weights) -> tuple[Floats, Floats]:
     left, right = (
         np.concatenate([ones, weights[name].astype(np.float64)], 1) for name in ("S", "O")
     )
-    # E[z z'] of z = (1, S_i * O_j) for independent i and j, and its root.
+    # E[z z'] of z = (1, S_i * O_j) for independent i and j, and its Cholesky factor.
     moment = (left.T @ (share[:, None] * left)) * (right.T @ (share[:, None] * right))
     scale = np.trace(moment) / len(moment)
     root = np.linalg.cholesky(moment + 1e-9 * scale * np.eye(len(moment)))

@@ -1,7 +1,7 @@
-"""The variants of the machine, and the sizes of one.
+"""The variants of the machine, and the specification of its sizes.
 
-A variant is one class here: which arrays it has, and which relation units they make. The service
-asks nothing else about it. A new variant is a class and an entry of `VARIANTS`.
+A class here defines each variant by its arrays and its relation units. The service needs no other
+information about a variant. To add a variant, write a class and add it to `VARIANTS`.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def feature_count(relations: int) -> int:
-    """F = 2A + (2A)² + 4A features of given relations, for A relations."""
+    """Return F = 2A + (2A)² + 4A, the number of features of observed relations."""
     return 2 * relations * (2 * relations + 3)
 
 
 class RBM:
-    """ℓ_t = d_t + U_t·h1 for the T triples seen in training; other triples have no unit."""
+    """ℓ_t = d_t + U_t·h1 for the T triples of the training scenes; other triples have no unit."""
 
     factorised: ClassVar[bool] = False
     two_layers: ClassVar[bool] = False
@@ -35,12 +35,12 @@ class RBM:
 
     @staticmethod
     def shapes(spec: MachineSpec) -> Shapes:
-        """Arrays beside those that all variants have."""
+        """Return names and shapes of the arrays that only this variant has."""
         return {"d": (spec.T,), "U": (spec.T, spec.H1)}
 
     @staticmethod
     def units(weights: Weights) -> RelationUnits:
-        """Its relation units."""
+        """Return the relation units."""
         return FreeUnits(weights, weights["U"])
 
 
@@ -56,12 +56,12 @@ class GBM(RBM):
 
     @staticmethod
     def units(weights: Weights) -> RelationUnits:
-        """Its relation units."""
+        """Return the relation units."""
         return FreeUnits(weights, weights["U"], weights["g"])
 
 
 class ProductRBM(RBM):
-    """An RBM whose U is U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]."""
+    """An RBM with factorised weights U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]."""
 
     factorised = True
 
@@ -73,7 +73,7 @@ class ProductRBM(RBM):
 
     @staticmethod
     def units(weights: Weights) -> RelationUnits:
-        """Its relation units."""
+        """Return the relation units."""
         relation, subject, object_ = weights["triples"].astype(np.int64).T
         product = weights["S"][subject] * weights["O"][object_]
         rows = weights["P"][relation]
@@ -83,7 +83,7 @@ class ProductRBM(RBM):
 
 
 class Triway:
-    """A unit for every triple, ℓ_e = w_e + U_e·h1; all weights but a sparse residual are shared.
+    """A unit for every triple, ℓ_e = w_e + U_e·h1, with shared weights and a sparse residual w'.
 
     w_e = d_a + s[a,i] + o[a,j] + sum_k S[i,k] R[a,k] O[j,k] + n[a]·(log n_i, log n_j) + w'_e
     U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]
@@ -108,7 +108,7 @@ class Triway:
 
     @staticmethod
     def units(weights: Weights) -> RelationUnits:
-        """Its relation units."""
+        """Return the relation units."""
         return SharedUnits(weights)
 
 
@@ -120,7 +120,7 @@ VARIANTS: Final[dict[str, type[RBM | Triway]]] = {
 }
 
 FACTORISED: Final = frozenset(name for name, variant in VARIANTS.items() if variant.factorised)
-"""Variants whose relation–context weights are shared by factors of rank K."""
+"""Variants whose relation–context weights are products of factors of rank K."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,14 +132,14 @@ class MachineSpec:
         V: object classes (visible units v).
         A: canonical relations.
         H1: hidden units of the first layer.
-        H2: hidden units of the second layer; 0 leaves the layer out.
-        C: room types that shift the biases of h1 when one is given.
+        H2: hidden units of the second layer; 0: no second layer.
+        C: room types; a known room type shifts the biases of h1.
         K: rank of the shared tri-way and relation-context weights (Triway, product RBM).
-        G: rank of the context's part in what given relations imply for others (Triway, local form);
-            0 leaves implications out.
-        T: relation units with a weight of their own: all units of the RBM and GBM, the sparse
-            residual of the Triway.
-        N: stored chain samples that chains start from; 0 keeps none.
+        G: rank of the context's effect on implications between relations (Triway, local form);
+            0: no implications.
+        T: relation units with their own weight: all units of RBM and GBM, the sparse residual of
+            the Triway.
+        N: stored persistent-chain samples at which new chains start; 0: no stored samples.
         form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations).
     """
 
@@ -165,18 +165,18 @@ class MachineSpec:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         for name in ("H2", "C", "K", "T", "G", "N"):
             if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, not {getattr(self, name)}")
+                raise ValueError(f"{name} must be at least 0, not {getattr(self, name)}")
         kind = self.kind
         if kind.factorised and self.K < 1:
             raise ValueError(f"a {self.variant} machine needs a rank K of at least 1, not {self.K}")
         if self.G and not (kind.implications and self.is_local):
-            raise ValueError(f"G must be 0 but in a local triway machine, not {self.G}")
+            raise ValueError(f"G must be 0 unless the machine is a local triway, not {self.G}")
         if self.H2 and not kind.two_layers:
-            raise ValueError(f"an RBM has one hidden layer: H2 must be 0, not {self.H2}")
+            raise ValueError(f"an RBM has one hidden layer, so H2 must be 0, not {self.H2}")
 
     @property
     def kind(self) -> type[RBM | Triway]:
-        """The variant."""
+        """The class of the variant."""
         return VARIANTS[self.variant]
 
     @property
@@ -185,12 +185,12 @@ class MachineSpec:
         return self.form == "local"
 
     def to_dict(self) -> dict[str, Any]:
-        """The spec as JSON-able values."""
+        """Return the specification as JSON-compatible values."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> MachineSpec:
-        """Read a spec back; unknown or missing names raise ValueError."""
+        """Build a specification from `to_dict`; raise ValueError for unknown or missing names."""
         known = {field.name for field in fields(cls)}
         if unknown := sorted(set(values) - known):
             raise ValueError(f"unknown fields in a machine spec: {unknown}")

@@ -1,10 +1,10 @@
-"""The weights of a trained machine: one layout of arrays for every variant; the hidden layers.
+"""The weights of a trained machine: their layout for all variants, and the hidden layers.
 
-The hidden layers given objects, the second one at its mean field:
+The hidden layers given objects, with the second layer at its mean field:
 
     x = c1 + Q[t] + v'W + J m2,   m1 = sigmoid(beta x),   m2 = sigmoid(beta (c2 + m1'J))
 
-from m2 = sigmoid(beta c2) on, in turn; beta is one over the temperature. With one layer x is exact.
+The iteration starts at m2 = sigmoid(beta c2); beta is 1 / temperature. With one layer, x is exact.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from app.inference.relations import SWEEPS
 from app.inference.variants import MachineSpec
 
 WORD = 32
-"""Bits of the words that stored scenes are packed into."""
+"""Bits per word of the packed stored scenes."""
 
 
 def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
-    """Kind of number (float or int) and shape of each array of a machine.
+    """Return the type (float or int) and the shape of each array of a machine.
 
-    All variants have these; for the others see `variants`.
+    All variants have these arrays; `variants` adds those of a variant.
 
         b (V,), c1 (H1,), c2 (H2,), W (V, H1), J (H1, H2), Q (C, H1)
-        triples (T, 3) the (a, i, j) that have a weight of their own, sorted
-        fantasies (N, ceil(V / 32)) stored scenes as bits; fantasy_rooms (N,) -1 for none
+        triples (T, 3) triples (a, i, j) with their own weight, sorted
+        fantasies (N, ceil(V / 32)) stored scenes as bits
+        fantasy_rooms (N,) room types of the stored scenes; -1: unknown
     """
     V, H1, H2 = spec.V, spec.H1, spec.H2
     floats: dict[str, tuple[int, ...]] = {
@@ -49,11 +50,11 @@ class Weights:
     """The arrays of a machine, by the names of `layout`; they never change.
 
     Attributes:
-        spec: sizes and form.
-        arrays: floats in one precision, integers int32.
+        spec: sizes and form of the machine.
+        arrays: floats in one precision, integers as int32.
 
     Raises:
-        ValueError: an array is missing, is one too many or has another shape; triples outside
+        ValueError: an array is missing, unexpected or of a wrong shape; or the triples are outside
             (A, V, V), repeated or not sorted.
     """
 
@@ -70,7 +71,7 @@ class Weights:
                 )
         table = self["triples"].astype(np.int64)
         if (table < 0).any() or (table >= [self.spec.A, self.spec.V, self.spec.V]).any():
-            raise ValueError("triples must hold (a, i, j) within (A, V, V)")
+            raise ValueError("triples must be (a, i, j) within (A, V, V)")
         if (np.diff(self.triple_keys) <= 0).any():
             raise ValueError("triples must be distinct and sorted by (a, i, j)")
 
@@ -79,25 +80,25 @@ class Weights:
 
     @property
     def triple_keys(self) -> NDArray[np.int64]:
-        """(T,) one number for each triple, (a V + i) V + j; ascending."""
+        """(T,) key (a V + i) V + j of each triple; ascending."""
         relation, subject, object_ = self["triples"].astype(np.int64).T
         keys: NDArray[np.int64] = (relation * self.spec.V + subject) * self.spec.V + object_
         return keys
 
     @property
     def scenes(self) -> NDArray[np.float32]:
-        """(N, V) presence in the stored scenes; unpacked at each call, since they are large."""
+        """(N, V) presence of the classes in the stored scenes; unpacked at each access."""
         return unpack_scenes(self["fantasies"], self.spec.V)
 
     def room_bias(self, room: int | None) -> NDArray[Any]:
-        """c1 + Q[t], (H1,); c1 where the room type is not known, or the machine has none."""
+        """Return c1 + Q[t], (H1,); or c1, if the room type or Q is missing."""
         bias: NDArray[Any] = self["c1"]
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
 
     def with_second_layer(
         self, base: NDArray[Any], beta: float = 1.0
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """x (B, H1) and m2 (B, H2) for base = c1 + Q[t] + v'W (B, H1)."""
+        """Return x (B, H1) and m2 (B, H2) for base = c1 + Q[t] + v'W (B, H1)."""
         if not self.spec.H2:
             return base, np.zeros((len(base), 0), base.dtype)
         J, c2 = self["J"], self["c2"]
@@ -109,7 +110,7 @@ class Weights:
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:
-    """Unpack scenes as bits, (N, words), into the presence of classes, (N, V)."""
+    """Unpack scenes stored as bits, (N, words), to the presence of classes, (N, V)."""
     octets = packed.astype("<i4").view(np.uint8).reshape(len(packed), -1)
     bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
     return bits.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Published models: their format, their store, and the verified snapshot a service works with."""
+"""Published models: their format, their store, and verified snapshots for a service."""
 
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.description import (

@@ -1,6 +1,6 @@
 """The table of aliases: one small JSON file, replaced as a whole.
 
-{"default": {"name": "...", "version": "..." or null for the latest}}
+Format: {"default": {"name": "...", "version": "..." or null for the latest version}}
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
 
 
 def read_aliases(path: Path) -> dict[str, AliasTarget]:
-    """The target of each alias; empty without a file.
+    """Return the target of each alias; empty if the file does not exist.
 
     Raises:
-        StoreError: `invalid_aliases` where the file is not what `write_aliases` writes.
+        StoreError: `invalid_aliases` if the file is not a valid table of aliases.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -46,6 +46,6 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
 
 
 def write_aliases(path: Path, aliases: Mapping[str, AliasTarget], *, prefix: str) -> None:
-    """Replace the table; `prefix` marks the temporary sibling that a crash may leave."""
+    """Replace the table; `prefix` marks the temporary file that a crash may leave behind."""
     table = dict(sorted(aliases.items()))
     replace_file(path, _TABLE.dump_json(table, indent=2) + b"\n", prefix=prefix)

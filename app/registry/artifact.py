@@ -1,4 +1,4 @@
-"""One version of a model: written once, verified whenever it is read."""
+"""One version of a model: written once, verified at every read."""
 
 from __future__ import annotations
 
@@ -30,23 +30,24 @@ from app.scene.scene import Scene
 from app.scene.vocabulary import Vocabulary
 
 _DTYPES: Final = {float: "float32", int: "int32"}
-_UNSUPPORTED: Final = "only machines in the local form with weights W between -64 and 64 are served"
+_UNSUPPORTED: Final = "the service needs a machine of the local form, with W between -64 and 64"
 
 
 @dataclass(frozen=True, eq=False)
 class Artifact:
-    """A verified model, ready to be asked.
+    """A verified model, ready to answer questions.
 
     Attributes:
-        manifest: everything the trainer said about it.
-        weights: of the machine.
-        vocabulary: the words of its V object classes and C room types.
-        calibration: from log-odds to promised probabilities.
-        digest: SHA-256 of the manifest's bytes, hexadecimal; it changes if any file does.
+        manifest: description of the model and its files.
+        weights: weights of the machine.
+        vocabulary: names of its V object classes and C room types.
+        calibration: conversion of log-odds into probabilities.
+        digest: SHA-256 of the manifest's bytes, hexadecimal. It changes if any file changes.
         card: the model card, Markdown.
-        path: the directory it was read from.
-        offsets: how far apart things stand, where training saw poses.
-        oracle: makes the posterior of a scene for machines without closed form, which training has.
+        path: directory of the artifact.
+        offsets: metric offsets between related objects, if the training scenes had poses.
+        oracle: function that returns the posterior of a scene, for machines without closed form;
+            used in training only.
     """
 
     manifest: Manifest
@@ -66,46 +67,46 @@ class Artifact:
 
     @cached_property
     def scorer(self) -> ContextScorer:
-        """Prepared scores of all objects; made when first asked for."""
+        """Scorer of all object classes; built on first access."""
         return ContextScorer(self.weights["W"])
 
     @cached_property
     def closed_form(self) -> ClosedForm:
-        """Log-odds in closed form, prepared."""
+        """Log-odds in closed form; built on first access."""
         return ClosedForm(self.weights)
 
     @cached_property
     def completions(self) -> Completions | None:
-        """Posterior of unlisted classes, prepared; None for machines without stored samples."""
+        """Posterior of unlisted classes; None for machines without stored samples."""
         if not Completions.fits(self.weights):
             return None
         return Completions(self.weights, self.vocabulary.structure, self.scorer)
 
     @cached_property
     def relation_slopes(self) -> RelationSlopes:
-        """The calibration of relations in arrays."""
+        """Calibration of the relations, as arrays."""
         return RelationSlopes.of(self.calibration)
 
     @cached_property
     def popularity(self) -> NDArray[np.float64] | None:
-        """(V,) log-odds of each class in a training scene; None where the calibration has none."""
+        """(V,) log-odds of each class in a training scene; None if the calibration lacks them."""
         found = self.calibration.popularity
         return np.array(found) if found else None
 
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:
-        """(V,) what the context adds to the log-odds of each class in an otherwise empty scene."""
+        """(V,) contribution of the context to the log-odds of each class in an empty scene."""
         gain: NDArray[np.float32] = self.scorer.gain(self.weights["c1"])
         return gain
 
     def context_rows(self) -> NDArray[np.float32]:
-        """(T, H1) what each triple that has a weight of its own says of the context."""
+        """(T, H1) input of each relation triple with its own weight to the context units."""
         relation, subject, object_ = self.weights["triples"].astype(np.int64).T.copy()
         return self.spec.kind.units(self.weights).rows_of(relation, subject, object_)
 
     @cached_property
     def scene_chains(self) -> SceneChains:
-        """Compiled chains that draw scenes."""
+        """Compiled Gibbs chains that sample scenes."""
         return SceneChains(self.weights, self.closed_form.units)
 
 
@@ -116,17 +117,17 @@ def write_artifact(
     *,
     storage_dtype: StorageDtype = "float32",
 ) -> Manifest:
-    """Write an artifact into a new directory and bring it to disk.
+    """Write an artifact into a new directory and sync it to disk.
 
     Args:
-        directory: must not exist; its parent must.
-        description: the manifest but for what describes the files.
-        state: the arrays of `layout`, and `Offsets.tensors()` where there are any.
-        storage_dtype: of tensors with two axes or more; see `pack`.
+        directory: the new directory; its parent must exist.
+        description: the manifest without its entries about files.
+        state: the arrays of `layout`, and optionally `Offsets.tensors()`.
+        storage_dtype: dtype of floating-point tensors with two or more axes; see `pack`.
 
     Raises:
-        ArtifactError: a tensor that an artifact cannot hold; see `pack`.
-        OSError: from the file system.
+        ArtifactError: an artifact cannot store a tensor; see `pack`.
+        OSError: the file system refused an operation.
     """
     weights, tensors = pack(state, storage_dtype)
     card = render_card(description, tensors).encode()
@@ -153,13 +154,13 @@ def load_artifact(
     """Read and verify an artifact.
 
     Args:
-        directory: holds the three files and nothing else.
-        previous: an artifact loaded before. The files are verified all the same, but where their
-            digest is unchanged, `previous` itself is returned instead of a second copy.
-        max_weights_bytes: a larger weights file is refused before it is read.
+        directory: directory with exactly the three files of an artifact.
+        previous: an artifact loaded before. If the digest of the verified files is unchanged,
+            `previous` itself is returned instead of a second copy.
+        max_weights_bytes: maximum size of the weights file, checked before it is read.
 
     Raises:
-        ArtifactError: with the code and reason of the first thing found wrong.
+        ArtifactError: code and reason of the first error found.
     """
     files = read_verified(directory, max_weights_bytes)
     if previous is not None and previous.digest == files.digest:

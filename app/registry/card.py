@@ -1,4 +1,4 @@
-"""The model card: what a person should know before a robot acts on this model's answers.
+"""The model card: purpose, metrics, data, terms and limits of a model.
 
 Sections follow Mitchell et al., "Model Cards for Model Reporting", FAT* 2019.
 """
@@ -13,58 +13,60 @@ from app.registry.manifest import TensorEntry
 from app.registry.offsets import PREFIX
 
 _RESEARCH_WARNING = """\
-> **Research use.** These weights were learned from {sources}, whose terms allow research use. Do
-> not ship them in a commercial robot without asking the owners of the data; a model trained on
-> freely licensed scenes alone carries no such warning."""
+> **Research use.** These weights were trained on {sources}, whose terms allow research use. Ask
+> the owners of the data before you ship the weights in a commercial robot. Models that were
+> trained only on freely licensed scenes do not carry this warning."""
 
 _INTENDED_USE = """\
-For a robot that has recognised the objects of a scene like those of the sources below: which
-spatial relations hold between them, which object is missing and where it would stand, which one
-does not belong, and what such a scene looks like."""
+For a robot that has recognised the objects of a scene like the scenes of the sources below. The
+model answers four questions: Which spatial relations hold between the objects? Which object is
+missing, and where would it stand? Which object does not belong? What does such a scene look
+like?"""
 
 _MEASURED = """\
-On test scenes of each source, which neither training nor calibration has seen; 95 % intervals in
-brackets. How many answers each figure is made of is in the manifest."""
+Measured on test scenes of each source, which training and calibration did not use. Brackets hold
+95 % intervals. The manifest has the number of answers behind each figure."""
 
 _FINAL_FIT = """\
-The figures are those of a first fit, which kept the test scenes back. The weights here are of a
-second fit of the same configuration: to all scenes but a tenth, on which it was calibrated."""
+The figures belong to a first fit without the test scenes. The weights here come from a second fit
+of the same configuration to nine tenths of all scenes. Its calibration used the other tenth."""
 
 _PROBABILITIES = """\
-Calibrated on validation scenes to this, ECE 0 and Brier skill 1 being perfect (0: no better than
-how often such answers are true):
+The probabilities are calibrated on validation scenes. A perfect calibration has ECE 0 and Brier
+skill 1; at Brier skill 0, the base rate would do as well. The probabilities mean:
 
-- relations: the relation holds between the two objects; placements: it holds between a missing
-  object and one that is there
-- missing: the class is there although it was not listed; at a place: and stands there
-- outliers: the object is an intruder, where half of the scenes are clean; at the default threshold
-  about 10 % of untouched scenes of the hardest large source raise an alarm
-- misplaced: the relation is false, where one was altered in half of the scenes"""
+- relations: the relation holds between the two objects
+- placements: the relation holds between the missing object and an object of the scene
+- missing: the class is in the scene although it was not listed; at a place: the class is in the
+  scene and stands at this place
+- outliers: the object is an intruder, if half of the scenes contain an intruder; at the default
+  threshold, about 10 % of the unchanged scenes of the hardest large source raise an alarm
+- misplaced: the relation is false, if half of the scenes contain an altered relation"""
 
 _OFFSETS = """\
-Of the offsets of placements: the share of things that stood inside the ellipse (in the plane) or
-the ellipsoid that mean and standard deviations draw for 80 %, by relation; and how far they stood
-from the mean, beside what the relation alone would have said."""
+Offsets of placements, by relation. Coverage is the share of objects inside the ellipse (in the
+plane) or the ellipsoid that mean and standard deviations predict for 80 % of them. The distance
+is that from the mean, compared with a mean that depends on the relation alone."""
 
 _LIMITS = """\
-- The model speaks of classes, not of instances: it says whether a class belongs here, not how many
-  of it. How many chairs a table wants is outside it.
-- Annotators list a few relations of each scene. An unlisted relation counts as wrong in R-precision
-  without being false.
-- Left and front are meant in the viewer's axes. Where a source has no viewer, one was chosen in
-  training, and these two relations carry that choice.
-- Offsets say where such a thing usually stands, not where there is room for it; they know neither
-  the size nor the heading of what it stands at.
-- Labels outside the vocabulary are not understood. Structure and vague labels (floor, sky, object)
-  are accepted and never proposed.
-- Scenes unlike those of the sources above are outside what the figures speak of, and so are scenes
-  of which the robot saw a small part.
-- A probability is a statistical statement about such scenes. It is no safety check: do not let a
-  robot move something, or leave it alone, on this answer only."""
+- The model knows classes, not instances. It says whether a class belongs to a scene, but not how
+  many objects of the class belong there.
+- Annotators list only a few relations of each scene. An unlisted relation counts as wrong in
+  R-precision although it may be true.
+- Left and front refer to the viewer's axes. For sources without a viewer, training chose one, and
+  these two relations depend on that choice.
+- Offsets say where an object usually stands. They ignore free space, and the size and heading of
+  the other object.
+- The model does not know labels outside its vocabulary. It accepts structure and vague labels
+  (floor, sky, object), but never proposes them.
+- The figures do not apply to scenes unlike the scenes of the sources above. They do not apply
+  either if the robot saw only a small part of the scene.
+- A probability is a statistical statement about such scenes, not a safety check. Do not let a
+  robot move an object, or leave it in place, because of this answer alone."""
 
 
 def render_card(description: Description, tensors: Mapping[str, TensorEntry]) -> str:
-    """The card of a model, Markdown."""
+    """Return the card of a model, in Markdown."""
     words, spec = description.vocabulary, description.spec
     proposed = sum(not entry.structure for entry in words.objects)
     machine = {name: e for name, e in tensors.items() if not name.startswith(PREFIX)}
@@ -115,7 +117,7 @@ def _warning(data: Sequence[DataSource]) -> Iterable[str]:
 
 def _metrics(description: Description) -> str:
     if not description.metrics:
-        return "None recorded: nothing is known of how well this model answers."
+        return "No metrics are recorded, so the quality of the answers is unknown."
     sources = list(dict.fromkeys(m.source for m in description.metrics))
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for m in description.metrics:
@@ -135,5 +137,5 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text that cannot break out of its cell."""
+    """Escape text for a table cell."""
     return " ".join(text.replace("|", "\\|").split())

@@ -1,4 +1,4 @@
-"""What a trainer says about a model: everything but its numbers and its files."""
+"""The description of a model by its trainer, without weights and files."""
 
 from __future__ import annotations
 
@@ -33,34 +33,34 @@ Floats = NDArray[np.floating[Any]]
 
 ItemT = TypeVar("ItemT")
 Many = Annotated[tuple[ItemT, ...], FailFast()]
-"""Validation stops at the first invalid item: errors of a million take gigabytes."""
+"""A tuple whose validation stops at the first invalid item; a million errors take gigabytes."""
 
 
 def _in_utc(moment: datetime) -> datetime:
     try:
         return moment.astimezone(UTC)
     except OverflowError:
-        raise ValueError("must lie in the years 1 to 9999 in UTC too") from None
+        raise ValueError("must be in the years 1 to 9999 in UTC") from None
 
 
 Timestamp = Annotated[AwareDatetime, AfterValidator(_in_utc)]
 
 
 def to_json(value: Any) -> str:
-    """One line of strict JSON; raises ValueError for NaN and infinity."""
+    """Return one line of strict JSON; raise ValueError for NaN and infinity."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
 class Frozen(BaseModel):
-    """Cannot be changed, and holds no unknown or non-finite field."""
+    """Base class of immutable models that refuse unknown fields and non-finite numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class CountSlope(Frozen):
-    """A logit z of an answer, made a log-odds: intercept + slope·z + log_count·log n.
+    """Calibration of a logit z: log-odds = intercept + slope·z + log_count·log n.
 
-    What n counts is the answer's: classes of the scene for outliers.
+    The meaning of n depends on the question; for outliers, n is the number of classes in the scene.
     """
 
     intercept: float = 0.0
@@ -68,17 +68,17 @@ class CountSlope(Frozen):
     log_count: float = 0.0
 
     def log_odds(self, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
-        """The log-odds of logits z (N,), of one n or of one each (N,)."""
+        """Return the log-odds (N,) of logits z (N,); n is a number or an array (N,)."""
         found: Floats = self.intercept + self.log_count * np.log(n) + self.slope * z
         return found
 
 
 class PairSlope(CountSlope):
-    """The same for a relation between two objects, and + log_classes·log of the scene's classes.
+    """Calibration of a relation between two objects.
 
-    n counts the instance pairs of both classes. In a room of many things an annotator lists fewer
-    of what each could be related to. From each bend (at, change) on the sum x grows faster, by
-    change·(x - at) for x > at, and slower for a negative change.
+    It adds log_classes·log(number of classes in the scene) to the formula of `CountSlope`, because
+    annotators list a smaller share of the relations in a larger scene. n is the number of instance
+    pairs of both classes. Each bend (at, change) adds change·(x - at) to a sum x > at.
     """
 
     log_classes: float = 0.0
@@ -102,7 +102,7 @@ _RETIRED = frozenset(
 
 
 class Thresholds(Frozen):
-    """Probabilities from which an alarm is raised, by sensitivity."""
+    """Minimum probability of an alarm, by sensitivity."""
 
     low: Annotated[float, Field(ge=0, le=1)] = 0.5
     medium: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -110,11 +110,12 @@ class Thresholds(Frozen):
 
 
 class EvidenceWeights(Frozen):
-    """How strongly given relations pull the context, by kind of evidence and of question.
+    """Weights of observed relations in the context, by kind of evidence and of question.
 
     Attributes:
-        relations_on_objects, relations_on_relations: relations that a request states.
-        poses_on_objects, poses_on_relations: relations derived from positions.
+        relations_on_objects, relations_on_relations: weights of relations that a request states,
+            for questions about objects and about relations.
+        poses_on_objects, poses_on_relations: the same for relations derived from poses.
     """
 
     relations_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
@@ -124,34 +125,33 @@ class EvidenceWeights(Frozen):
 
 
 class Calibration(Frozen):
-    """How a machine's log-odds become the probabilities that the service promises.
+    """Calibration: conversion of a machine's log-odds into probabilities.
 
-    The defaults change no log-odds but those of unlisted classes, see `coverage`.
+    The defaults change only the log-odds of unlisted classes; see `coverage`.
 
     Attributes:
-        coverage: probability that a class which is present is listed, unless a request says.
-        coverage_weight: share of the partial posterior in the log-odds; the rest is the closed form
-            with unlisted classes absent; chosen on validation.
-        missing: posterior log-odds of an unlisted class to the calibrated ones; n counts the listed
-            classes.
-        evidence: see `EvidenceWeights`.
-        popularity: (V,) log-odds of finding each class in a training scene; empty: all alike.
-        popularity_weight: alpha of the prior of an intruder, proportional to popularity^alpha.
-        outlier_thresholds: probabilities from which an object is an outlier.
-        short_list_thresholds: the same for lists of 1, 2, ... classes, structure aside; longer
-            lists have `outlier_thresholds`.
-        misplaced_thresholds: probabilities from which a relation is misplaced.
-        smallest: (C + 1,) classes that nine in ten real rooms of each type have at least,
-            and last of all rooms together; empty: any number.
-        room_fit: (C,) what 85 % of the real rooms of each type have at least of
-            log p(v | room type) / p(v), up to a constant; empty: any value.
-        outlier: presence log-odds to the log-odds of being an intruder.
-        relation: one entry a canonical relation.
-        relation_given: the same where some relations of the scene are given; `relation` if empty.
-        placement: the same for a missing object and one that is there, at its likeliest places;
-            `relation` if empty.
-        asked_place: the same at the place that a request asks for; `placement` if empty.
-        misplaced: relation log-odds to the log-odds of being false.
+        coverage: probability that a class in the scene is listed; a request may override it.
+        coverage_weight: weight of the partial posterior in the log-odds, chosen on validation
+            scenes. The rest is the closed form with unlisted classes absent.
+        missing: calibration of the posterior log-odds of an unlisted class; n is the number of
+            listed classes.
+        evidence: weights of observed relations.
+        popularity: (V,) log-odds of each class in a training scene; empty: equal for all classes.
+        popularity_weight: alpha; the prior of an intruder is proportional to popularity^alpha.
+        outlier_thresholds: minimum probability of an outlier.
+        short_list_thresholds: outlier thresholds for scenes of 1, 2, ... classes without structure;
+            larger scenes use `outlier_thresholds`.
+        misplaced_thresholds: minimum probability of a misplaced relation.
+        smallest: (C + 1,) number of classes that 90 % of the real rooms of each type reach; the
+            last entry is for all rooms together. Empty: no minimum.
+        room_fit: (C,) value of log p(v | room type) / p(v), up to a constant, that 85 % of the
+            real rooms of each type reach. Empty: no minimum.
+        outlier: calibration from the log-odds of presence to the log-odds of an intruder.
+        relation: one entry per canonical relation.
+        relation_given: entries for scenes with observed relations; if empty, `relation`.
+        placement: entries for a missing object at its most probable places; if empty, `relation`.
+        asked_place: entries for the place that a request names; if empty, `placement`.
+        misplaced: calibration from the log-odds of a relation to the log-odds that it is false.
     """
 
     coverage: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -175,19 +175,19 @@ class Calibration(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _without_retired(cls, values: Any) -> Any:
-        """Pass over what earlier releases wrote."""
+        """Ignore fields that only earlier releases used."""
         if not isinstance(values, dict):
             return values
         return {name: value for name, value in values.items() if name not in _RETIRED}
 
     @classmethod
     def neutral(cls, relations: int) -> Self:
-        """The calibration that changes nothing, for A canonical relations."""
+        """Return the neutral calibration for A = ``relations`` canonical relations."""
         return cls(relation=(PairSlope(),) * relations)
 
 
 class ClassEntry(Frozen):
-    """One object class; `size` is its typical extent in metres, x, y, z."""
+    """One object class; `size` is its typical extent (x, y, z) in metres."""
 
     label: Text
     aliases: Many[Text] = ()
@@ -196,7 +196,7 @@ class ClassEntry(Frozen):
 
 
 class VocabularyEntry(Frozen):
-    """The words of a model, in the order of its units."""
+    """The object classes, relations and room types of a model, in the order of its units."""
 
     objects: Many[ClassEntry]
     relations: Many[str] = CANONICAL
@@ -206,22 +206,22 @@ class VocabularyEntry(Frozen):
     @model_validator(mode="after")
     def _is_a_vocabulary(self) -> Self:
         if self.relations != CANONICAL[: len(self.relations)]:
-            raise ValueError(f"relations must be the canonical ones in their order: {CANONICAL}")
+            raise ValueError(f"relations must be the first of {CANONICAL}, in this order")
         self._words = Vocabulary.from_dict(self.model_dump(mode="json", exclude={"relations"}))
         return self
 
     @classmethod
     def of(cls, vocabulary: Vocabulary, relations: int = len(CANONICAL)) -> Self:
-        """The entry of a vocabulary, for a machine of A = `relations`."""
+        """Return the entry of a vocabulary, for a machine of A = ``relations`` relations."""
         return cls.model_validate({**vocabulary.to_dict(), "relations": CANONICAL[:relations]})
 
     def vocabulary(self) -> Vocabulary:
-        """The vocabulary itself."""
+        """Return the vocabulary."""
         return self._words
 
 
 class DataSource(Frozen):
-    """Scenes that the model was trained on, their digest and their terms."""
+    """One source of training scenes: its name, size, digest and terms."""
 
     source: Text
     scenes: Count
@@ -231,7 +231,7 @@ class DataSource(Frozen):
 
 
 class Metric(Frozen):
-    """One measured figure with its 95 % interval over n units (scenes, removed objects …)."""
+    """One measured figure with its 95 % interval over n units (scenes, removed objects, ...)."""
 
     task: Text
     source: Text
@@ -249,19 +249,19 @@ class Metric(Frozen):
 
 
 class Description(Frozen):
-    """What the trainer says about a model; all of the manifest but what describes the files.
+    """The description of a model: its manifest without the entries about files.
 
     Attributes:
-        name, version: where the artifact is published.
-        created: when; kept in UTC.
+        name, version: name and version in the store.
+        created: time of creation, in UTC.
         spec: `MachineSpec.to_dict()`.
-        vocabulary: words in the order of the units; V, A and C of them.
-        calibration: see `Calibration`.
-        training: configuration and seed, free JSON.
-        data: the sources trained on.
-        metrics: measured on held-out scenes.
-        terms: licence of the weights, in words.
-        libraries: versions that the model was trained with.
+        vocabulary: V object classes, A relations and C room types, in the order of the units.
+        calibration: conversion of log-odds into probabilities.
+        training: configuration and seed of the training, free JSON.
+        data: sources of the training scenes.
+        metrics: figures measured on held-out scenes.
+        terms: licence of the weights.
+        libraries: versions of the libraries used in training.
     """
 
     name: ModelName
@@ -279,7 +279,7 @@ class Description(Frozen):
     @field_validator("spec", "training", "libraries", "terms")
     @classmethod
     def _can_be_written(cls, value: JsonValue) -> JsonValue:
-        # pydantic lets NaN and lone surrogates through in free JSON.
+        # pydantic accepts NaN and lone surrogates in free JSON.
         to_json(value).encode()
         return value
 
@@ -293,9 +293,9 @@ class Description(Frozen):
             *(
                 ("A", f"calibration {kind}", len(entries or self.calibration.relation))
                 for kind, entries in (
-                    ("relations given others", self.calibration.relation_given),
-                    ("placements", self.calibration.placement),
-                    ("a place asked for", self.calibration.asked_place),
+                    ("entries of relation_given", self.calibration.relation_given),
+                    ("entries of placement", self.calibration.placement),
+                    ("entries of asked_place", self.calibration.asked_place),
                 )
             ),
         ):

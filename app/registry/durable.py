@@ -1,7 +1,7 @@
-"""Writing files so that a crash leaves either the old state or the new one.
+"""Writing files so that a crash leaves either the old state or the new state.
 
-A rename is atomic for readers at once, but survives a power cut only when the file's bytes were on
-disk before it and the directory's entry is on disk after it. Each fsync here serves this.
+A rename is atomic for readers. To survive a power cut, it also needs the file's bytes on disk
+before the rename, and the directory's entry on disk afterwards. The calls of fsync ensure both.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Create a file that must not exist yet, and bring its bytes to disk."""
+    """Create a new file and sync its bytes to disk; raise FileExistsError if it exists."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     with os.fdopen(descriptor, "wb") as file:
         file.write(data)
@@ -21,7 +21,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def sync_directory(path: Path) -> None:
-    """Bring a directory's entries to disk."""
+    """Sync the entries of a directory to disk."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
@@ -30,7 +30,7 @@ def sync_directory(path: Path) -> None:
 
 
 def make_directory(path: Path) -> None:
-    """Create a directory (and missing parents) whose entry survives a crash; existing is fine."""
+    """Create a directory and its missing parents, and sync them to disk; it may already exist."""
     if path.is_dir():
         return
     make_directory(path.parent)
@@ -39,13 +39,13 @@ def make_directory(path: Path) -> None:
 
 
 def rename(source: Path, target: Path) -> None:
-    """Move within one directory, and bring the move to disk."""
+    """Rename a file within its directory, and sync the directory to disk."""
     source.rename(target)
     sync_directory(target.parent)
 
 
 def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
-    """Give a file new contents in one step; `prefix` marks the temporary sibling."""
+    """Replace the contents of a file atomically; `prefix` marks the temporary file beside it."""
     temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}")
     try:
         write_file(temporary, data)

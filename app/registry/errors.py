@@ -1,4 +1,4 @@
-"""Why an artifact or a store was refused: a code for programs and a reason for people."""
+"""Errors of the registry: each has a code for programs and a reason for people."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ StoreCode = Literal[
 
 
 class RegistryError(Exception):
-    """Base of the registry's errors. Neither code nor reason ever holds an absolute path."""
+    """Base class of the registry errors. Code and reason never contain an absolute path."""
 
     code: str
     reason: str
@@ -50,11 +50,11 @@ class RegistryError(Exception):
 
 
 class ArtifactError(RegistryError):
-    """One artifact cannot be used.
+    """An artifact is not usable.
 
     Attributes:
         code: machine-readable kind of failure.
-        reason: the same in words, naming the file or tensor, without its folder.
+        reason: description that names the file or tensor, without the folder.
     """
 
     code: ArtifactCode
@@ -66,11 +66,11 @@ class ArtifactError(RegistryError):
 
 
 class StoreError(RegistryError):
-    """A reference does not resolve, or a change to the store was refused.
+    """A reference does not resolve, or the store refused a change.
 
     Attributes:
         code: machine-readable kind of failure.
-        reason: the same in words.
+        reason: description of the failure.
     """
 
     code: StoreCode
@@ -82,7 +82,7 @@ class StoreError(RegistryError):
 
 
 def cause(error: OSError) -> str:
-    """The system's message without the path that str(error) would show."""
+    """Return the message of the operating system, without the path that str(error) would show."""
     if error.errno == errno.ELOOP:
-        return "links are not followed"
+        return "the path contains a symbolic link, which the store does not follow"
     return os.strerror(error.errno) if error.errno is not None else "input/output error"

@@ -1,4 +1,4 @@
-"""One writer at a time, across processes."""
+"""A lock for one writer at a time, across processes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from app.registry.errors import StoreError
 
 @contextmanager
 def exclusive(path: Path, timeout: float) -> Iterator[None]:
-    """Hold the lock of a file, created where it is missing and left in place afterwards.
+    """Hold an exclusive lock on a file.
 
-    The kernel releases the lock when its holder ends, however it ends.
+    The kernel releases the lock when the process ends, even after a crash.
 
     Args:
-        path: the lock file.
+        path: the lock file; created if missing, and never removed.
         timeout: seconds to wait for another holder.
 
     Raises:
-        StoreError: `locked` after the timeout.
+        StoreError: `locked`, if another process still holds the lock after ``timeout``.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
     try:

@@ -1,8 +1,8 @@
-"""The file beside the weights: a description, and what proves the files to be those described.
+"""The manifest of an artifact: the description of the model and the checksums of its files.
 
-A manifest is a JSON object, one top-level member a line, whose last line is the SHA-256 of all
-bytes before it. So a manifest that was cut or altered is recognised by itself, before it is parsed,
-and the checksums it holds of the other files can be believed.
+A manifest is a JSON object with one top-level member per line. Its last line is the SHA-256 of all
+bytes before it. The checksum reveals a truncated or altered manifest before it is parsed. The
+checksums of the other files are then trustworthy too.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from app.registry.offsets import PREFIX
 
 FORMAT: Final = 2
 READABLE: Final = (1, FORMAT)
-"""Format 1 knows no offsets; a version of either may lack them."""
+"""Format 1 does not support offsets; in format 2 they are optional."""
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -30,7 +30,7 @@ _TRAILER: Final = re.compile(rb',\n"checksum": "([0-9a-f]{64})"\n}\n\Z')
 
 
 class TensorEntry(Frozen):
-    """A tensor as it is stored."""
+    """Dtype and shape of a stored tensor."""
 
     dtype: Literal["float16", "float32", "int32", "int64", "bool"]
     shape: Many[Count]
@@ -44,7 +44,7 @@ class FileEntry(Frozen):
 
 
 class Manifest(Description):
-    """A description, the tensors as stored, and the checksum of every other file."""
+    """The description of a model, its stored tensors and the checksums of its other files."""
 
     format: Literal[1, 2] = FORMAT
     tensors: Annotated[dict[str, TensorEntry], Field(max_length=MAX_TENSORS)]
@@ -52,18 +52,18 @@ class Manifest(Description):
 
     @property
     def weights(self) -> dict[str, TensorEntry]:
-        """The tensors of the machine alone."""
+        """The tensors of the machine, without the offsets."""
         return {name: e for name, e in self.tensors.items() if not name.startswith(PREFIX)}
 
     @field_validator("files")
     @classmethod
     def _names_every_file(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:
         if set(files) != {WEIGHTS, CARD}:
-            raise ValueError(f"must name {WEIGHTS} and {CARD}, and no other file")
+            raise ValueError(f"must name exactly {WEIGHTS} and {CARD}")
         return files
 
     def to_bytes(self) -> bytes:
-        """The file's contents, checksum last."""
+        """Return the contents of the manifest file, with the checksum at the end."""
         members = self.model_dump(mode="json")
         members = {"format": members.pop("format"), **members}
         lines = ",\n".join(f"{to_json(name)}: {to_json(value)}" for name, value in members.items())
@@ -72,7 +72,7 @@ class Manifest(Description):
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Read a manifest back.
+        """Parse the contents of a manifest file.
 
         Raises:
             ArtifactError: `truncated`, `checksum_mismatch`, `unknown_format`, `invalid_manifest`.
@@ -99,7 +99,7 @@ def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:
     except (ValueError, RecursionError):
         if complete:
             raise ArtifactError("invalid_manifest", f"{MANIFEST} is not JSON") from None
-        raise ArtifactError("truncated", f"{MANIFEST} is cut off or not JSON") from None
+        raise ArtifactError("truncated", f"{MANIFEST} is truncated or not JSON") from None
     if not isinstance(members, dict):
         raise ArtifactError("invalid_manifest", f"{MANIFEST} is not a JSON object")
     return members
@@ -110,7 +110,7 @@ def _is_known_format(value: object) -> bool:
 
 
 def _first(error: ValidationError) -> str:
-    """The first complaint and where it is; never the offending value."""
+    """Return the first error and its location, without the invalid value."""
     detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
     place = ".".join(str(part) for part in detail["loc"])
     return f"{place}: {detail['msg']}" if place else str(detail["msg"])

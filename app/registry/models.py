@@ -1,4 +1,4 @@
-"""Everything the store holds, loaded: an immutable snapshot that a service swaps as a whole."""
+"""The loaded store: an immutable snapshot that a service replaces as a whole."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _logger = logging.getLogger("app.registry")
 
 @dataclass(frozen=True, slots=True)
 class ArtifactFailure:
-    """Why a version was refused. Unlike an exception it keeps no frames and no weights alive."""
+    """The reason for a refused version; unlike an exception, it holds no frames or weights."""
 
     code: ArtifactCode
     reason: str
@@ -26,7 +26,7 @@ class ArtifactFailure:
 
 @dataclass(frozen=True, slots=True)
 class StoreFailure:
-    """Why the store itself, or its table of aliases, could not be read."""
+    """The reason why the store or its table of aliases could not be read."""
 
     code: StoreCode
     reason: str
@@ -37,9 +37,9 @@ class ModelSet:
     """The state of a store at one moment.
 
     Attributes:
-        entries: each published (name, version): its artifact, or why it was refused.
-        aliases: what each points at.
-        failure: set where the store or its aliases could not be read.
+        entries: artifact or failure of each published (name, version).
+        aliases: target of each alias.
+        failure: reason why the store or its aliases could not be read; None if they were read.
     """
 
     entries: Mapping[tuple[str, str], Artifact | ArtifactFailure]
@@ -48,7 +48,7 @@ class ModelSet:
 
     @cached_property
     def versions(self) -> Mapping[str, tuple[str, ...]]:
-        """Versions of each model, ascending; refused ones too."""
+        """Versions of each model, ascending, including refused versions."""
         found: dict[str, list[str]] = {}
         for name, version in sorted(self.entries, key=lambda key: (key[0], version_key(key[1]))):
             found.setdefault(name, []).append(version)
@@ -56,19 +56,19 @@ class ModelSet:
 
     @cached_property
     def failures(self) -> Mapping[tuple[str, str], ArtifactFailure]:
-        """The versions that were refused."""
+        """The refused versions, with reasons."""
         return MappingProxyType(
             {key: e for key, e in self.entries.items() if isinstance(e, ArtifactFailure)}
         )
 
     def resolve(self, reference: str) -> Artifact:
-        """The model that an alias, `name` or `name@version` points at.
+        """Return the model that an alias, `name` or `name@version` points at.
 
-        A refused version answers with its failure: no older one stands in for it.
+        An older version never replaces a refused version.
 
         Raises:
             ArtifactError: the version was refused.
-            StoreError: see `resolve_reference`; the store's own failure where it could not be read.
+            StoreError: see `resolve_reference`; or the store could not be read.
         """
         try:
             key = resolve_reference(
@@ -86,7 +86,7 @@ class ModelSet:
 
     @cached_property
     def default_failure(self) -> str | None:
-        """Why requests that name no model cannot be answered; None where they can."""
+        """The reason why the default model is not usable; None if it is usable."""
         try:
             self.resolve("default")
         except RegistryError as error:
@@ -95,21 +95,21 @@ class ModelSet:
 
     @property
     def ready(self) -> bool:
-        """Whether requests that name no model can be answered."""
+        """Whether the default model is usable."""
         return self.default_failure is None
 
 
 def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
     """Load and verify every version of a store.
 
-    Never raises for what the store holds: a refused version, unreadable aliases or a missing store
-    are part of the result. Artifacts of `previous` whose digest is unchanged are taken over as they
-    are, after their files were verified again.
+    Errors in the store are part of the result, not raised: refused versions, unreadable aliases or
+    a missing store. Artifacts of `previous` with an unchanged digest are reused after their files
+    have been verified again.
     """
     failure: StoreFailure | None = None
     aliases: Mapping[str, AliasTarget]
     try:
-        # Before the versions: an alias moves after its version appears, so each target is listed.
+        # Before the versions: an alias is written after its target, so the list has each target.
         aliases = store.aliases()
     except StoreError as error:
         aliases, failure = {}, StoreFailure(error.code, error.reason)
@@ -118,7 +118,7 @@ def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
         for name in store.names():
             try:
                 keys += [(name, version) for version in store.versions(name)]
-            except StoreError as error:  # one model's folder; the others still answer
+            except StoreError as error:  # only this model's folder is unreadable
                 failure = StoreFailure(error.code, error.reason)
     except StoreError as error:
         failure = StoreFailure(error.code, error.reason)
@@ -134,10 +134,10 @@ def _load(
         return store.load(name, version, known if isinstance(known, Artifact) else None)
     except ArtifactError as error:
         return ArtifactFailure(error.code, error.reason)
-    except StoreError as error:  # removed by hand since it was listed
+    except StoreError as error:  # the version was removed after it was listed
         return ArtifactFailure("missing_file", error.reason)
     except Exception as error:
-        # MemoryError is one of them: this version needs more than there is, the others do not.
+        # Including MemoryError: other versions may need less memory.
         _logger.exception("%s@%s could not be loaded", name, version)
         return ArtifactFailure(
             "unexpected_error", f"loading failed with {type(error).__name__}; the log says why"

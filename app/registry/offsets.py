@@ -1,8 +1,8 @@
-"""Where things stand to each other in metres, by relation and pair of classes.
+"""Offsets between related objects in metres, by relation and pair of classes.
 
-An offset leads from the centre of a relation's object to that of its subject, in the viewer's axes
-(x away, y left, z up). Relations are the canonical ones: what stands to the right of a thing has
-the negative offset of the thing to its left.
+An offset is the vector from the centre of a relation's object to the centre of its subject, in the
+viewer's axes (x away from the viewer, y left, z up). The table holds canonical relations only. The
+offset of the opposite relation is the negative offset with both classes exchanged.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
 
 PREFIX: Final = "offsets."
-"""Of the names of their tensors, which lie among the machine's."""
+"""Prefix of the names of offset tensors, which share a file with the machine's tensors."""
 
 NOTHING: Final = -1
-"""In place of a number of scenes: training saw none of the relation."""
+"""Value instead of a number of scenes, if the relation never occurred in training."""
 
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """Normal offsets, axis by axis; A canonical relations, V classes, P pairs that were seen.
+    """Normal distributions of offsets, for A canonical relations, V classes and P observed pairs.
 
     Attributes:
-        relation: (A, 6) mean and variance of x, y and z between two classes never seen in it.
-        relation_scenes: (A,) training scenes that showed the relation.
-        subject, object: (A, V, 6) what a class at this end adds to both.
-        pair: (P,) the pairs that were seen, (a V + subject) V + object, ascending.
-        pair_offset: (P, 6) mean and standard deviation of theirs.
-        pair_scenes: (P,) training scenes that showed the pair so.
+        relation: (A, 6) mean and variance of x, y and z for any two classes.
+        relation_scenes: (A,) number of training scenes with the relation.
+        subject, object: (A, V, 6) additions of a class at this end to mean and variance.
+        pair: (P,) pairs that training scenes contain, (a V + subject) V + object, ascending.
+        pair_offset: (P, 6) mean and standard deviation of each pair.
+        pair_scenes: (P,) number of training scenes with the pair in this relation.
     """
 
     relation: Table
@@ -51,12 +51,12 @@ class Offsets:
     pair_scenes: Ints
 
     def tensors(self) -> dict[str, NDArray[Any]]:
-        """As an artifact holds them."""
+        """Return the arrays under their names in an artifact."""
         return {f"{PREFIX}{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, NDArray[Any]], A: int, V: int) -> Self:
-        """What `tensors` gave, for a machine of A relations and V classes.
+        """Rebuild the offsets of a machine with A relations and V classes from `tensors()`.
 
         Raises:
             ArtifactError: `wrong_shape`, `invalid_tensor`.
@@ -85,27 +85,28 @@ class Offsets:
         if not all(np.issubdtype(array.dtype, np.integer) for array in counted):
             return "pairs and scenes must be integers"
         if (np.diff(self.pair) <= 0).any() or (self.pair[:1] < 0).any():
-            return "pairs must ascend"
+            return "pairs must be in ascending order"
         if (self.pair[-1:] >= most).any():
-            return "a pair is beyond the vocabulary"
+            return "a pair has a class outside the vocabulary"
         if (self.relation_scenes < 0).any() or (self.pair_scenes < 1).any():
-            return "a number of scenes is too small"
+            return "relation_scenes must be at least 0 and pair_scenes at least 1"
         least = self.relation + self.subject.min(axis=1) + self.object.min(axis=1)
         if (least[self.relation_scenes > 0, 3:] <= 0).any() or (self.pair_offset[:, 3:] <= 0).any():
-            return "spreads must be positive"
+            return "variances and standard deviations must be positive"
         return None
 
     def find(
         self, relation: Ints, subject: Ints, other: Ints
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Of n pairs of classes, each in a relation: mean and standard deviation, and scenes.
+        """Return the offsets of n pairs of classes in given relations.
 
         Args:
             relation, subject, other: (n,) canonical relations and classes.
 
         Returns:
-            (n, 6), and (n,) the training scenes that showed the pair so: 0 where the offset rests
-            on what is known of the relation and of either class; `NOTHING` where it means nothing.
+            (n, 6) mean and standard deviation, and (n,) number of training scenes with the pair.
+            The number is 0 if the offset comes from the relation and the two classes separately,
+            and `NOTHING` if the relation never occurred in training.
         """
         found: tuple[NDArray[np.float64], NDArray[np.int64]]
         found = look_up(self.tables, relation, subject, other)
@@ -113,7 +114,7 @@ class Offsets:
 
     @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:
-        """As `look_up` takes them."""
+        """The arrays in the order of `look_up`."""
         return (
             *(self.relation, self.relation_scenes, self.subject, self.object),
             *(self.pair, self.pair_offset, self.pair_scenes),

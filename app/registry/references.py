@@ -1,7 +1,7 @@
-"""Names, versions and aliases: their spelling, their order, and what a reference points at.
+"""Names, versions and aliases: their spelling, their order, and the target of a reference.
 
-A reference is an alias, `name` (its latest version), or `name@version`. Spellings are narrow enough
-to be used as file names as they are: no separators, no leading dot, one case.
+A reference is an alias, `name` (the latest version of the model) or `name@version`. Every valid
+name is also a safe file name: lower case, without separators or a leading dot.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ _VERSION = re.compile(r"(?:0|[1-9][0-9]{0,8})(?:\.(?:0|[1-9][0-9]{0,8})){2}")
 
 
 def is_name(text: str) -> bool:
-    """Whether text may name a model or an alias: a-z, 0-9, inner `_` and `-`, up to 64."""
+    """Return whether text is a valid name: up to 64 characters a-z, 0-9, inner `_` and `-`."""
     return _NAME.fullmatch(text) is not None
 
 
 def is_version(text: str) -> bool:
-    """Whether text is MAJOR.MINOR.PATCH, three decimal numbers without leading zeros."""
+    """Return whether text is MAJOR.MINOR.PATCH: three decimal numbers without leading zeros."""
     return _VERSION.fullmatch(text) is not None
 
 
 def _require_name(text: str) -> str:
     if not is_name(text):
-        raise ValueError("must have 1 to 64 characters a-z, 0-9 and, inside, '_' or '-'")
+        raise ValueError("must have 1 to 64 characters a-z, 0-9, '_', '-'; first and last a-z, 0-9")
     return text
 
 
 def _require_version(text: str) -> str:
     if not is_version(text):
-        raise ValueError("must be MAJOR.MINOR.PATCH without leading zeros, as in 1.0.0")
+        raise ValueError("must be MAJOR.MINOR.PATCH without leading zeros, for example 1.0.0")
     return text
 
 
@@ -45,7 +45,7 @@ Version = Annotated[str, AfterValidator(_require_version)]
 
 
 class AliasTarget(BaseModel):
-    """The target of an alias: one version, or the latest (`version` null)."""
+    """The target of an alias: one version, or the latest version (`version` null)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -82,12 +82,12 @@ def resolve_reference(
     aliases: Mapping[str, AliasTarget],
     versions: Callable[[str], Sequence[str]],
 ) -> tuple[str, str]:
-    """The (name, version) that a reference points at.
+    """Return the (name, version) that a reference points at.
 
     Args:
         reference: alias, `name`, or `name@version`.
-        aliases: by alias; an alias goes before a model of the same name.
-        versions: of a model, ascending; empty for an unknown model.
+        aliases: targets by alias; an alias takes precedence over a model of the same name.
+        versions: returns the versions of a model, ascending; empty for an unknown model.
 
     Raises:
         StoreError: `invalid_reference`, `unknown_model`, `unknown_version` or `dangling_alias`.
@@ -106,11 +106,11 @@ def resolve_reference(
 
 def _pick(target: AliasTarget, versions: Callable[[str], Sequence[str]]) -> tuple[str, str]:
     if not (known := versions(target.name)):
-        raise StoreError("unknown_model", f"there is no model or alias named '{target.name}'")
+        raise StoreError("unknown_model", f"no model or alias has the name '{target.name}'")
     if target.version is None:
         return target.name, known[-1]
     if target.version not in known:
         raise StoreError(
-            "unknown_version", f"model '{target.name}' has no version {target.version}"
+            "unknown_version", f"model '{target.name}' does not have version {target.version}"
         )
     return target.name, target.version

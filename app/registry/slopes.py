@@ -1,4 +1,4 @@
-"""A calibration's entries of relations as arrays, for the loops that answer."""
+"""The relation entries of a calibration as arrays, for the compiled kernels."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ Table = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelationSlopes:
-    """Of each canonical relation intercept, slope, log_count, log_classes and K bends, (A, 4 + 2K).
+    """Calibration tables of the A canonical relations, each (A, 4 + 2K).
+
+    A row holds intercept, slope, log_count, log_classes and K bends.
 
     Attributes:
-        alone: for scenes of which no relation is given.
-        given: of which some are.
-        placement: for a missing object and one that is there.
-        asked_place: the same at the place that a request asks for.
+        alone: for scenes without observed relations.
+        given: for scenes with observed relations.
+        placement: for a missing object at its most probable places.
+        asked_place: for a missing object at the place that a request names.
     """
 
     alone: Table
@@ -30,7 +32,7 @@ class RelationSlopes:
 
     @classmethod
     def of(cls, calibration: Calibration) -> RelationSlopes:
-        """The entries of a calibration, each kind standing in where another is empty."""
+        """Build the tables of a calibration; an empty kind uses the entries of another kind."""
         alone = calibration.relation
         placement = calibration.placement or alone
         return cls(

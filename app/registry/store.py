@@ -1,10 +1,10 @@
-"""The store: published versions, which never change, and the aliases that point at them.
+"""The store: published versions, which never change, and aliases that point at them.
 
     <root>/<name>/<version>/{model.safetensors, manifest.json, card.md}
     <root>/aliases.json
 
-Readers take no lock: a version appears by one rename, and an alias moves by one. Writers exclude
-each other, so whatever temporary file a writer finds was left by a dead one.
+Readers need no lock, because writers publish a version or change an alias by one atomic rename.
+Writers hold a lock, so a temporary file that a writer finds comes from a crashed writer.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class Store:
     """A directory of published models.
 
     Args:
-        root: need not exist before the first publication.
-        lock_timeout: seconds that a writer waits for another.
-        max_weights_bytes: versions with a larger weights file are refused.
+        root: directory of the store; the first publication creates it.
+        lock_timeout: seconds that a writer waits for another writer.
+        max_weights_bytes: maximum size of a version's weights file.
     """
 
     def __init__(
@@ -72,18 +72,19 @@ class Store:
     # -- reading --------------------------------------------------------------------------------
 
     def names(self) -> tuple[str, ...]:
-        """Names of models with at least one version (or an unreadable folder), in order.
+        """Return the sorted names of models with a version or an unreadable folder.
 
         Raises:
-            StoreError: `unreadable` where the root is not a readable directory.
+            StoreError: `unreadable` if the root is not a readable directory.
         """
         return tuple(name for name in self._folders() if self._may_hold_versions(name))
 
     def versions(self, name: str) -> tuple[str, ...]:
-        """Published versions of a model, ascending; empty for an unknown model.
+        """Return the published versions of a model, ascending; empty for an unknown model.
 
-        A folder without a manifest is unfinished and does not count: the manifest is written last.
-        Anything else under a version's name counts, so that a broken one is seen and reported.
+        A folder without a manifest is unfinished and excluded, because the manifest is written
+        last. Any other entry with the name of a version is included, so that loading reports
+        broken versions.
 
         Raises:
             StoreError: `invalid_reference`, or `unreadable`.
@@ -98,17 +99,17 @@ class Store:
         return tuple(sorted(filter(is_version, found), key=version_key))
 
     def latest(self, name: str) -> str:
-        """The highest published version.
+        """Return the highest published version of a model.
 
         Raises:
             StoreError: `invalid_reference`, `unreadable`, or `unknown_model`.
         """
         if not (found := self.versions(name)):
-            raise StoreError("unknown_model", f"there is no model named '{name}'")
+            raise StoreError("unknown_model", f"no model has the name '{name}'")
         return found[-1]
 
     def aliases(self) -> Mapping[str, AliasTarget]:
-        """What each alias points at.
+        """Return the target of each alias.
 
         Raises:
             StoreError: `invalid_aliases`.
@@ -116,10 +117,10 @@ class Store:
         return MappingProxyType(read_aliases(self.root / _ALIASES))
 
     def resolve(self, reference: str) -> tuple[str, str]:
-        """The (name, version) that an alias, `name` or `name@version` points at.
+        """Return the (name, version) that an alias, `name` or `name@version` points at.
 
         Raises:
-            StoreError: see `resolve_reference`; `invalid_aliases`, or `unreadable`.
+            StoreError: see `resolve_reference`; also `invalid_aliases` or `unreadable`.
         """
         return resolve_reference(reference, self.aliases(), self.versions)
 
@@ -127,26 +128,28 @@ class Store:
         """Load and verify one version.
 
         Args:
-            name, version: as published.
+            name, version: name and version in the store.
             previous: see `load_artifact`.
 
         Raises:
-            ArtifactError: it cannot be used; `wrong_place` where it is another one's copy.
+            ArtifactError: the artifact is not valid; `wrong_place` if its manifest has another
+                name or version.
             StoreError: `invalid_reference`, `unreadable`, or `unknown_version`.
         """
         if check_version(version) not in self.versions(name):
-            raise StoreError("unknown_version", f"model '{name}' has no version {version}")
+            raise StoreError("unknown_version", f"model '{name}' does not have version {version}")
         folder = self.root / name / version
         artifact = load_artifact(folder, previous, self._max_weights_bytes)
         manifest = artifact.manifest
         if (manifest.name, manifest.version) != (name, version):
             raise ArtifactError(
-                "wrong_place", f"this is {manifest.name}@{manifest.version}, not {name}@{version}"
+                "wrong_place",
+                f"the manifest is that of {manifest.name}@{manifest.version}, not {name}@{version}",
             )
         return artifact
 
     def state(self) -> StoreState:
-        """What changes whenever a version or an alias does; no file is read for it."""
+        """Return a value that changes with every version or alias, without reading the files."""
         files = [self.root / _ALIASES]
         with suppress(StoreError):
             for name in self.names():
@@ -165,20 +168,21 @@ class Store:
         storage_dtype: StorageDtype = "float32",
         alias: str | None = None,
     ) -> Artifact:
-        """Make a version visible, once and for all, and point an alias at it.
+        """Publish a version for good, and optionally point an alias at it.
 
-        The artifact is written beside its place and loaded from there, so that nothing which the
-        service would refuse is ever published; then it is renamed, then the alias is moved.
+        The artifact is written to a temporary folder and loaded from there, so that a version which
+        the service would refuse is never published. Then the folder is renamed, and the alias
+        changed.
 
         Args:
             description, state, storage_dtype: see `write_artifact`.
-            alias: afterwards points at this very version.
+            alias: alias to point at this version.
 
         Returns:
             The published artifact, as a reader loads it.
 
         Raises:
-            ArtifactError: the artifact would be refused.
+            ArtifactError: the artifact is not valid.
             StoreError: `version_exists`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
                 `unsafe_path`, `locked`, or `not_writable`.
         """
@@ -187,7 +191,7 @@ class Store:
             check_name(alias, "alias")
         with self._writing():
             if name == alias or name in self.aliases():
-                raise StoreError("name_conflict", f"'{name}' would be a model and an alias")
+                raise StoreError("name_conflict", f"'{name}' cannot be both a model and an alias")
             if alias is not None:
                 self._require_no_model(alias)
             folder = self._prepare_folder(name)
@@ -212,17 +216,17 @@ class Store:
         *,
         expected: AliasTarget | Literal["any"] | None = "any",
     ) -> None:
-        """Point an alias at a version, or at the latest.
+        """Point an alias at a version, or at the latest version of a model.
 
         Args:
-            alias: created where there is none.
-            target: must exist.
-            expected: what the alias must point at now (None: nothing) for the change to happen.
+            alias: the alias; created if missing.
+            target: an existing version or model.
+            expected: required current target of the alias; None: the alias must not exist.
 
         Raises:
-            StoreError: `alias_conflict` where it points elsewhere by now; `unknown_model`,
-                `unknown_version`, `name_conflict`, `invalid_reference`, `invalid_aliases`,
-                `locked`, or `not_writable`.
+            StoreError: `alias_conflict` if the current target is not ``expected``;
+                `unknown_model`, `unknown_version`, `name_conflict`, `invalid_reference`,
+                `invalid_aliases`, `locked`, or `not_writable`.
         """
         check_name(alias, "alias")
         with self._writing():
@@ -232,15 +236,15 @@ class Store:
             self._write_alias(alias, target)
 
     def remove_alias(self, alias: str, *, expected: AliasTarget | Literal["any"] = "any") -> None:
-        """Forget an alias.
+        """Remove an alias.
 
         Raises:
-            StoreError: `unknown_model` where there is no such alias; else see `set_alias`.
+            StoreError: `unknown_model` if the alias does not exist; else see `set_alias`.
         """
         check_name(alias, "alias")
         with self._writing():
             if alias not in self.aliases():
-                raise StoreError("unknown_model", f"there is no alias named '{alias}'")
+                raise StoreError("unknown_model", f"no alias has the name '{alias}'")
             self._require_expected(alias, expected)
             self._write_alias(alias, None)
 
@@ -285,7 +289,7 @@ class Store:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Exclude other writers, and clear away what dead ones left."""
+        """Exclude other writers, and remove temporary files of crashed writers."""
         try:
             make_directory(self.root)
             with exclusive(self.root / _LOCK, self._lock_timeout):
@@ -307,7 +311,7 @@ class Store:
 
 
 def _appearance(path: Path) -> tuple[int, ...]:
-    """Inode, size and time of the last change; () for a missing file."""
+    """Return inode, size and modification time; () for a missing file."""
     try:
         status = path.lstat()
     except OSError:
@@ -316,7 +320,7 @@ def _appearance(path: Path) -> tuple[int, ...]:
 
 
 def _is_unfinished(version: Path) -> bool:
-    """A folder that can be read and holds no manifest."""
+    """Return whether a path is a readable folder without a manifest."""
     try:
         (version / MANIFEST).lstat()
     except FileNotFoundError:
@@ -327,7 +331,7 @@ def _is_unfinished(version: Path) -> bool:
 
 
 def _is_directory(path: Path) -> bool:
-    """A directory itself, not a link to one."""
+    """Return whether a path is a directory; False for a link to a directory."""
     try:
         return stat.S_ISDIR(path.lstat().st_mode)
     except OSError:

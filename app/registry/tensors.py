@@ -1,4 +1,4 @@
-"""Weights as stored: safetensors, half precision where the trainer asked for it, never a pickle."""
+"""Stored weights: a safetensors file, in half precision if the trainer chose it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from app.registry.manifest import WEIGHTS, TensorEntry
 StorageDtype = Literal["float16", "float32"]
 
 MAX_HEADER_BYTES: Final = 2**20
-"""Of the description of the tensors at the head of the file: about 10,000 tensors."""
+"""Maximum size of the header that lists the tensors; enough for about 10,000 tensors."""
 
 _DTYPES: Final = {
     "F16": "float16",
@@ -30,16 +30,17 @@ _DTYPES: Final = {
 def pack(
     state: Mapping[str, ArrayLike], storage_dtype: StorageDtype
 ) -> tuple[bytes, dict[str, TensorEntry]]:
-    """A machine's tensors as a safetensors file, and what the manifest says of them.
+    """Return the tensors as a safetensors file, and their entries in the manifest.
 
     Args:
-        state: numpy arrays or CPU tensors by name. Floating ones become `storage_dtype`, those with
-            at most one axis (biases, which are added unscaled) float32; others stay as they are.
-        storage_dtype: float16 halves the file at a relative error of 2^-11 a weight.
+        state: numpy arrays or CPU tensors by name. Floating-point arrays are stored as
+            `storage_dtype`, or as float32 if they have at most one axis (biases). Other arrays keep
+            their dtype.
+        storage_dtype: float16 halves the file, with a relative error of 2^-11 per weight.
 
     Raises:
-        ArtifactError: `not_finite`, also where a weight overflows float16 (beyond 65,504);
-            `invalid_tensor` for a dtype that artifacts do not hold.
+        ArtifactError: `not_finite`, also for a weight beyond the float16 maximum of 65,504;
+            `invalid_tensor` for a dtype that artifacts do not support.
     """
     arrays = {name: _stored(name, value, storage_dtype) for name, value in sorted(state.items())}
     entries = {
@@ -50,13 +51,13 @@ def pack(
 
 
 def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray[Any]]:
-    """The tensors of a safetensors file, floating ones as float32; writable copies.
+    """Return writable copies of the tensors of a safetensors file, floating-point as float32.
 
     Raises:
-        ArtifactError: `not_safetensors`; `too_large` where the header is; `wrong_shape` where
-            names, dtypes or shapes differ from the manifest's; `not_finite`.
+        ArtifactError: `not_safetensors`; `too_large` for a header over the limit; `wrong_shape` if
+            names, dtypes or shapes differ from the manifest; `not_finite`.
     """
-    # The file begins with the length of its header, 64 bits little-endian.
+    # The file begins with the length of its header: 64 bits, little-endian.
     if MAX_HEADER_BYTES < int.from_bytes(data[:8], "little") <= len(data):
         raise ArtifactError(
             "too_large", f"{WEIGHTS}: the header has more than {MAX_HEADER_BYTES} bytes"
@@ -76,7 +77,7 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
 def require_equal(
     found: Mapping[str, object], expected: Mapping[str, object], holds: str, says: str
 ) -> None:
-    """Compare tensors by name; raise ArtifactError (`wrong_shape`) naming the first difference."""
+    """Compare tensors by name; raise ArtifactError (`wrong_shape`) for the first difference."""
     for name in sorted(found.keys() | expected.keys()):
         if found.get(name) != expected.get(name):
             raise ArtifactError(
@@ -90,13 +91,16 @@ def _words(tensors: Mapping[str, object], name: str) -> str:
 
 
 def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray[Any]:
-    array = np.ascontiguousarray(value).reshape(np.shape(value))  # the former makes () into (1,)
+    # reshape(), because ascontiguousarray() turns shape () into (1,).
+    array = np.ascontiguousarray(value).reshape(np.shape(value))
     if np.issubdtype(array.dtype, np.floating):
         with np.errstate(over="ignore"):
             array = array.astype(storage_dtype if array.ndim > 1 else np.float32)
         _require_finite(name, array, f" in {array.dtype.name}")
     elif array.dtype.name not in _DTYPES.values():
-        raise ArtifactError("invalid_tensor", f"tensor '{name}' has dtype {array.dtype.name}")
+        raise ArtifactError(
+            "invalid_tensor", f"tensor '{name}' has the unsupported dtype {array.dtype.name}"
+        )
     return array
 
 
@@ -111,4 +115,4 @@ def _loaded(name: str, data: bytes, entry: TensorEntry) -> NDArray[Any]:
 
 def _require_finite(name: str, array: NDArray[Any], where: str) -> None:
     if not np.isfinite(array).all():
-        raise ArtifactError("not_finite", f"tensor '{name}' holds NaN or infinity{where}")
+        raise ArtifactError("not_finite", f"tensor '{name}' contains NaN or infinity{where}")

@@ -1,7 +1,7 @@
-"""Reading an artifact's directory: every file once, and nothing believed before its checksum.
+"""Reading the files of an artifact: each file is read once and checked against its checksum.
 
-What is parsed later is the bytes that were hashed here, so a file that is exchanged after the check
-changes nothing. Links are not followed: an artifact lies in its directory or not at all.
+Later steps parse the bytes that were hashed here, so replacing a file after the check has no
+effect. Symbolic links are not followed.
 """
 
 from __future__ import annotations
@@ -17,19 +17,22 @@ from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
 
 MAX_MANIFEST_BYTES: Final = 4 * 2**20
-"""Enough for about 20,000 classes: the manifest of 785 classes has 162 kB."""
+"""Maximum size of a manifest: enough for about 20,000 classes (162 kB for 785 classes)."""
 MAX_CARD_BYTES: Final = 2**20
 MAX_WEIGHTS_BYTES: Final = 2**30
-"""Default of the largest weights file; an operator may choose another."""
+"""Default maximum size of the weights file; an operator may choose another maximum."""
 
 
 @dataclass(frozen=True, slots=True)
 class VerifiedFiles:
-    """The contents of an artifact's files, each as its checksum promises.
+    """The contents of an artifact's files, verified by their checksums.
 
     Attributes:
-        digest: SHA-256 of the manifest's bytes, hexadecimal; it stands for all files, since the
+        manifest: the parsed manifest.
+        digest: SHA-256 of the manifest's bytes, hexadecimal. It identifies all files, because the
             manifest holds their checksums.
+        weights: bytes of the safetensors file.
+        card: the model card, Markdown.
     """
 
     manifest: Manifest
@@ -39,15 +42,15 @@ class VerifiedFiles:
 
 
 def read_verified(directory: Path, max_weights_bytes: int = MAX_WEIGHTS_BYTES) -> VerifiedFiles:
-    """Read an artifact's files.
+    """Read and verify the files of an artifact.
 
     Args:
-        directory: holds them.
-        max_weights_bytes: a larger weights file is refused before it is read.
+        directory: directory of the artifact.
+        max_weights_bytes: maximum size of the weights file, checked before it is read.
 
     Raises:
         ArtifactError: a file is missing, unexpected, unreadable, too large, truncated or altered,
-            or the manifest is not one that this release reads.
+            or this release cannot read the manifest.
     """
     try:
         folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -79,17 +82,17 @@ def _require_no_other_file(folder: int) -> None:
         raise ArtifactError("unreadable", f"the artifact's directory: {cause(error)}") from None
     if extra:
         names = ", ".join(sorted(ascii(name) for name in extra))
-        raise ArtifactError("unexpected_file", f"not part of an artifact: {names}")
+        raise ArtifactError("unexpected_file", f"the directory has unexpected files: {names}")
 
 
 def _require_size(name: str, size: int, limit: int) -> None:
     if size > limit:
-        raise ArtifactError("too_large", f"{name} is over {limit} bytes")
+        raise ArtifactError("too_large", f"{name} has more than {limit} bytes")
 
 
 def _read(folder: int, name: str, limit: int) -> bytes:
-    """The file, up to limit + 1 bytes: one more than allowed shows that it is too long."""
-    # Without O_NONBLOCK, opening a FIFO put in a file's place would wait for ever.
+    """Read at most limit + 1 bytes of a file; the extra byte shows that it is too long."""
+    # Without O_NONBLOCK, opening a FIFO in place of the file would block forever.
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
         descriptor = os.open(name, flags, dir_fd=folder)
@@ -102,7 +105,7 @@ def _read(folder: int, name: str, limit: int) -> bytes:
         if not stat.S_ISREG(status.st_mode):
             raise ArtifactError("unreadable", f"{name} is not a regular file")
         with os.fdopen(descriptor, "rb", closefd=False) as file:
-            # The buffer is allocated at once: as large as the file, whatever a manifest claims.
+            # read() allocates its buffer at once, so the size of the real file bounds it.
             return file.read(min(status.st_size, limit) + 1)
     except OSError as error:
         raise ArtifactError("unreadable", f"{name}: {cause(error)}") from None
@@ -114,7 +117,7 @@ def _read_checked(folder: int, name: str, entry: FileEntry, limit: int) -> bytes
     _require_size(name, entry.bytes, limit)
     data = _read(folder, name, entry.bytes)
     if len(data) < entry.bytes:
-        raise ArtifactError("truncated", f"{name} has {len(data)} bytes of {entry.bytes}")
+        raise ArtifactError("truncated", f"{name} has only {len(data)} of {entry.bytes} bytes")
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise ArtifactError("checksum_mismatch", f"{name} does not match its checksum")
     return data

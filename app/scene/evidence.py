@@ -1,8 +1,7 @@
-"""What a scene tells a model of classes.
+"""From the instances of a scene to evidence about classes.
 
-Models speak of classes, scenes of instances: r[a, x, y] says that *some* instance of class x stands
-in relation a to some instance of class y. A pair of instances that is not listed never makes it
-false.
+Models know classes, and scenes contain instances. r[a, x, y] is on if *some* instance of class x
+stands in relation a to some instance of class y. An unlisted pair of instances never turns it off.
 """
 
 from __future__ import annotations
@@ -22,14 +21,15 @@ Places = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClassEvidence:
-    """The n distinct classes of a scene and what is known of their relations.
+    """The n distinct classes of a scene and their observed relations.
 
     Attributes:
         classes: (n,) int64, ascending, distinct.
-        counts: (n,) int64, instances of each class.
-        confidence: (n,) float64 in (0, 1], probability that at least one instance is there.
-        holds: (A, n, n) bool, observed on. ``holds[a, x, y]``: classes[x] stands so to classes[y].
-        observed: (A, n, n) bool, observed on or off; ``holds`` implies ``observed``.
+        counts: (n,) int64, number of instances of each class.
+        confidence: (n,) float64 in (0, 1], probability that at least one instance exists.
+        holds: (A, n, n) bool, relations observed on. ``holds[a, x, y]``: classes[x] stands in
+            relation a to classes[y].
+        observed: (A, n, n) bool, relations observed on or off; ``holds`` implies ``observed``.
         room_type: index of the room type, or None.
     """
 
@@ -48,22 +48,22 @@ def pool_instances(
     observed: NDArray[np.bool_],
     room_type: int | None = None,
 ) -> ClassEvidence:
-    """OR over instances.
+    """Pool instances into classes by OR.
 
-    A class-level relation is on if it holds for one pair of instances; it is observed off if it
-    was observed for at least one pair and holds for none; otherwise it is unobserved. A class with
-    a single instance has no pair with itself: its (x, x) relations stay unobserved.
+    A relation between classes is on if it holds for one pair of instances. It is off if it was
+    observed for at least one pair and holds for none. Otherwise it is unobserved. The relations of
+    a class to itself stay unobserved if it has a single instance.
 
     Args:
         classes: (N,) class of each instance.
-        confidence: (N,) probability that the instance is there. Instances are taken as independent
-            detections: a class is there with probability 1 - prod(1 - confidence).
+        confidence: (N,) probability that the instance exists. Instances count as independent
+            detections: a class exists with probability 1 - prod(1 - confidence).
         holds: (A, N, N) relations that hold between instances.
-        observed: (A, N, N) relations of instances that were observed, on or off.
-        room_type: passed through.
+        observed: (A, N, N) relations between instances that were observed, on or off.
+        room_type: index of the room type, or None.
 
     Raises:
-        ValueError: shapes that do not fit each other.
+        ValueError: the shapes do not match.
     """
     size = len(classes)
     for name, array in (("holds", holds), ("observed", observed)):
@@ -81,11 +81,11 @@ def pool_instances(
 def pool_classes(
     classes: NDArray[np.int64], confidence: NDArray[np.float64]
 ) -> tuple[Places, Places, Places, Places, NDArray[np.float64]]:
-    """The n distinct classes of N instances, ascending.
+    """Return the n distinct classes of N instances, ascending.
 
     Returns:
-        The classes, the first instance of each, the place of each instance's class (N,), how many
-        instances each has, and the probability that at least one is there.
+        (n,) classes, (n,) first instance of each class, (N,) position of each instance's class,
+        (n,) number of instances, and (n,) probability that at least one instance exists.
     """
     distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
     counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
@@ -104,10 +104,16 @@ def pool_classes(
 def pooled(
     row: NDArray[np.int64], n: int, holds: NDArray[np.bool_], observed: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Relations of instances (A, N, N), which hold and which were observed, by class, (A, n, n).
+    """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
 
     Args:
-        row: (N,) the class of each instance, of n.
+        row: (N,) position of each instance's class.
+        n: number of classes.
+        holds: (A, N, N) relations that hold.
+        observed: (A, N, N) observed relations.
+
+    Returns:
+        ``holds`` and ``observed`` of the classes.
     """
     size = len(row)
     on, seen = np.zeros((A, n, n), np.bool_), np.zeros((A, n, n), np.bool_)
@@ -121,11 +127,11 @@ def pooled(
 
 
 def class_evidence(scene: Scene) -> ClassEvidence:
-    """The evidence a scene gives; instances outside the vocabulary are left out.
+    """Return the evidence of a scene, without instances outside the vocabulary.
 
-    Relations derived from poses (``scene.poses``) are on or off for neighbours and unobserved
-    beyond. Relations that were given are on; all others are unobserved, or off where the scene says
-    that its relations are complete.
+    Relations derived from poses (``scene.poses``) are on or off for neighbours, and unobserved for
+    other pairs. Stated relations are on. All other relations are unobserved, or off if the stated
+    relations are complete.
     """
     kept = [i for i, thing in enumerate(scene.objects) if thing.class_index is not None]
     size = len(kept)
@@ -138,7 +144,7 @@ def class_evidence(scene: Scene) -> ClassEvidence:
 
 
 def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which relations hold between the N instances of a scene, and which are known, (A, N, N)."""
+    """Return the relations between the N instances that hold and that are observed, (A, N, N)."""
     if scene.poses is not None:
         return scene.poses.holds, scene.poses.observed
     size = len(scene.objects)

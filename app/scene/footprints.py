@@ -1,7 +1,7 @@
-"""Overlap and gap of turned rectangles.
+"""Overlap and gap of rotated rectangles, exact up to rounding.
 
-Exact up to rounding. Two rectangles turned by a multiple of 90 degrees against each other share
-axes, and intervals answer; the others are cut along their edges.
+If the angle between two rectangles is a multiple of 90 degrees, intervals along the common axes
+are enough. Otherwise each rectangle is clipped along the edges of the other.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from app.compiling import compiled
 
 Array = NDArray[np.float64]
 
-# Radians below which two rectangles count as parallel. Only parallel edges can coincide, so that
-# cutting along edges, which would count a shared edge twice, never meets one.
+# Angle in radians below which two rectangles count as parallel. Clipping would count a shared edge
+# twice, but only parallel rectangles can share an edge.
 _PARALLEL: Final = 1e-6
-# In place of edges of no length, which nothing can be divided by.
+# Replaces an edge length of 0, to avoid division by zero.
 _SHORTEST: Final = 1e-150
 _QUARTER: Final = math.pi / 2
 
@@ -27,16 +27,16 @@ _QUARTER: Final = math.pi / 2
 def overlap_and_gap(
     centre_a: Array, size_a: Array, yaw_a: Array, centre_b: Array, size_b: Array, yaw_b: Array
 ) -> tuple[Array, Array]:
-    """Overlap and gap of P pairs of rectangles a, b.
+    """Compute overlap and gap of P pairs of rectangles a, b.
 
     Args:
-        centre_a, centre_b: (P, 2).
+        centre_a, centre_b: (P, 2) centres.
         size_a, size_b: (P, 2) extents along the rectangles' own axes.
-        yaw_a, yaw_b: (P,) turns in radians.
+        yaw_a, yaw_b: (P,) rotations in radians.
 
     Returns:
         (P,) area of the intersection as a share of the smaller area, and (P,) distance between the
-        rectangles, 0 where they touch.
+        rectangles, 0 if they touch.
     """
     share, gap = np.empty(len(yaw_a)), np.empty(len(yaw_a))
     rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
@@ -54,8 +54,8 @@ def _measure_pairs(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b, share, gap)
 
 @compiled
 def measure(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b):
-    """Overlap and gap of one pair; of centres and sizes the first two numbers count."""
-    # In b's axes b is the box |x| <= half_b[0], |y| <= half_b[1] around the origin.
+    """Compute overlap and gap of one pair; only x and y of centres and sizes are used."""
+    # In the axes of b, b is the box |x| <= half_b[0], |y| <= half_b[1] around the origin.
     offset = _turn_back(
         (centre_a[0] - centre_b[0], centre_a[1] - centre_b[1]), math.cos(yaw_b), math.sin(yaw_b)
     )
@@ -65,14 +65,14 @@ def measure(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b):
     if not abs(yaw - quarters * _QUARTER) < _PARALLEL:
         area, gap = _skew(offset, half_a, math.cos(yaw), math.sin(yaw), half_b)
     elif quarters / 2 != np.rint(quarters / 2):
-        # A quarter turn exchanges the extents.
+        # A rotation by 90 degrees exchanges the extents.
         area, gap = _parallel(offset, (half_a[1], half_a[0]), half_b)
     else:
         area, gap = _parallel(offset, half_a, half_b)
     smaller = min(size_a[0] * size_a[1], size_b[0] * size_b[1])
     if smaller > 0.0:
         return area / smaller, gap
-    # An area too small for a float is a point's, and lies wholly in what it touches.
+    # A rectangle with an area of 0 counts as a point: it overlaps fully with what it touches.
     return 1.0 if gap == 0.0 else 0.0, gap
 
 
@@ -87,9 +87,9 @@ def _parallel(offset, half_a, half_b):
 
 @compiled
 def _skew(offset, half_a, cos, sin, half_b):
-    """Area and gap by edges: each rectangle's corners in the axes of the other."""
-    # Green's theorem: the border of the intersection is made of a's edges inside b and b's edges
-    # inside a; each part adds cross(p, q) / 2, taken about one common origin, the centre of b.
+    """Compute area and gap from the edges of each rectangle in the axes of the other."""
+    # Green's theorem: the border of the intersection consists of the edges of a inside b and the
+    # edges of b inside a. Each part p-q adds cross(p, q) / 2, with the centre of b as origin.
     swept_a, swept_b, gap = 0.0, 0.0, math.inf
     for k in range(4):
         start, end = _corner(half_a, k), _corner(half_a, k + 1)
@@ -97,12 +97,12 @@ def _skew(offset, half_a, cos, sin, half_b):
         end = _moved(_turn(end, cos, sin), offset)
         p, q = _inside(start, end, half_b)
         swept_a += p[0] * q[1] - p[1] * q[0]
-        # Disjoint convex polygons are nearest at a corner of one of them.
+        # The shortest distance of disjoint convex polygons starts at a corner of one of them.
         gap = min(gap, _distance(start, half_b))
     back = (-offset[0], -offset[1])
     for k in range(4):
         start, end = _corner(half_b, k), _corner(half_b, k + 1)
-        # b's corners in a's axes.
+        # Corners of b in the axes of a.
         start = _turn_back(_moved(start, back), cos, sin)
         end = _turn_back(_moved(end, back), cos, sin)
         p, q = _inside(start, end, half_a)
@@ -116,7 +116,7 @@ def _skew(offset, half_a, cos, sin, half_b):
 
 @compiled
 def _corner(half, k):
-    """Corner k of a box around the origin, counter-clockwise."""
+    """Return corner k of a box around the origin, counter-clockwise."""
     k = k % 4
     return (half[0] if k in (0, 3) else -half[0], half[1] if k < 2 else -half[1])
 
@@ -138,10 +138,12 @@ def _turn_back(point, cos, sin):
 
 @compiled
 def _inside(start, end, half):
-    """The ends of the part of an edge inside the box (Liang & Barsky 1984); they fall together
-    where no part is."""
-    # The edges are skew to the box, so a component of `along` is zero only where all its length was
-    # lost to rounding; such an edge bounds no area wherever it is cut.
+    """Clip an edge to a box and return the two ends (Liang & Barsky 1984).
+
+    The two ends are equal if the edge lies outside the box.
+    """
+    # The edges are skew to the box, so x or y is 0 only for an edge that rounding has made
+    # infinitely short. Such an edge adds no area.
     x, y = end[0] - start[0] or _SHORTEST, end[1] - start[1] or _SHORTEST
     one_x, other_x = (-half[0] - start[0]) / x, (half[0] - start[0]) / x
     one_y, other_y = (-half[1] - start[1]) / y, (half[1] - start[1]) / y
@@ -156,5 +158,5 @@ def _inside(start, end, half):
 
 @compiled
 def _distance(point, half):
-    """From a point to a box around the origin."""
+    """Return the distance from a point to a box around the origin."""
     return math.hypot(max(abs(point[0]) - half[0], 0.0), max(abs(point[1]) - half[1], 0.0))

@@ -1,4 +1,4 @@
-"""Coordinate frames of robots (ROS REP 103 and REP 105) to body axes: x forward, y left, z up."""
+"""Conversion of robot frames (ROS REP 103, REP 105) to body axes: x forward, y left, z up."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ Vector = tuple[float, float, float]
 Axes = tuple[Vector, Vector, Vector]
 Quaternion = tuple[float, float, float, float]
 
-# Frames that are fixed to the world: where the viewer stands in them must be said.
+# Frames that are fixed to the world. They do not define the viewer, so a request needs a viewpoint.
 WORLD_FRAMES = frozenset({"map", "odom", "world"})
 
-# Farther than this from length 1 a quaternion is a mistake, not rounding.
+# Maximum difference of a quaternion's length from 1 that counts as rounding.
 _NORM_TOLERANCE = 0.01
 
 
 def is_optical(frame_id: str) -> bool:
-    """Whether a frame has optical axes: z forward, x right, y down."""
+    """Return whether a frame has optical axes: z forward, x right, y down."""
     return _plain(frame_id).endswith(("_optical", "_optical_frame"))
 
 
 def is_world_fixed(frame_id: str) -> bool:
-    """Whether a frame is fixed to the world ("map", "robot_1/odom"): its origin is not a viewer."""
+    """Return whether a frame is fixed to the world ("map", "robot_1/odom"), not to a viewer."""
     return _plain(frame_id).rpartition("/")[2] in WORLD_FRAMES
 
 
 def _plain(frame_id: str) -> str:
-    # "MAP" and "map " are not body frames: read as such they would give wrong answers silently.
+    # "MAP" and "map " also mean "map"; treated as body frames, they would give wrong relations.
     return frame_id.strip().casefold()
 
 
@@ -37,20 +37,20 @@ def body_pose(
     *,
     optical: bool = False,
 ) -> tuple[Vector, Vector | None, float]:
-    """A box of a frame as an upright box in body axes: position, size and yaw.
+    """Convert a box of a frame to an upright box in body axes: position, size and yaw.
 
-    A box may be given lying on its side, and in an optical frame an unturned box has its y axis
-    vertical: whichever of its axes is nearest to the vertical becomes z, the extents are reordered
-    to match, and what remains of a tilt is dropped. The optical axis is taken to be level.
+    The axis of the box nearest to the vertical becomes z, and the extents are reordered to match.
+    So a box may lie on its side, or have a vertical y axis, as in optical frames. Any remaining
+    tilt is ignored. The optical axis is assumed to be horizontal.
 
     Args:
         position: centre in the frame.
         size: extents along the box's own axes, or None.
-        orientation: quaternion (x, y, z, w) from the box's axes to the frame; None = unturned.
-        optical: the frame has optical axes.
+        orientation: quaternion (x, y, z, w) from the box's axes to the frame; None: not rotated.
+        optical: whether the frame has optical axes.
 
     Raises:
-        ValueError: the quaternion is not of length 1.
+        ValueError: the length of the quaternion is not 1.
     """
     if orientation is None and not optical:
         return position, size, 0.0
@@ -59,7 +59,7 @@ def body_pose(
         position = _from_optical(position)
         first, second, third = map(_from_optical, (first, second, third))
     rises = abs(first[2]), abs(second[2]), abs(third[2])
-    # Of axes that are equally near to the vertical the last one.
+    # If several axes are equally near to the vertical, the last one becomes z.
     if rises[2] >= max(rises):
         up, ahead, aside, heading = 2, 0, 1, first
     elif rises[1] >= rises[0]:
@@ -72,14 +72,14 @@ def body_pose(
 
 
 def viewer_axes(frame_id: str | None = None, yaw: float | None = None) -> Axes | None:
-    """The viewer's axes (x away, y left, z up) as vectors of a frame.
+    """Return the viewer's axes (x away, y left, z up) as vectors of a frame.
 
     Args:
-        frame_id: of an optical frame, of one fixed to the world, or of body axes; None = body axes.
-        yaw: where the viewer looks; None = along x.
+        frame_id: name of the frame; None: body axes.
+        yaw: viewing direction in radians; None: along x.
 
     Returns:
-        None in a frame fixed to the world without a viewing direction.
+        The three axes; None for a world-fixed frame without a viewing direction.
     """
     if frame_id is not None and yaw is None and is_world_fixed(frame_id):
         return None
@@ -106,11 +106,11 @@ def _to_optical(vector: Vector) -> Vector:
 
 
 def _rotation(quaternion: Quaternion) -> tuple[Vector, ...]:
-    """The box's axes as vectors of the frame."""
+    """Return the axes of a box as vectors of the frame."""
     x, y, z, w = quaternion
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if not abs(norm - 1.0) <= _NORM_TOLERANCE:
-        raise ValueError(f"orientation must be a quaternion of length 1, not of length {norm:g}")
+        raise ValueError(f"orientation must be a quaternion of length 1, but has length {norm:g}")
     x, y, z, w = x / norm, y / norm, z / norm, w / norm
     xx, yy, zz = x * x, y * y, z * z
     xy, xz, yz, xw, yw, zw = x * y, x * z, y * z, x * w, y * w, z * w

@@ -1,21 +1,22 @@
-"""Poses to relations: the one rule set of training and serving.
+"""From poses to relations: the same rules for training and serving.
 
-Viewer axes: x away from the viewer, y to the left, z up; metres and radians. Boxes stand upright;
-their footprint is the rectangle of the horizontal extents, turned by the yaw.
+Viewer axes: x away from the viewer, y to the left, z up; metres and radians. Boxes stand upright.
+Their footprint is the rectangle of the horizontal extents, rotated by the yaw.
 
 1. *on-top*(i, j): the footprints overlap by at least 30 % of the smaller one and the bottom of i is
    within 5 cm of the top of j.
-2. *above*(i, j): the same overlap, the bottom of i more than 5 cm over the top of j.
+2. *above*(i, j): the same overlap, and the bottom of i is more than 5 cm above the top of j.
 3. Otherwise, for neighbours, the larger of the offsets |dx|, |dy| between the centres decides:
-   *left* is larger y, *front* is nearer (smaller x). Offsets under 10 cm decide nothing.
+   *left* means larger y, *front* means nearer (smaller x). If that offset is under 10 cm, the pair
+   has no relation.
 
-Neighbours are boxes whose footprints are at most 1 m apart or, where a size is unknown, whose
-centres are at most 1.5 m apart in the horizontal plane. What the rules leave open is settled here
-so that no pair is contradictory: equal offsets count as sideways; of two thin boxes that would each
-lie on the other, the one with the higher centre does, and neither if the centres are level.
+Neighbours are boxes whose footprints are at most 1 m apart. If a size is unknown, the centres must
+be at most 1.5 m apart in the horizontal plane. Two further rules exclude contradictions. Equal
+offsets count as sideways. If two thin boxes would each lie on the other, the box with the higher
+centre lies on the other; with equal centres, neither does.
 
-Every relation of a pair of neighbours is observed, so a pair in a vertical relation is observed not
-to be in a horizontal one. Vertical relations need both sizes, and stay unobserved without them.
+Every relation of a pair of neighbours is observed, so a vertical relation implies that the
+horizontal relations are observed off. Without both sizes, vertical relations stay unobserved.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ NEIGHBOUR_GAP: Final = 1.0  # m between footprints
 NEIGHBOUR_DISTANCE: Final = 1.5  # m between centres, sizes unknown
 MIN_OFFSET: Final = 0.10  # m between centres
 
-_NONE: Final = -1  # in place of a relation
+_NONE: Final = -1  # index for "no relation"
 
 Array = NDArray[np.float64]
 Rows = Array | Sequence[Sequence[float]]
 
 
 class Viewpoint(NamedTuple):
-    """Where the viewer stands: x and y in metres, heading yaw in radians."""
+    """Position and heading of the viewer: x and y in metres, yaw in radians."""
 
     x: float
     y: float
@@ -54,7 +55,7 @@ class Viewpoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseRelations:
-    """Relations of n instances.
+    """Relations between n instances, derived from poses.
 
     Attributes:
         holds: (A, n, n) bool; ``holds[a, i, j]``: instance i stands in relation a to instance j.
@@ -68,12 +69,12 @@ class PoseRelations:
 def to_viewer_frame(
     positions: Rows, viewpoint: Viewpoint, yaws: ArrayLike | None = None
 ) -> tuple[Array, Array]:
-    """Positions (n, 3) and yaws (n,) as seen from ``viewpoint``; heights stay as they are.
+    """Convert positions (n, 3) and yaws (n,) to the axes of ``viewpoint``; heights stay unchanged.
 
-    Without ``yaws`` the boxes are taken to stand along the axes of the given frame.
+    Without ``yaws``, the boxes are aligned with the axes of the frame.
 
     Raises:
-        ValueError: wrong shapes, or a viewpoint that is not finite.
+        ValueError: a shape is wrong, or the viewpoint is not finite.
     """
     points = _array("positions", positions, (len(positions), 3))
     turns = np.zeros(len(points)) if yaws is None else _array("yaws", yaws, (len(points),))
@@ -92,17 +93,17 @@ def derive_relations(
     *,
     horizontal: bool = True,
 ) -> PoseRelations:
-    """The relations between n boxes by the rules of this module.
+    """Derive the relations between n boxes by the rules of this module.
 
     Args:
-        positions: (n, 3) centres in viewer axes; a row with NaN is a thing without a position, and
-            nothing about it is observed.
-        sizes: (n, 3) extents before the yaw; a row with NaN is a thing without a size.
-        yaws: (n,) turn of each box about z; all zero by default.
-        horizontal: False where the viewer is unknown: left and front stay unobserved.
+        positions: (n, 3) centres in viewer axes. A row with NaN means an unknown position; the
+            relations of this box stay unobserved.
+        sizes: (n, 3) extents before the rotation. A row with NaN means an unknown size.
+        yaws: (n,) rotation of each box about z in radians; zeros by default.
+        horizontal: False if the viewer is unknown; left and front then stay unobserved.
 
     Raises:
-        ValueError: wrong shapes, infinite values, or sizes that are not positive.
+        ValueError: a shape is wrong, a value is infinite, or a size is not positive.
     """
     points = _array("positions", positions, (len(positions), 3))
     n = len(points)
@@ -120,7 +121,7 @@ def derive_relations(
 
 @compiled
 def _are_finite(points, extents, turns):
-    """Or NaN, which only a yaw must not be."""
+    """Return whether no value is infinite and no yaw is NaN."""
     for i in range(len(points)):
         for k in range(3):
             if math.isinf(points[i, k]) or math.isinf(extents[i, k]):
@@ -132,7 +133,7 @@ def _are_finite(points, extents, turns):
 
 @compiled
 def _are_positive(extents):
-    """Or NaN."""
+    """Return whether all extents are positive or NaN."""
     for i in range(len(extents)):
         for k in range(3):
             if extents[i, k] <= 0.0:
@@ -155,7 +156,7 @@ def _relate_all(points, extents, turns, horizontal, holds, observed):
             boxed, stacked = sized[i] and sized[j], False
             if not boxed:
                 neighbours = distance <= NEIGHBOUR_DISTANCE
-            # Rectangles are measured only where the circles around them come near enough.
+            # Measuring rectangles is slow: first check the circles around them.
             elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
                 share, gap = measure(
                     points[i], extents[i], turns[i], points[j], extents[j], turns[j]
@@ -174,8 +175,8 @@ def _is_known(row):
 
 @compiled
 def _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed):
-    """Enter the relations of two neighbours."""
-    # Left and front come before on-top and above.
+    """Set the relations of two neighbours."""
+    # Order of the relations: left, front, on-top, above.
     first, last = LEFT if horizontal else ON_TOP, ABOVE if boxed else FRONT
     for relation in range(first, last + 1):
         observed[relation, i, j] = observed[relation, j, i] = True
@@ -194,7 +195,7 @@ def _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed):
 
 @compiled
 def _vertical(points, extents, i, j):
-    """The relation of i to j, the footprint of which it overlaps."""
+    """Return the vertical relation of i to j; their footprints overlap."""
     lift = (points[i, 2] - extents[i, 2] / 2) - (points[j, 2] + extents[j, 2] / 2)
     if lift > CONTACT:
         return ABOVE
@@ -205,7 +206,7 @@ def _vertical(points, extents, i, j):
 
 @compiled
 def _horizontal(points, i, j):
-    """The relation of i to j, its neighbour."""
+    """Return the horizontal relation of i to its neighbour j."""
     nearer, aside = points[j, 0] - points[i, 0], points[i, 1] - points[j, 1]
     if abs(aside) >= abs(nearer):
         return LEFT if aside >= MIN_OFFSET else _NONE

@@ -1,11 +1,11 @@
-"""How labels are compared: one key for every spelling of a name.
+"""Comparison of labels: one key for all spellings of a name.
 
-Detectors, annotators and programmers write one thing in many ways ("Trash_Cans", "trash can",
-"trashcan"). `label_key` folds case, separators and a final plural, so that equal keys mean the same
-label. Synonyms ("tv", "television") are the business of alias tables, not of spelling.
+Detectors, annotators and programmers spell a name in many ways ("Trash_Cans", "trash can",
+"trashcan"). `label_key` removes differences of case, separators and a final plural, so that equal
+keys mean the same label. Alias tables handle synonyms ("tv", "television").
 
-`head_of` names the thing of a phrase with "of": a bottle of milk is a bottle, a pair of shoes is
-shoes.
+`head_of` returns the object in a phrase with "of": a "bottle of milk" is a bottle, and a "pair of
+shoes" is shoes.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Final
 
 _SEPARATORS: Final = re.compile(r"[\s_\-./'’‐-―]+")
 
-# Endings that are no plural, or whose singular is another thing or no word: also in compounds
-# ("rain pants", "camera lens").
+# Endings that are not plurals, or whose singular has another meaning or does not exist. They also
+# occur in compounds ("rain pants", "camera lens").
 _NOT_PLURAL_ENDINGS: Final = (
     *("ss", "us", "is"),
     *("clothes", "pants", "jeans", "shorts", "trousers", "tights", "overalls", "pyjamas"),
@@ -26,9 +26,9 @@ _NOT_PLURAL_ENDINGS: Final = (
     *("sunglasses", "eyeglasses", "readingglasses", "safetyglasses"),
     *("canvas", "lens", "thermos", "atlas", "christmas"),
 )
-# The same for whole words: a wine glass has the plural "wine glasses", but "glasses" are worn.
+# The same for whole words: "wine glasses" is a plural, but "glasses" alone means spectacles.
 _NOT_PLURAL: Final = frozenset({"glasses", "gas", "news", "series", "vhs", "gps", "ups"})
-# Plurals that no rule below forms, recognised at the end of a compound ("bookshelves").
+# Plurals outside the rules below, also recognised at the end of a compound ("bookshelves").
 _IRREGULAR: Final = (
     ("shelves", "shelf"),
     ("knives", "knife"),
@@ -63,7 +63,7 @@ _IRREGULAR_ENDINGS: Final = tuple(plural for plural, _ in _IRREGULAR)
 
 
 _OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
-# A container with its contents is the container; a collection is its members.
+# "bottle of milk" means the container; "pile of books" means the members of the collection.
 _CONTAINERS: Final = frozenset(
     (
         *("bag", "basket", "bottle", "bowl", "box", "bucket", "can", "canister", "carton"),
@@ -75,9 +75,9 @@ _COLLECTIONS: Final = frozenset({"bunch", "pair", "piece", "pile", "row", "slice
 
 
 def head_of(label: str) -> str | None:
-    """The thing that a phrase names: "bottle of milk" is "bottle", "pile of books" is "books".
+    """Return the object in a phrase: "bottle" for "bottle of milk", "books" for "pile of books".
 
-    None where the label is another phrase.
+    Other labels give None.
     """
     parts = _OF.split(label, maxsplit=1)
     if len(parts) != 2:
@@ -89,10 +89,10 @@ def head_of(label: str) -> str | None:
 
 
 def singular(word: str) -> str:
-    """The singular of a folded English noun; a word that is not a plural is returned as it is.
+    """Return the singular of a folded English noun; other words are returned unchanged.
 
-    Regular endings (-ies, -ches, -shes, -xes, -sses, -oes, -s) and a short list of irregular ones.
-    Compared with a general inflection library in docs/decisions/data.md.
+    Covers regular endings (-ies, -ches, -shes, -xes, -sses, -oes, -s) and a short list of irregular
+    plurals. docs/decisions/data.md compares it with a general inflection library.
     """
     if word.endswith(_IRREGULAR_ENDINGS):
         for plural, single in _IRREGULAR:
@@ -114,25 +114,25 @@ def singular(word: str) -> str:
     return singular(stem)  # "childrens" is a double plural
 
 
-# The models of a store name mostly the same classes.
+# Cached, because the models of a store mostly share their classes.
 @lru_cache(maxsize=4096)
 def label_key(label: str) -> str:
-    """The key under which every spelling of ``label`` is found; idempotent.
+    """Return the key that all spellings of ``label`` share; idempotent.
 
-    Case, compatibility characters, separators (whitespace, ``_ - . / '``) and a final plural are
-    folded away: "Night-Stands", "night_stand" and "nightstand" share the key "nightstand". A label
-    of separators alone has the empty key.
+    The key ignores case, compatibility characters, separators (whitespace, ``_ - . / '``) and a
+    final plural: "Night-Stands", "night_stand" and "nightstand" have the key "nightstand". A label
+    that consists of separators only has the empty key.
     """
     if label.isascii():
         return singular(_SEPARATORS.sub("", label.casefold()))
-    # Folding can leave text that folds further: a spaced accent joins its letter, and so on.
+    # Repeated, because a fold can enable another one: a separate accent joins its letter.
     while (folded := _fold_unicode(label)) != label:
         label = folded
     return label
 
 
 def split_words(label: str) -> tuple[str, ...]:
-    """The words of a label in the singular, folded as in `label_key`."""
+    """Return the words of a label in the singular, folded as in `label_key`."""
     folded = unicodedata.normalize("NFKC", label).casefold()
     return tuple(singular(word) for word in _SEPARATORS.split(folded) if word)
 

@@ -1,12 +1,12 @@
-"""The known names nearest to an unknown one, by spelling and by common words.
+"""The known names nearest to an unknown name, by spelling and by common words.
 
     spelling   1 - edits / length of the longer name; two exchanged letters are one edit
-    words      the same last word, and how many of the others are shared: "coffee mug" is a "mug"
+    words      same last word, plus the share of other common words: "coffee mug" is a "mug"
 
-The similarity of two names is the larger of the two. Words for size, colour and material are passed
-over where the whole name finds less: a "big lamp" is a "lamp". Word vectors are left out: the class
-with the largest cosine is right for 40 % of held-out aliases, and at no cosine for 85 % or more
-(GloVe 6B, 100 dimensions, 20,000 words).
+The similarity of two names is the larger of the two values. A second search ignores words for
+size, colour and material: a "big lamp" is a "lamp". Word vectors are not used. The class with the
+largest cosine is right for only 40 % of held-out aliases, and a minimum cosine does not raise this
+to 85 % (GloVe 6B, 100 dimensions, 20,000 words).
 """
 
 from __future__ import annotations
@@ -20,21 +20,24 @@ from rapidfuzz.distance import OSA
 from app.scene.labels import split_words
 
 ACCEPTED: Final = 0.8
-"""From this similarity on the nearest name may stand for the unknown one.
+"""Minimum similarity at which the nearest name replaces an unknown name.
 
-The lowest multiple of .05 at which 90 % of the mappings are right, of held-out aliases and
-misspelt names of the `indoor` vocabulary together: 2724 of 2895; of held-out aliases alone 572 of
-727.
+It is the lowest multiple of 0.05 at which 90 % of the mappings are right. Measured on held-out
+aliases and misspelt names of the `indoor` vocabulary: 2724 of 2895 mappings are right. For held-out
+aliases alone: 572 of 727.
 """
 
 LONGEST: Final = 64
-"""Characters of a name whose spelling is compared, after folding: one character may become 18. No
-class has a name half as long, and the cost of a comparison grows with the length."""
+"""Maximum length, after folding, of a name whose spelling is compared.
 
-_LEAST: Final = 0.6  # "asdf" is not a misspelt "scarf"
-_BY_KIND: Final = 0.95  # of a name without its words for looks
-_BY_REST: Final = 0.9  # people rarely mistype the first letter: a pocket is not a socket
-_FARTHER: Final = 0.1  # a suggestion this much less similar than the best one is noise
+The cost of a comparison grows with the length, and folding can turn one character into 18. All
+names of classes have fewer than 32 characters.
+"""
+
+_LEAST: Final = 0.6  # minimum similarity: "asdf" is not a misspelt "scarf"
+_BY_KIND: Final = 0.95  # factor for a name without its words for size, colour and material
+_BY_REST: Final = 0.9  # factor for another first letter, which people rarely mistype
+_FARTHER: Final = 0.1  # maximum distance of a suggestion from the best similarity
 
 
 _LOOKS: Final = frozenset(
@@ -45,17 +48,17 @@ _LOOKS: Final = frozenset(
 
 
 class Match(NamedTuple):
-    """A known entry and its similarity, in [0, 1]."""
+    """Index of a known entry, and its similarity in [0, 1]."""
 
     entry: int
     similarity: float
 
 
 class NameIndex:
-    """Finds entries by names like theirs.
+    """Search for entries with similar names.
 
     Args:
-        names: (name, number of its entry); an entry may have several names.
+        names: (name, index of its entry); an entry may have several names.
     """
 
     def __init__(self, names: Sequence[tuple[str, int]]) -> None:
@@ -67,7 +70,7 @@ class NameIndex:
             self._by_head.setdefault(_head(words), []).append(place)
 
     def nearest(self, name: str, limit: int) -> tuple[Match, ...]:
-        """The plausible entries, most similar first, at most ``limit``."""
+        """Return at most ``limit`` plausible entries, most similar first."""
         words = split_words(name)
         best = self._similarities(words)
         kind = [word for word in words if word not in _LOOKS]
@@ -79,7 +82,7 @@ class NameIndex:
         return tuple(Match(*entry) for entry in ranked if entry[1] >= least)
 
     def _similarities(self, words: Sequence[str]) -> dict[int, float]:
-        """The entries with a similar name."""
+        """Return the similarity of each entry with a similar name."""
         best: dict[int, float] = {}
         if not words:
             return best
@@ -108,19 +111,22 @@ def _keep(best: dict[int, float], index: int, similarity: float) -> None:
 
 
 def _head(words: Sequence[str]) -> str:
-    """The word that names the thing: the last one, or the one before "of"."""
+    """Return the head word of a name: the word before "of", else the last word."""
     return words[words.index("of", 1) - 1] if "of" in words[1:] else words[-1]
 
 
 def _in_common(words: Sequence[str], known: Sequence[str], *, is_only: bool) -> float:
-    """How much of a name with the same head is shared.
+    """Return the similarity of two names with the same head word, by their common words.
 
-    A name that says more than a known one is a kind of it; one that says less may be another kind.
-    A head word is ambiguous if several entries share it. If one entry has it, 86 % of held-out
-    aliases belong to that entry. If several have it, 59 % belong to the entry of that name.
+    A name with more words than the known name is probably a subclass ("coffee mug"). A name with
+    fewer words may be another subclass. A head word is ambiguous if several entries share it. If
+    one entry has it, 86 % of held-out aliases belong to that entry. If several have it, 59 % belong
+    to the entry of that name.
 
     Args:
-        is_only: no other entry has a name with this head.
+        words: words of the unknown name.
+        known: words of the known name.
+        is_only: whether only one entry has names with this head word.
     """
     one, other = set(words), set(known)
     shared = len(one & other)

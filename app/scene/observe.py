@@ -1,4 +1,4 @@
-"""A scene with poses to the same scene with the relations one can see in them."""
+"""Derive the relations of a scene from its poses."""
 
 from __future__ import annotations
 
@@ -25,18 +25,19 @@ def observe(
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
 
-    Positions and yaws are those of body axes (`app.scene.frames.body_pose`); the returned scene has
-    them in viewer axes where a viewpoint was given, its ``relations`` list what holds and its
-    ``poses`` also say what does not. A scene that states relations, or has no positions, is
-    returned as it is. In a frame fixed to the world (map, odom, world) left and front mean nothing
-    without a viewpoint: only vertical relations are derived.
+    Positions and yaws must be in body axes (`app.scene.frames.body_pose`). With a viewpoint, the
+    returned scene has them in viewer axes. Its ``relations`` list the relations that hold, and its
+    ``poses`` also contain relations observed off. A scene that states relations, or has no
+    positions, is returned unchanged. In a world-fixed frame (map, odom, world) without a viewpoint,
+    left and front are undefined, so only vertical relations are derived.
 
     Args:
         scene: the scene.
         frame_id: the frame of the positions.
-        viewpoint: where the viewer stands in that frame; by default at its origin, looking along x.
-        typical_sizes: (V, 3) extents in metres for objects without a size, by class; NaN rows where
-            unknown (`Vocabulary.sizes`).
+        viewpoint: position and heading of the viewer in that frame; by default the origin, looking
+            along x.
+        typical_sizes: (V, 3) extents in metres by class, for objects without a size; NaN if unknown
+            (`Vocabulary.sizes`).
     """
     if scene.relations is not None or all(thing.position is None for thing in scene.objects):
         return scene

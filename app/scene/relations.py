@@ -1,7 +1,7 @@
 """The eight spatial relations and their four canonical forms.
 
-A relation and its opposite are one statement read from either end, so only four are stored:
-``right(i, j)`` is ``left(j, i)``. Relation indices throughout the product point into `CANONICAL`.
+A relation and its opposite are the same statement with exchanged ends: ``right(i, j)`` is
+``left(j, i)``. So only four are stored. All relation indices are indices into `CANONICAL`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ End = TypeVar("End")
 
 
 def _unknown(relation: str) -> ValueError:
-    return ValueError(f"unknown relation {relation!r}: must be one of {', '.join(RELATIONS)}")
+    return ValueError(f"unknown relation {relation!r}; it must be one of {', '.join(RELATIONS)}")
 
 
 def opposite(relation: str) -> str:
-    """The relation read from the other end: ``opposite("left") == "right"``.
+    """Return the opposite relation: ``opposite("left") == "right"``.
 
     Raises:
-        ValueError: the relation is none of `RELATIONS`.
+        ValueError: `RELATIONS` does not contain the relation.
     """
     try:
         return _OPPOSITE[relation]
@@ -47,12 +47,13 @@ def opposite(relation: str) -> str:
 
 
 def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, End]:
-    """The same statement in canonical form: (relation index, subject, anchor).
+    """Return a statement in canonical form: (relation index, subject, anchor).
 
-    ``right``, ``behind``, ``under`` and ``below`` exchange their ends; the ends may be of any type.
+    For ``right``, ``behind``, ``under`` and ``below``, the ends are exchanged. They may have any
+    type.
 
     Raises:
-        ValueError: the relation is none of `RELATIONS`.
+        ValueError: `RELATIONS` does not contain the relation.
     """
     if (index := _INDEX.get(relation)) is not None:
         return index, subject, anchor
@@ -64,10 +65,10 @@ def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, En
 def contradiction(
     triples: Iterable[tuple[int, End, End]],
 ) -> tuple[tuple[int, End, End], tuple[int, End, End]] | None:
-    """Two canonical triples that say the opposite of each other, or None.
+    """Return two canonical triples that contradict each other, or None.
 
-    ``left(i, j)`` and ``left(j, i)`` contradict each other between *things*; between classes with
-    several instances they do not.
+    ``left(i, j)`` and ``left(j, i)`` contradict each other between *objects*, but not between
+    classes with several instances.
     """
     seen: set[tuple[int, End, End]] = set()
     for relation, subject, anchor in triples:

@@ -1,4 +1,4 @@
-"""A scene as one observer knows it: things, and how they stand to each other."""
+"""A scene as observed by one viewer: objects and their relations."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from app.scene.relations import CANONICAL, contradiction
 Point = tuple[float, float, float]
 
 
-# Frozen it would take four times as long to make, which is felt where there are dozens.
+# Not frozen: creating a frozen instance takes four times as long, and scenes have dozens of them.
 @dataclass(slots=True, unsafe_hash=True)
 class SceneObject:
-    """One thing in a scene, made once and never changed.
+    """One object in a scene; treat it as immutable.
 
     Attributes:
-        id: its name in this scene.
-        label: its label as it was given.
-        class_index: its class in the model's vocabulary; None where the vocabulary has none.
-        confidence: probability in (0, 1] that the thing is there.
+        id: name of the object in this scene.
+        label: label in the request.
+        class_index: class in the model's vocabulary; None for a label outside the vocabulary.
+        confidence: probability in (0, 1] that the object exists.
         position: centre (x, y, z) in metres, viewer axes (x away, y left, z up); None if unknown.
-        size: extents (x, y, z) in metres before the yaw; None if unknown.
-        yaw: turn of the box about z in radians.
+        size: extents (x, y, z) in metres before the rotation; None if unknown.
+        yaw: rotation of the box about z in radians.
 
     Raises:
-        ValueError: a value outside its range.
+        ValueError: a value is outside its range.
     """
 
     id: str
@@ -45,29 +45,29 @@ class SceneObject:
         if not 0.0 < self.confidence <= 1.0:
             raise ValueError(f"confidence of {self.id!r} must be in (0, 1], not {self.confidence}")
         if self.position is not None and not _are_finite(self.position):
-            raise ValueError(f"position of {self.id!r} must be three finite metres")
+            raise ValueError(f"position of {self.id!r} must be three finite numbers (metres)")
         if self.size is not None and not (_are_finite(self.size) and min(self.size) > 0):
-            raise ValueError(f"size of {self.id!r} must be three positive metres")
+            raise ValueError(f"size of {self.id!r} must be three positive numbers (metres)")
         if not math.isfinite(self.yaw):
             raise ValueError(f"yaw of {self.id!r} must be finite, not {self.yaw}")
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Things and their relations.
+    """Objects and their relations.
 
     Attributes:
-        objects: the things; their positions in this tuple name them in ``relations``.
-        relations: canonical triples (relation, subject, object) that hold; None: not given.
-        relations_complete: relations missing from ``relations`` do not hold.
+        objects: the objects; ``relations`` refer to their indices in this tuple.
+        relations: canonical triples (relation, subject, object) that hold; None: not observed.
+        relations_complete: whether all relations missing from ``relations`` are off.
         room_type: index of the room type in the model's vocabulary; None if unknown.
-        poses: relations derived from poses (see `app.scene.observe`), which also say what was seen
-            *not* to hold. They replace ``relations`` as evidence. ``relations`` must list those
-            that hold, which is not checked.
+        poses: relations derived from poses (see `app.scene.observe`), including relations observed
+            off. They replace ``relations`` as evidence. ``relations`` must list the relations that
+            hold; this is not checked.
 
     Raises:
-        ValueError: two things with one id, a triple that points nowhere, joins a thing to itself or
-            contradicts another one, or complete relations where there are none.
+        ValueError: two objects share an id; a triple has an invalid index, relates an object to
+            itself or contradicts another triple; or `relations_complete` is set without relations.
     """
 
     objects: tuple[SceneObject, ...]
@@ -79,7 +79,7 @@ class Scene:
     def __post_init__(self) -> None:
         n = len(self.objects)
         if len({thing.id for thing in self.objects}) < n:
-            raise ValueError("two objects of a scene share one id")
+            raise ValueError("two objects of the scene have the same id")
         if self.relations is None:
             if self.relations_complete:
                 raise ValueError("relations_complete needs relations")
@@ -93,7 +93,7 @@ class Scene:
                 (relation, i, j), _ = clash
                 first, second = self.objects[i].id, self.objects[j].id
                 raise ValueError(
-                    f"{CANONICAL[relation]!r} is claimed both of {first!r} to {second!r} and of "
+                    f"{CANONICAL[relation]!r} is stated both for {first!r} to {second!r} and for "
                     f"{second!r} to {first!r}"
                 )
         if self.poses is not None and self.poses.holds.shape != (len(CANONICAL), n, n):
@@ -112,6 +112,6 @@ class Scene:
 
 
 def _are_finite(point: Sequence[float]) -> bool:
-    # Written out: a scene asks this twice for every object.
+    # Written without a loop: it runs twice for every object.
     finite = math.isfinite
     return len(point) == 3 and finite(point[0]) and finite(point[1]) and finite(point[2])

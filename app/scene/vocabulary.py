@@ -1,4 +1,4 @@
-"""The object classes and room types a model knows, and the spellings it accepts for them."""
+"""The object classes and room types of a model, and their accepted spellings."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ Extents = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class ObjectClass:
-    """A kind of thing.
+    """An object class.
 
     Attributes:
-        label: its canonical name.
-        aliases: other names of the same thing; spellings and plurals need no alias.
-        structure: building structure and vague names (floor, wall, object): accepted in scenes,
-            never proposed by a model.
-        size: typical extents (x, y, z) in metres, z vertical; None where unknown.
+        label: canonical name.
+        aliases: synonyms; other spellings and plurals do not need an alias.
+        structure: whether the class is building structure or a vague name (floor, wall, object).
+            Scenes may contain such classes, but a model never proposes them.
+        size: typical extents (x, y, z) in metres, z vertical; None if unknown.
 
     Raises:
-        ValueError: an empty name, or a size that is not three positive finite numbers.
+        ValueError: a name is empty, or the size is not three positive finite numbers.
     """
 
     label: str
@@ -44,7 +44,7 @@ class ObjectClass:
                 raise ValueError(f"object class {self.label!r} has an empty name: {name!r}")
         if self.size is not None and not _are_extents(self.size):
             raise ValueError(
-                f"size of {self.label!r} must be three positive metres, not {self.size!r}"
+                f"size of {self.label!r} must be three positive numbers (metres), not {self.size!r}"
             )
 
 
@@ -56,8 +56,8 @@ class Vocabulary:
         room_types: canonical room types; their order gives the room indices.
 
     Raises:
-        ValueError: no object class, or two classes (or room types) claim one name after
-            normalisation.
+        ValueError: the list of classes is empty, or two classes (or room types) have the same name
+            after normalisation.
     """
 
     __slots__ = ("__dict__", "_by_key", "_by_spelling", "_objects", "_room_by_key", "_room_types")
@@ -84,7 +84,9 @@ class Vocabulary:
                 raise ValueError(f"empty room type {room!r}")
             claimed = self._room_by_key.setdefault(label_key(room), index)
             if claimed != index:
-                raise ValueError(f"room types {self._room_types[claimed]!r} and {room!r} are one")
+                raise ValueError(
+                    f"room types {self._room_types[claimed]!r} and {room!r} have the same name"
+                )
 
     def __len__(self) -> int:
         return len(self._objects)
@@ -117,28 +119,29 @@ class Vocabulary:
 
     @cached_property
     def longest_label(self) -> int:
-        """Bytes of the longest label or room type as JSON."""
+        """Size in bytes of the longest label or room type in JSON."""
         names = [*self.labels, *self._room_types]
         return max(len(json.dumps(name, ensure_ascii=False).encode()) for name in names)
 
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
-        """(V,) True for structure and vague classes, which are never proposed. Read-only."""
+        """(V,) True for structure and vague classes, which a model never proposes. Read-only."""
         mask = np.array([entry.structure for entry in self._objects], dtype=np.bool_)
         mask.flags.writeable = False
         return mask
 
     @cached_property
     def sizes(self) -> NDArray[np.float64]:
-        """(V, 3) typical sizes in metres, NaN where unknown. Read-only."""
+        """(V, 3) typical sizes in metres, NaN if unknown. Read-only."""
         sizes = np.array([entry.size or (math.nan,) * 3 for entry in self._objects])
         sizes.flags.writeable = False
         return sizes
 
     def index(self, label: str) -> int | None:
-        """The class a label names under any accepted spelling; None if there is none.
+        """Return the class of a label in any accepted spelling; None for an unknown label.
 
-        A phrase that is not a name itself means its head: "bottle of milk" is a bottle (`head_of`).
+        For an unknown phrase, the object in the phrase is looked up: "bottle of milk" is a bottle
+        (`head_of`).
         """
         found = self._by_spelling.get(label)
         if found is None:
@@ -148,7 +151,7 @@ class Vocabulary:
         return found
 
     def room_index(self, room: str) -> int | None:
-        """The room type under any spelling ("bed_room" is "bedroom"); None if there is none."""
+        """Return the room type in any spelling ("bed_room" is "bedroom"); None if unknown."""
         return self._room_by_key.get(label_key(room))
 
     @cached_property
@@ -160,22 +163,22 @@ class Vocabulary:
         return NameIndex([(room, index) for index, room in enumerate(self._room_types)])
 
     def nearest(self, label: str, limit: int = 3) -> tuple[Match, ...]:
-        """The classes with names like ``label``, most similar first; only plausible ones.
+        """Return plausible classes with names similar to ``label``, most similar first.
 
-        Compares with every name and alias: costs far more than `index`.
+        It compares with every name and alias, so it is much slower than `index`.
         """
         return self._names.nearest(label, limit)
 
     def nearest_room(self, room: str, limit: int = 3) -> tuple[Match, ...]:
-        """The same for room types."""
+        """Return plausible room types with names similar to ``room``, most similar first."""
         return self._room_names.nearest(room, limit)
 
     def suggest(self, label: str, limit: int = 3) -> tuple[str, ...]:
-        """The canonical labels of the classes with names like ``label``, for error messages."""
+        """Return the labels of classes with names similar to ``label``, for error messages."""
         return tuple(self._objects[match.entry].label for match in self.nearest(label, limit))
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able values; `from_dict` reads them back."""
+        """Return JSON-compatible values that `from_dict` accepts."""
         return {
             "objects": [
                 {
@@ -191,13 +194,13 @@ class Vocabulary:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Read what `to_dict` wrote; ``aliases``, ``structure`` and ``size`` may be left out.
+        """Build a vocabulary from `to_dict`; ``aliases``, ``structure`` and ``size`` are optional.
 
         Raises:
-            ValueError: a field is missing, unknown or of the wrong type, or see `Vocabulary`.
+            ValueError: a field is missing, unknown or of the wrong type; also see `Vocabulary`.
         """
         if not isinstance(values.get("objects"), list):
-            raise ValueError("a vocabulary is a mapping with a list 'objects'")
+            raise ValueError("a vocabulary must be a mapping with a list 'objects'")
         rooms = values.get("room_types", [])
         if not isinstance(rooms, list):
             raise ValueError(f"'room_types' must be a list, not {rooms!r}")
@@ -212,7 +215,7 @@ def _are_extents(size: Sequence[float]) -> bool:
 
 def _object_class(entry: Any) -> ObjectClass:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("label"), str):
-        raise ValueError(f"an object class is a mapping with a 'label', not {entry!r}")
+        raise ValueError(f"an object class must be a mapping with a 'label', not {entry!r}")
     if unknown := sorted(set(entry) - {"label", "aliases", "structure", "size"}):
         raise ValueError(f"unknown fields in object class {entry['label']!r}: {unknown}")
     aliases, structure = entry.get("aliases", []), entry.get("structure", False)

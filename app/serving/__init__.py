@@ -1,1 +1,1 @@
-"""From requests to answers: reading scenes, holding models, asking them. Knows nothing of HTTP."""
+"""Serving: read scenes, hold the loaded models and answer questions; independent of HTTP."""

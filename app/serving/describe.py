@@ -1,4 +1,4 @@
-"""What there is to know about the models being served."""
+"""Descriptions of the served models, for the routes under ``/models``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from scene_client.schemas import (
 
 
 def everything(models: ServedModels) -> ModelList:
-    """All models, versions, aliases and failures."""
+    """List all models, versions, aliases and failures."""
     return ModelList(
         generation=models.generation,
         models=[_summary(models, name) for name in models.store.versions],
@@ -39,23 +39,23 @@ def everything(models: ServedModels) -> ModelList:
 
 
 def model(models: ServedModels, reference: str) -> ModelSummary:
-    """The model that a name or an alias leads to, whether or not it is usable.
+    """Describe the model of a name or an alias, usable or refused.
 
     Raises:
-        UnknownModelError: there is none.
+        UnknownModelError: no model or alias has this name.
     """
     return _summary(models, _name(models, reference))
 
 
 def version(models: ServedModels, reference: str, number: str) -> VersionDetails:
-    """One version of the model that a name or an alias leads to.
+    """Describe one version of the model of a name or an alias.
 
     Raises:
-        UnknownModelError: there is none.
+        UnknownModelError: no model or alias has this name, or the model lacks this version.
     """
     name = _name(models, reference)
     if number not in models.store.versions[name]:
-        raise UnknownModelError("The model has no such version.")
+        raise UnknownModelError("The model does not have this version.")
     summary = _version_summary(models, name, number)
     served = models.served.get((name, number))
     if served is None:
@@ -74,7 +74,7 @@ def version(models: ServedModels, reference: str, number: str) -> VersionDetails
 
 
 def vocabulary(served: ServedModel) -> VocabularyAnswer:
-    """The words of a model."""
+    """List object classes, relations and room types of a model."""
     canonical = served.artifact.manifest.vocabulary.relations
     names = (*canonical, *map(opposite, canonical))
     return VocabularyAnswer(
@@ -94,7 +94,7 @@ def vocabulary(served: ServedModel) -> VocabularyAnswer:
 
 
 def contexts(served: ServedModel) -> ContextsAnswer:
-    """The hidden units of a model by their strongest objects and relations."""
+    """List the hidden units of a model with their strongest objects and relations."""
     return ContextsAnswer(
         model=served.reference,
         layers={
@@ -133,13 +133,13 @@ def _weighted(pairs: Sequence[tuple[str, float]]) -> list[WeightedLabel]:
 
 
 def _name(models: ServedModels, reference: str) -> str:
-    """A model's name from a reference, which may lead to a version that was refused."""
+    """Return the name of the model that a reference points to, even if its version was refused."""
     name = reference.partition("@")[0]
     target: AliasTarget | None = models.store.aliases.get(name)
     if target is not None:
         name = target.name
     if name not in models.store.versions:
-        raise UnknownModelError("There is no such alias or model.")
+        raise UnknownModelError("No model or alias has this name.")
     return name
 
 

@@ -1,4 +1,4 @@
-"""Why a question cannot be answered, in terms of scenes and models; HTTP is not known here."""
+"""Errors of the serving layer, in terms of scenes and models, independent of HTTP."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from enum import Enum
 from scene_client.schemas import Failure
 
 Location = tuple[str | int, ...]
-"""A way into a request: field names and list positions."""
+"""Path to a value of a request: field names and list indices."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that is wrong with a request.
+    """One error in a request.
 
     Attributes:
-        location: where, from the root of the request.
-        message: what; never a copy of the input.
+        location: path to the invalid value, from the root of the request.
+        message: description of the error, without a copy of the input.
         suggestions: nearest known names, best first.
     """
 
@@ -28,7 +28,7 @@ class Fault:
 
 
 class Reason(Enum):
-    """The kind of fault that a client may want to branch on."""
+    """The kind of a request error; each kind has its own problem type."""
 
     INVALID = "invalid"
     UNKNOWN_LABELS = "unknown labels"
@@ -37,11 +37,11 @@ class Reason(Enum):
 
 
 class ServingError(Exception):
-    """Base of what the service can say about a request; its text is fit for the client."""
+    """Base class of the serving errors; the client may read their text."""
 
 
 class RequestError(ServingError):
-    """A request that fits the schema but makes no sense to this model or in itself."""
+    """The request matches the schema, but contradicts itself or does not suit the model."""
 
     def __init__(self, reason: Reason, faults: Sequence[Fault]) -> None:
         super().__init__(reason.value)
@@ -50,43 +50,43 @@ class RequestError(ServingError):
 
 
 class UnknownModelError(ServingError):
-    """No alias, model or version has this name."""
+    """The name of a model is neither an alias nor a model nor a version."""
 
 
 class ModelUnavailableError(ServingError):
-    """The version is in the store, but it was refused when it was loaded."""
+    """The version is in the store, but the service refused to load it."""
 
 
 class NotReadyError(ServingError):
-    """Nothing is being served yet, or the default model is not usable."""
+    """The service is still starting, or the default model is not usable."""
 
 
 class QueueFullError(ServingError):
-    """More is waiting than the service will hold."""
+    """The queue of requests, or of the model's scenes, is full."""
 
 
 class DeadlinePassedError(ServingError):
-    """The request's time was over before its answer was there."""
+    """The deadline of the request passed before the answer was complete."""
 
 
 class DisconnectedError(ServingError):
-    """The client has left."""
+    """The client has closed its connection."""
 
 
 class DrainingError(ServingError):
-    """The service is ending and takes nothing new."""
+    """The service is shutting down and refuses new requests."""
 
 
 class AliasConflictError(ServingError):
-    """The alias does not lead where the request expected, or cannot have this name."""
+    """The alias does not point to the expected version, or a model has its name."""
 
 
 class ModelUnusableError(ServingError):
-    """An alias was to lead to a version that was refused."""
+    """The alias would point to a version that the service refused to load."""
 
 
 class StoreNotWritableError(ServingError):
-    """The store's aliases cannot be changed from here."""
+    """This process cannot write the aliases of the store."""
 
 
 class StoreBusyError(ServingError):
@@ -94,10 +94,10 @@ class StoreBusyError(ServingError):
 
 
 class RefreshRefusedError(ServingError):
-    """What the store holds now is worse than what is served.
+    """The new state of the store would make a working version or alias unusable.
 
     Attributes:
-        failures: what was wrong with it.
+        failures: the refused versions and aliases, with reasons.
     """
 
     def __init__(self, failures: Sequence[Failure]) -> None:

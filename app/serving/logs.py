@@ -1,4 +1,4 @@
-"""Log records as JSON lines or plain text, on standard error; never a payload or key in either."""
+"""Log records as JSON lines or plain text on standard error, without payloads or keys."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ def _masked(line: str, secrets: Sequence[str]) -> str:
 
 
 class JSONFormatter(logging.Formatter):
-    """One JSON object a line: time, level, process, logger, message and the fields of a request.
+    """Write one JSON object per line: time, level, process, logger, message and request fields.
 
-    A record's attribute ``entry`` holds these fields for a line of the access log, ``request_id``
-    the id of the request that met a defect.
+    Two attributes of a record add fields: ``entry`` holds the fields of an access log line, and
+    ``request_id`` names the request that caused an internal error.
 
     Args:
-        secrets: texts to mask wherever they turn up; a defect's own words may quote anything.
+        secrets: texts to mask everywhere, because an exception message may quote them.
     """
 
     def __init__(self, secrets: Sequence[str] = ()) -> None:
         super().__init__()
-        # As they stand in a JSON string.
+        # Escaped as in a JSON string.
         self.secrets = [json.dumps(secret)[1:-1] for secret in secrets]
         self._second, self._text = -1, ""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as a line."""
+        """Return the record as one line."""
         second = int(record.created)
         if second != self._second:
             self._second = second
@@ -55,37 +55,37 @@ class JSONFormatter(logging.Formatter):
 
 
 class PlainFormatter(logging.Formatter):
-    """Text for people, with secrets masked."""
+    """Write text for people, with secrets masked."""
 
     def __init__(self, secrets: Sequence[str] = ()) -> None:
         super().__init__("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
         self.secrets = secrets
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as lines."""
+        """Return the record as one or several lines."""
         return _masked(super().format(record), self.secrets)
 
 
 class NoHandshakes(logging.Filter):
-    """Drops the server's lines on WebSocket handshakes, which repeat addresses as asked."""
+    """Drop the server's lines about WebSocket handshakes, which contain the requested path."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the record is written."""
+        """Return whether to write the record."""
         return not (record.name == "uvicorn.error" and '"WebSocket %s"' in str(record.msg))
 
 
 def log_config(
     level: str, style: Literal["json", "plain"], secrets: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """A configuration for `logging.config.dictConfig`, covering the service and its server.
+    """Return a configuration of service and server for `logging.config.dictConfig`.
 
-    The server's own access log is off: it repeats paths as they were asked, and the service writes
-    a line of its own with the request id. Libraries tell nothing below `info`, for at `debug` the
-    server would list the headers of WebSocket handshakes, keys among them.
+    The access log of the server is off: it would contain raw paths, and the service writes its own
+    access log. Libraries log at `info` or above. At `debug` the server would log the headers of
+    WebSocket handshakes, including keys.
 
     Args:
-        level: of the service's own records.
-        style: one JSON object a line, or text.
+        level: log level of the service.
+        style: "json" for one JSON object per line, "plain" for text.
         secrets: texts to mask.
     """
     known = logging.getLevelNamesMapping()
@@ -108,7 +108,7 @@ def log_config(
         "loggers": {
             "app": {"level": level.upper()},
             "uvicorn.access": {"level": "CRITICAL"},
-            # Tells of every WebSocket that opens, is refused or closes.
+            # At "info" it would log each WebSocket that opens, fails or closes.
             "websockets": {"level": "WARNING"},
         },
     }

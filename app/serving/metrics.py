@@ -1,7 +1,7 @@
-"""Metrics for Prometheus: counted where it happens, written out when `/metrics` is asked.
+"""Metrics for Prometheus, updated during the requests and formatted by `GET /metrics`.
 
-Every label has few values, whatever clients send: routes by their templates, models only while
-they are served. A replica is one process and tells its own; see docs/decisions/artifacts.md.
+Clients cannot add label values: routes appear as templates, and models only while they are served.
+Each replica is one process and reports its own metrics; see docs/decisions/artifacts.md.
 """
 
 from __future__ import annotations
@@ -38,16 +38,15 @@ _ROWS: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _MODEL: Final = ("model", "version")
 _INFO: Final = "scene_model_info"
 
-# A second series for each one that says when it began: Prometheus itself sees when a counter
-# restarts.
+# Without a second series per counter for its creation time: Prometheus detects restarts itself.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 
 class Metrics:
-    """The metrics of one application; its methods are called on the thread of the event loop.
+    """The metrics of one application; call its methods on the thread of the event loop only.
 
     Attributes:
-        registry: of its own, so that a process can hold several applications.
+        registry: own registry, so that one process can hold several applications.
     """
 
     def __init__(self) -> None:
@@ -60,53 +59,53 @@ class Metrics:
         )
         self._latency = Histogram(
             "scene_request_duration_seconds",
-            "From the request's first byte to the response's last",
+            "Seconds from the first byte of the request to the last byte of the response",
             ("route",),
             buckets=_SECONDS,
             registry=registry,
         )
         self._entries = Counter(
             "scene_batch_entries_total",
-            "Scenes of batch requests, each of which succeeds or fails on its own",
+            "Scenes of batch requests; outcome is success or the name of the problem",
             ("question", "outcome"),
             registry=registry,
         )
         self._queue = Histogram(
             "scene_queue_duration_seconds",
-            "How long a scene waited before a model looked at it",
+            "Seconds that a scene waited before its computation",
             _MODEL,
             buckets=_SECONDS,
             registry=registry,
         )
         self._compute = Histogram(
             "scene_compute_duration_seconds",
-            "How long a model computed for the scenes that it answered together",
+            "Seconds that a model computed for one question",
             (*_MODEL, "question"),
             buckets=_SECONDS,
             registry=registry,
         )
         self._rows = Histogram(
             "scene_batch_rows",
-            "How many scenes a model answered together",
+            "Scenes of one question: 1, or the number of generated scenes",
             (*_MODEL, "question"),
             buckets=_ROWS,
             registry=registry,
         )
         self._serialisation = Histogram(
             "scene_serialisation_duration_seconds",
-            "From a model's last answer to the response's first byte",
+            "Seconds from the last answer of a model to the first byte of the response",
             buckets=_SECONDS,
             registry=registry,
         )
         self._pending = Gauge(
             "scene_pending_rows",
-            "Scenes waiting for a model",
+            "Scenes that wait for a model or are being computed",
             _MODEL,
             registry=registry,
         )
         self._streams = Gauge(
             "scene_streams",
-            "Streams that are open",
+            "Open streams",
             registry=registry,
         )
         self._messages = Counter(
@@ -123,18 +122,18 @@ class Metrics:
         )
         self._superseded = Counter(
             "scene_stream_superseded_total",
-            "Updates of streams that a newer one replaced before they were answered",
+            "Stream updates that a newer update replaced before an answer",
             registry=registry,
         )
         self._info = Gauge(
             _INFO,
-            "1 for every model that is served, once for each alias that leads to it",
+            "1 for each served model, with one series per alias",
             (*_MODEL, "variant", "digest", "alias"),
             registry=registry,
         )
         self._reloads = Counter(
             "scene_reloads_total",
-            "Changes of what is served: refreshes, moved aliases, polls, with refused ones",
+            "Attempts to change the served models: refreshes, alias changes, polls of the store",
             ("change", "outcome"),
             registry=registry,
         )
@@ -145,27 +144,27 @@ class Metrics:
         )
         self._ready = Gauge(
             "scene_ready_time_seconds",
-            "Unix time when its default model had answered; 0 before",
+            "Unix time when the default model first answered; 0 before",
             registry=registry,
         )
         self._infos: set[Info] = set()
         self._is_ready = False
-        # Bound once: looking a child up by its labels costs more than counting.
+        # Cached: looking up a series by its labels takes longer than counting.
         self._of_request: dict[tuple[str, str, str], Counter] = {}
         self._of_route: dict[str, Histogram] = {}
         self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
 
-    # ------------------------------------------------------------------------- what happened
+    # ---------------------------------------------------------------------------- recording
 
     def started(self) -> None:
-        """The process begins to load its models."""
+        """Record that the process begins to load its models."""
         self._started.set(time.time())
         for change in get_args(Change):
             for outcome in get_args(Outcome):
                 self._reloads.labels(change, outcome)
 
     def serving(self, models: ServedModels) -> None:
-        """These models are served from now on; series of all others go away."""
+        """Set the served models, and remove the series of all other models."""
         for key in self._of_model.keys() - models.served.keys():
             for question in self._of_model.pop(key):
                 self._compute.remove(*key, question)
@@ -187,7 +186,7 @@ class Metrics:
             self._ready.set(time.time())
 
     def reloaded(self, change: Change, outcome: Outcome) -> None:
-        """Somebody tried to change what is served."""
+        """Count one attempt to change the served models."""
         self._reloads.labels(change, outcome).inc()
 
     def answered(
@@ -198,14 +197,14 @@ class Metrics:
         seconds: float | None,
         serialised: float | None = None,
     ) -> None:
-        """A request has been answered.
+        """Count one answered request.
 
         Args:
-            route: the template of the route, "-" where none answered.
-            method: the request's, "-" if HTTP defines no such method.
-            outcome: "success", or the name of the problem.
-            seconds: how long it took; None for a stream, which lasts as long as its client likes.
-            serialised: seconds from a model's last answer to the response; None without one.
+            route: template of the route, "-" if the path matches none.
+            method: HTTP method, "-" for a method that HTTP does not define.
+            outcome: "success", or the slug of the problem.
+            seconds: duration of the request; None for a stream, whose duration the client chooses.
+            serialised: seconds from the last answer of a model to the response; None without one.
         """
         key = (route, method, outcome)
         counter = self._of_request.get(key)
@@ -232,19 +231,32 @@ class Metrics:
         """Count one stream message: accepted, or refused with the problem `outcome`.
 
         Args:
-            kind: its type, "-" if there is no such type.
+            kind: type of the message, "-" for an unknown type.
+            outcome: "success", or the slug of the problem.
         """
         self._messages.labels(kind, outcome).inc()
 
     def stream_answered(self, outcome: str, superseded: int) -> None:
-        """A stream has been given an answer, which covers so many updates besides the newest."""
+        """Count one answer on a stream.
+
+        Args:
+            outcome: "success", or the slug of the problem.
+            superseded: number of older updates that the answer covers besides the newest.
+        """
         self._answers.labels(outcome).inc()
         self._superseded.inc(superseded)
 
     def computed(self, key: Key, question: str, rows: int, waited: float, seconds: float) -> None:
-        """A model has answered a question about ``rows`` scenes at once, which waited before.
+        """Record one computed question.
 
-        Dropped where the model has been removed meanwhile: its series would come back.
+        Ignored if the model has been removed in the meantime: its series would appear again.
+
+        Args:
+            key: name and version of the model.
+            question: name of the question.
+            rows: number of scenes of the question.
+            waited: seconds before the computation.
+            seconds: duration of the computation.
         """
         series = self._of_model.get(key)
         if series is None:
@@ -261,15 +273,15 @@ class Metrics:
         compute.observe(seconds)
         size.observe(rows)
 
-    # ------------------------------------------------------------------------- what is told
+    # ---------------------------------------------------------------------------- reporting
 
     def exposition(self) -> bytes:
-        """Everything in Prometheus' text format."""
+        """Return all metrics in the text format of Prometheus."""
         return generate_latest(self.registry)
 
 
 def _infos(models: ServedModels) -> Iterable[Info]:
-    """The label values of every model, once an alias; "" where no alias leads to it."""
+    """Yield the label values of each model, once per alias; the alias is "" if it has none."""
     aliases: dict[Key, list[str]] = {key: [] for key in models.served}
     for alias in models.store.aliases:
         try:

@@ -1,6 +1,6 @@
 """From a request to a scene: names to ids, labels to classes, poses to relations.
 
-One pass over the request gathers every fault before any is raised, so that a caller can mend all of
+The reading collects all errors of a request before it raises, so that a client can correct all of
 them at once.
 """
 
@@ -35,10 +35,9 @@ from scene_client.schemas import (
 )
 
 MAX_SUGGESTED: Final = 32
-"""How many unknown labels of one scene are looked up, to suggest or to take the nearest class; and
-of one request, with all its scenes, to suggest."""
+"""Maximum number of look-ups of unknown labels in a scene, and of suggestions in a request."""
 MAX_MAPPED: Final = 256
-"""How many of one request are looked up to take the nearest class."""
+"""Maximum number of unknown labels of a request that are mapped to the nearest class."""
 
 
 Triple = tuple[int, int, int]
@@ -46,7 +45,12 @@ Triple = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one scene and its answer may hold, as the operator chose."""
+    """Limits of the operator on one scene and its answer.
+
+    Attributes:
+        objects, relations: maximum numbers in a scene.
+        answer_bytes: maximum size of an answer.
+    """
 
     objects: int = 256
     relations: int = 4096
@@ -55,21 +59,21 @@ class Limits:
 
 @dataclass(slots=True)
 class Faults:
-    """What has been found wrong so far, by kind."""
+    """The errors of a request found so far, by kind."""
 
     found: dict[Reason, list[Fault]] = field(default_factory=dict)
 
     def add(
         self, reason: Reason, location: Location, message: str, suggestions: Sequence[str] = ()
     ) -> None:
-        """Note a fault and go on."""
+        """Add an error without raising it."""
         self.found.setdefault(reason, []).append(Fault(location, message, tuple(suggestions)))
 
     def raise_any(self) -> None:
-        """Raise what was found; faults of form come before unknown labels, those before sense.
+        """Raise the errors of the first kind found, in the order of `Reason`.
 
         Raises:
-            RequestError: something was found.
+            RequestError: the request has an error.
         """
         if not self.found:
             return
@@ -80,12 +84,12 @@ class Faults:
 
 @dataclass(slots=True)
 class LookUps:
-    """The unknown labels that one request has looked up, in all its scenes.
+    """The look-ups of unknown labels in all scenes of one request.
 
-    A look-up takes .2 ms, and a batch may hold ten thousand unknown labels.
+    Their number is limited: a look-up takes 0.2 ms, and a batch may have 10,000 unknown labels.
 
     Attributes:
-        suggestions: how many faults with suggestions it has named.
+        suggestions: number of errors with suggestions so far.
     """
 
     suggestions: int = 0
@@ -94,8 +98,8 @@ class LookUps:
     def nearest(
         self, vocabulary: Vocabulary, label: str, *, is_room: bool, limit: int
     ) -> tuple[Match, ...] | None:
-        """The entries like an unknown label; None where so many have been looked up already."""
-        key = id(vocabulary), label, is_room  # the request keeps its models
+        """Return the entries nearest to an unknown label; None after ``limit`` look-ups."""
+        key = id(vocabulary), label, is_room  # the id stays valid: the request keeps its models
         if key not in self._found:
             if len(self._found) >= limit:
                 return None
@@ -106,13 +110,14 @@ class LookUps:
 
 @dataclass(slots=True)
 class Unknown:
-    """What becomes of the labels of one request that the model does not know.
+    """The unknown labels of one scene and their treatment.
 
     Attributes:
+        vocabulary: classes and room types of the model.
         treatment: `SceneRequest.unknown_labels`.
-        ignored: names of what was left out.
-        mapped: labels by the class that stands for each.
-        look_ups: those of the whole request.
+        look_ups: look-ups of the whole request.
+        ignored: names of the ignored objects.
+        mapped: nearest class by label.
     """
 
     vocabulary: Vocabulary
@@ -125,14 +130,17 @@ class Unknown:
     def resolve(
         self, label: str, name: str, location: Location, faults: Faults, *, is_room: bool = False
     ) -> int | None:
-        """The class, or room type, that stands for an unknown label.
+        """Return the class or room type that replaces an unknown label.
 
         Args:
-            name: noted as ignored, where unknown labels are.
-            location: of the label, for the fault that is noted where it is refused.
+            label: the unknown label.
+            name: name of its object, for the list of ignored names.
+            location: location of the label, for an error.
+            faults: receives an error if the label is refused.
+            is_room: whether the label is a room type.
 
         Returns:
-            None where it is ignored or refused.
+            None if the label is ignored or refused.
         """
         if self.treatment == "ignore":
             self.ignored.append(name)
@@ -149,11 +157,11 @@ class Unknown:
         if is_room:
             message = "the model does not know this room type"
             if not known:
-                message = "this model knows no room types"
+                message = "this model does not have room types"
         if self.treatment == "nearest" and (label, is_room) not in self._looked_up:
             message += (
-                f"; the nearest class is looked up for {MAX_SUGGESTED} labels of a scene and "
-                f"{MAX_MAPPED} of a batch at most"
+                f"; the service looks up the nearest class of at most {MAX_SUGGESTED} labels of a "
+                f"scene and {MAX_MAPPED} labels of a batch"
             )
         suggestions = [known[match.entry] for match in matches]
         if self.look_ups.suggestions >= MAX_SUGGESTED:
@@ -163,7 +171,7 @@ class Unknown:
         return None
 
     def copy(self) -> Unknown:
-        """For a question with labels of its own: the reading stays as it is."""
+        """Return a copy for a question with its own labels; the reading stays unchanged."""
         return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
 
     def _nearest(self, label: str, *, is_room: bool) -> tuple[Match, ...]:
@@ -181,16 +189,16 @@ class Unknown:
 
 @dataclass
 class Reading:
-    """A request's scene as the models see it, made once and never changed.
+    """The scene of a request in the classes of a model; constant after `read_scene`.
 
     Attributes:
-        scene: the known objects, what holds between them, and the room.
-        ids: of the scene's objects.
-        unknown: what became of the labels that the model does not know.
-        left_out: (id, label) of the objects that were left out.
-        observed: relations derived from poses; None where there was nothing to derive from.
-        flipped: canonical triples of `scene` that the request spelled from the other end.
-        warnings: what is probably a mistake.
+        scene: known objects, their relations and the room type.
+        ids: ids of the scene's objects.
+        unknown: unknown labels and their treatment.
+        left_out: (id, label) of the ignored objects.
+        observed: relations derived from poses; None without poses.
+        flipped: canonical triples of `scene` that the request stated in the opposite direction.
+        warnings: probable mistakes in the scene.
     """
 
     scene: Scene
@@ -203,11 +211,11 @@ class Reading:
 
     @cached_property
     def names(self) -> Names:
-        """How the request may name its objects; most requests name none."""
+        """Look-up of objects by id or label; built on first access."""
         return Names(self.scene.objects, self.left_out, self.unknown.vocabulary)
 
     def longest_name(self) -> int:
-        """Bytes of the longest name in an answer as JSON."""
+        """Return the size in bytes of the longest id or label in a JSON answer."""
         text = "".join(self.ids)
         if text.isascii() and '"' not in text and "\\" not in text:
             longest = max(map(len, self.ids), default=0) + 2
@@ -217,15 +225,17 @@ class Reading:
 
     @property
     def ignored(self) -> tuple[str, ...]:
-        """Names of what the model does not know, left out as the request allowed."""
+        """Names of the ignored objects."""
         return tuple(self.unknown.ignored)
 
 
 class Names:
-    """How the objects of a scene may be named: by id, or by a label that only one of them has.
+    """Look-up of objects by id, or by a label that only one object has.
 
     Args:
-        ignored: (id, label) of those that were left out.
+        objects: objects of the scene.
+        ignored: (id, label) of the ignored objects.
+        vocabulary: classes of the model.
     """
 
     def __init__(
@@ -239,7 +249,7 @@ class Names:
         self._ignored_ids = {name for name, _ in ignored}
         self._ignored_labels = {label_key(label) for _, label in ignored}
 
-    # Made when first asked for: most requests name none of their objects.
+    # Built on first access, because most requests do not name their objects.
 
     @cached_property
     def _by_id(self) -> dict[str, int]:
@@ -261,9 +271,9 @@ class Names:
         return places
 
     def find(self, name: str, location: Location, faults: Faults) -> int | None:
-        """The place of the one object that ``name`` names; else None, with a fault noted.
+        """Return the position of the object with this name, or add an error and return None.
 
-        Ids win over labels; a label in another spelling names the same class.
+        Ids take precedence over labels. A label matches in every accepted spelling of its class.
         """
         if (place := self._by_id.get(name)) is not None:
             return place
@@ -274,14 +284,14 @@ class Names:
         if len(places) == 1:
             return places[0]
         if places:
-            message = f"{len(places)} objects have this label: name one of them by its id"
+            message = f"{len(places)} objects have this label; use the id of one of them"
             faults.add(Reason.INVALID, location, message)
         else:
-            faults.add(Reason.INVALID, location, "names no object of the scene")
+            faults.add(Reason.INVALID, location, "no object of the scene has this id or label")
         return None
 
     def is_ignored(self, name: str) -> bool:
-        """Whether the name belongs to an object that was left out."""
+        """Return whether the name belongs to an ignored object."""
         if name in self._by_id:
             return False
         return name in self._ignored_ids or label_key(name) in self._ignored_labels
@@ -296,14 +306,18 @@ def read_scene(
     may_be_empty: bool = False,
     derive: bool = True,
 ) -> Reading:
-    """The scene of a request, in the classes of ``vocabulary``.
+    """Read the scene of a request in the classes of ``vocabulary``.
 
     Args:
-        look_ups: those of the whole request, where it holds more than this scene.
-        derive: whether to derive relations and warnings from poses; else the scene is only checked.
+        request: the request.
+        vocabulary: classes and room types of the model.
+        limits: limits on the scene.
+        look_ups: look-ups of the whole request, for a scene of a batch.
+        may_be_empty: whether a scene without known objects is valid.
+        derive: whether to derive relations and warnings from poses; if False, only check the scene.
 
     Raises:
-        RequestError: everything that is wrong with it, of the gravest kind found.
+        RequestError: all errors of the first kind found, in the order of `Reason`.
     """
     faults = Faults()
     _check_sizes(request, limits, faults)
@@ -331,7 +345,7 @@ def read_scene(
             objects.append(_scene_object(ids[place], entry, index, optical=optical))
     room = None if request.room_type is None else _room(request.room_type, unknown, faults)
     if not objects and not may_be_empty and not faults.found:
-        faults.add(Reason.INVALID, ("objects",), "the model knows none of the objects")
+        faults.add(Reason.INVALID, ("objects",), "the model does not know any of these objects")
     if faults.found:
         faults.raise_any()
 
@@ -350,15 +364,13 @@ def read_scene(
 
 def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
     if len(request.objects) > limits.objects:
-        faults.add(
-            Reason.INVALID, ("objects",), f"must not hold more than {limits.objects} objects"
-        )
+        faults.add(Reason.INVALID, ("objects",), f"must have at most {limits.objects} objects")
     if request.relations is None:
         if request.relations_complete:
-            faults.add(Reason.INVALID, ("relations_complete",), "needs relations")
+            faults.add(Reason.INVALID, ("relations_complete",), "requires relations")
     elif len(request.relations) > limits.relations:
         faults.add(
-            Reason.INVALID, ("relations",), f"must not hold more than {limits.relations} relations"
+            Reason.INVALID, ("relations",), f"must have at most {limits.relations} relations"
         )
     if faults.found:
         faults.raise_any()
@@ -367,7 +379,7 @@ def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
 def _derive(
     request: SceneRequest, reading: Reading, vocabulary: Vocabulary, *, has_poses: bool
 ) -> None:
-    """Add to a reading what the poses of its objects say."""
+    """Add the relations and warnings that follow from the poses."""
     given = reading.scene
     if has_poses and given.relations is None:
         view = request.viewpoint
@@ -386,7 +398,7 @@ def _derive(
 
 
 def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
-    """The id of every object: its own, or its label, numbered where the label is not enough."""
+    """Return the ids of the objects: given ids, else labels, numbered if they repeat."""
     labels: list[str] = [entry for entry in entries if isinstance(entry, str)]
     if len(set(labels)) == len(entries):
         return labels
@@ -454,7 +466,7 @@ def _room(name: str, unknown: Unknown, faults: Faults) -> int | None:
 def _triples(
     relations: Sequence[Relation], reading: Reading, faults: Faults
 ) -> tuple[tuple[Triple, ...], frozenset[Triple]]:
-    """The canonical triples, and those of them that are spelled from the other end."""
+    """Return the canonical triples, and the triples stated in the opposite direction."""
     names, some_ignored = reading.names, bool(reading.left_out)
     triples: dict[Triple, bool] = {}
     for place, relation in enumerate(relations):
@@ -468,12 +480,12 @@ def _triples(
         if subject is None or other is None:
             continue
         if subject == other:
-            message = "an object stands in no relation to itself"
+            message = "an object cannot have a relation to itself"
             faults.add(Reason.CONTRADICTION, location, message)
             continue
         index, i, j = canonicalise(subject, relation.relation, other)
         if (index, j, i) in triples:
-            message = "contradicts an earlier relation, which says the opposite of this pair"
+            message = "contradicts an earlier relation of this pair, which is the opposite"
             faults.add(Reason.CONTRADICTION, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])

@@ -1,4 +1,4 @@
-"""One request: its deadline, the models that it sees, and what becomes known about it."""
+"""One request: its deadline, its snapshot of the models, and its record for log and metrics."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ SUCCESS: Final = "success"
 
 @dataclass(slots=True)
 class Record:
-    """Values of a request for log and metrics, read when its response has been sent.
+    """Values of a request for log and metrics, read after the response has been sent.
 
     Attributes:
-        outcome: `SUCCESS`, or the name of the problem it was answered with.
-        status: of its response; 0 before that begins.
-        models: those it asked, by (name, version); a batch may ask several.
-        queue_seconds: how long its scenes waited, together; None where none had to.
-        compute_seconds: how long the models computed for it; None where none was asked.
-        answered_at: `time.perf_counter` when the last answer of a model came.
-        serialise_seconds: from the last answer of a model to the response.
-        stream: of a stream its messages, answers, superseded updates and the code of its close.
+        outcome: `SUCCESS`, or the slug of the problem in the response.
+        status: HTTP status of the response; 0 before the response starts.
+        models: (name, version) of the models that the request used; a batch may use several.
+        queue_seconds: total waiting time of its scenes; None if no model was asked.
+        compute_seconds: total computing time of its models; None if no model was asked.
+        answered_at: `time.perf_counter` at the last answer of a model.
+        serialise_seconds: time from the last answer of a model to the response.
+        stream: numbers of messages, answers and superseded updates, and the close code; None for
+            a request that is not a stream.
     """
 
     outcome: str = SUCCESS
@@ -50,13 +51,13 @@ class Record:
     stream: dict[str, int] | None = None
 
     def begin(self, status: int) -> None:
-        """The response begins."""
+        """Record that the response starts."""
         self.status = status
         if self.answered_at is not None and status < 400:
             self.serialise_seconds = perf_counter() - self.answered_at
 
     def known(self) -> dict[str, str | float]:
-        """The record for a line of the log: times in milliseconds, the model if there is one."""
+        """Return the fields of a log line: times in milliseconds, and the model if it is one."""
         entry: dict[str, str | float] = {"outcome": self.outcome, **(self.stream or {})}
         if len(self.models) == 1:
             ((entry["model"], entry["version"]),) = self.models
@@ -69,18 +70,18 @@ class Record:
 
 @dataclass(slots=True)
 class Request(Ticket):
-    """One request, with one snapshot of the models from beginning to end.
+    """One request, with the same snapshot of the models from beginning to end.
 
     Attributes:
-        id: goes into every answer.
-        models: the snapshot of models.
-        limits: of its scenes and answers.
-        metrics: of the service.
-        record: what becomes known about it.
-        holding: whether rows of the models' queues are held for it already.
-        known: what `read` found, where several questions are asked about one scene.
-        low_priority: its questions run after those of other requests.
-        look_ups: of labels that the models do not know.
+        id: request id that every answer repeats.
+        models: snapshot of the models.
+        limits: limits on its scenes and answers.
+        metrics: metrics of the service.
+        record: values for the log and the metrics.
+        holding: whether the request has already reserved its rows in the queues of the models.
+        known: result of `read`, if several questions ask about the same scene.
+        low_priority: whether its questions run after the questions of other requests.
+        look_ups: nearest classes of its unknown labels.
     """
 
     id: str = ""
@@ -96,12 +97,12 @@ class Request(Ticket):
     def read(
         self, scene: SceneRequest, *, may_be_empty: bool = False
     ) -> tuple[ServedModel, Reading]:
-        """The model that a scene names, and the scene in the classes of that model.
+        """Return the model that a scene names, and the scene in the classes of this model.
 
         Raises:
-            UnknownModelError: no such model.
-            ModelUnavailableError: the model was refused when it was loaded.
-            RequestError: the scene does not fit; see `read_scene`.
+            UnknownModelError: the model does not exist.
+            ModelUnavailableError: the service refused to load the model.
+            RequestError: the scene is invalid; see `read_scene`.
         """
         if self.known is not None:
             return self.known
@@ -119,7 +120,13 @@ class Request(Ticket):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Put one question about one scene to one model.
+        """Ask a model one question about one scene.
+
+        Args:
+            model: the model.
+            question: function of `app.questions`.
+            scene: the scene in the classes of the model.
+            *args, **kwargs: further arguments of ``question``.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
@@ -133,7 +140,7 @@ class Request(Ticket):
                 call,
                 self,
                 kind=_kind_of_cost(name, scene, kwargs),
-                # The relation part is computed for pairs of objects.
+                # The cost of relations grows with the number of pairs.
                 size=(1 + len(scene.objects)) ** 2,
                 low_priority=self.low_priority,
             )
@@ -144,11 +151,13 @@ class Request(Ticket):
     async def draw(
         self, rows: int, model: ServedModel, name: str, draw: Callable[[Callable[[], bool]], T]
     ) -> T:
-        """Draw so many scenes.
+        """Sample scenes from a model.
 
         Args:
-            name: of the question.
-            draw: the work; its argument says whether the result has been given up.
+            rows: number of scenes.
+            model: the model.
+            name: name of the question.
+            draw: the work; its argument returns whether the request has been abandoned.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
@@ -170,18 +179,18 @@ class Request(Ticket):
         return done.result
 
     def with_answer_bytes(self, left: int) -> Request:
-        """The same request, whose next answer may have so many bytes."""
+        """Return a copy of the request with another limit for the next answer, in bytes."""
         return replace(self, limits=replace(self.limits, answer_bytes=left))
 
     @contextmanager
     def for_batch(self, references: Sequence[str]) -> Iterator[Request]:
-        """The same request with room for all its scenes in the queues.
+        """Reserve a row for each scene of a batch, and yield a copy of the request.
 
         Args:
-            references: the models that its scenes name; those that lead nowhere take no room.
+            references: model of each scene; an unusable model needs no row.
 
         Raises:
-            QueueFullError: there is no room.
+            QueueFullError: the queue of a model is full.
         """
         with ExitStack() as held:
             for reference, rows in Counter(references).items():
@@ -195,10 +204,10 @@ class Request(Ticket):
 
 
 def _kind_of_cost(name: str, scene: Scene, parameters: Mapping[str, object]) -> str:
-    """The same for questions of about one cost for any number of objects.
+    """Return a key that is equal for questions of similar cost at the same number of objects.
 
-    The cost also depends on the number of classes, of related classes and of related pairs: one
-    class is cheap and thirty are not, and so are relations of one pair and of all.
+    The cost also depends on the number of classes, of related classes and of related pairs, so the
+    key holds their orders of magnitude.
     """
     of = [thing.class_index for thing in scene.objects]
     orders = [len(set(of)).bit_length(), 0, 0]

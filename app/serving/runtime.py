@@ -1,4 +1,4 @@
-"""What the process serves: one snapshot of models, and the ways to change it."""
+"""The runtime of the process: the current snapshot of models, and its changes."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ T = TypeVar("T")
 
 _logger = logging.getLogger("app.serving")
 
-# An administrator waits this long for another writer; the requests of robots never do.
+# Seconds that an administration request waits for another writer of the store.
 _LOCK_TIMEOUT = 5.0
 
-# Seconds after which the worker thread, where it interprets and does not compute, gives way to the
-# event loop. The interpreter's default of 5 ms is a quarter of a robot's tick.
+# Seconds after which the interpreter switches from a worker thread to the event loop. Its default
+# of 5 ms is a quarter of a robot's control cycle.
 _SWITCH_INTERVAL = 5e-4
 
 
@@ -57,7 +57,7 @@ def _counted(
     [Callable[Concatenate[Runtime, P], Awaitable[T]]],
     Callable[Concatenate[Runtime, P], Awaitable[T]],
 ]:
-    """Count every attempt of a method to change what is served, by how it went."""
+    """Count every call of a method that changes the served models, by its outcome."""
 
     def decorate(
         method: Callable[Concatenate[Runtime, P], Awaitable[T]],
@@ -81,14 +81,14 @@ def _counted(
 
 
 class Runtime:
-    """The one holder of the current snapshot.
+    """Holder of the current snapshot of models.
 
     Args:
-        settings: of the service.
+        settings: settings of the service.
 
     Attributes:
-        backlog: the requests that wait to be read.
-        metrics: of the service.
+        backlog: queued requests.
+        metrics: metrics of the service.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -115,7 +115,7 @@ class Runtime:
         """The current snapshot.
 
         Raises:
-            NotReadyError: nothing has been loaded yet.
+            NotReadyError: the models are not loaded yet.
         """
         if self._models is None:
             raise NotReadyError("The service is starting.")
@@ -128,15 +128,15 @@ class Runtime:
         record: Record | None = None,
         is_gone: Callable[[], Awaitable[bool]] | None = None,
     ) -> Request:
-        """A request that sees the current snapshot from beginning to end.
+        """Create a request that keeps the current snapshot until its end.
 
         Args:
             deadline, is_gone: see `Ticket`.
-            request_id: goes into every answer.
-            record: what becomes known about the request.
+            request_id: id that every answer repeats.
+            record: values for the log and the metrics.
 
         Raises:
-            NotReadyError: nothing has been loaded yet.
+            NotReadyError: the models are not loaded yet.
         """
         return Request(
             deadline,
@@ -150,17 +150,18 @@ class Runtime:
 
     @property
     def draining(self) -> bool:
-        """Whether nothing new is begun."""
+        """Whether the service refuses new requests."""
         return self.backlog.draining
 
     def check_ready(self) -> None:
-        """Return if requests that name no model can be answered.
+        """Check that the service accepts requests and its default model is usable.
 
         Raises:
-            NotReadyError, DrainingError: they cannot.
+            NotReadyError: the default model is not usable.
+            DrainingError: the service is shutting down.
         """
         if self.draining:
-            raise DrainingError("The service finishes the requests in progress, and then ends.")
+            raise DrainingError("The service finishes the requests in progress and then stops.")
         self.models.resolve(DEFAULT)
 
     def drain(self) -> None:
@@ -168,11 +169,11 @@ class Runtime:
         self.backlog.draining = True
 
     async def start(self) -> None:
-        """Load, verify and warm everything in the store; `models` tells what is wrong."""
+        """Load, verify and warm up all versions in the store; `models.failures` lists failures."""
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
         check_cache()
-        # No request waits yet, and another thread would cost time and memory.
+        # On this thread: no request waits yet, and another thread would cost time and memory.
         self._serve(self._load(None))
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
@@ -180,24 +181,23 @@ class Runtime:
             self._polling = asyncio.create_task(self._follow())
 
     def stop(self) -> None:
-        """Let go of the worker threads; what they have not begun is dropped."""
+        """Stop the worker threads and drop their pending work."""
         if self._polling is not None:
             self._polling.cancel()
         self._threads.stop()
 
     @_counted("refresh")
     async def refresh(self, request_id: str) -> RefreshAnswer:
-        """Take over what the store holds now, or leave everything as it is.
+        """Serve the current state of the store, or keep the served models.
 
-        Refused is what makes the service worse: anything that fails and did not before, and any
-        state whose default model is not usable.
+        The service refuses a state with a new failure, and a state without a usable default model.
 
         Raises:
-            RefreshRefusedError: nothing has changed.
-            NotReadyError: nothing has been loaded yet.
+            RefreshRefusedError: the new state was refused; the served models are unchanged.
+            NotReadyError: the models are not loaded yet.
         """
         async with self._changing:
-            # Not the old snapshot itself: its memory is to be free when the new one settles.
+            # Keep only names of the old snapshot, so that its memory can be freed.
             failed, served = set(self.models.failures), set(self.models.served)
             new = await self._take_over(lambda subject: subject == DEFAULT or subject not in failed)
             return RefreshAnswer(
@@ -210,15 +210,16 @@ class Runtime:
 
     @_counted("alias")
     async def move_alias(self, alias: str, request: AliasRequest, request_id: str) -> AliasAnswer:
-        """Let an alias lead to a version that is served, here at once and in the store for good.
+        """Point an alias at a served version, in the store and in this process.
 
         Raises:
-            RequestError: no alias can have this name.
-            UnknownModelError: no such model or version is served.
+            RequestError: the name is not valid for an alias.
+            UnknownModelError: the model or version is not served.
             ModelUnusableError: the version was refused.
-            AliasConflictError: the alias leads elsewhere than expected, or is a model's name.
-            StoreNotWritableError, StoreBusyError: the store cannot be changed (now).
-            NotReadyError: nothing has been loaded yet.
+            AliasConflictError: the alias has another target than expected, or is a model's name.
+            StoreNotWritableError: this process cannot write to the store.
+            StoreBusyError: another process is writing to the store.
+            NotReadyError: the models are not loaded yet.
         """
         async with self._changing:
             target = self._target(request.model)
@@ -237,7 +238,7 @@ class Runtime:
             )
 
     async def _follow(self) -> None:
-        """Take over what others change in the store: publishers, operators, other replicas."""
+        """Poll the store for changes by publishers, operators or other replicas."""
         while True:
             await asyncio.sleep(self._poll)
             if await asyncio.to_thread(self._store.state) == self._seen:
@@ -247,20 +248,21 @@ class Runtime:
             except RefreshRefusedError as error:
                 for failure in error.failures:
                     _logger.error(
-                        "The store's changes are not served: %s: %s: %s",
+                        "Changes in the store were refused: %s: %s: %s",
                         *(failure.subject, failure.reason, failure.detail),
                     )
             except Exception:
-                _logger.exception("The store's changes could not be loaded")
+                _logger.exception("Changes in the store could not be loaded")
 
     @_counted("poll")
     async def _take_over_changes(self) -> None:
-        """Take over the store's changes; a version or alias that works now must go on working.
+        """Serve the changes in the store, if every usable version and alias stays usable.
 
-        New versions that fail are listed as refused and keep nothing else back.
+        A new version that fails is listed as refused; the other changes still take effect.
 
         Raises:
-            RefreshRefusedError: something would stop working; nothing has changed.
+            RefreshRefusedError: a version or alias would stop working; the served models are
+                unchanged.
         """
         async with self._changing:
             await self._take_over(self.models.usable.__contains__)
@@ -269,12 +271,12 @@ class Runtime:
         """Load the store and serve it.
 
         Args:
-            matters: whether the failure of a subject keeps everything as it is.
+            matters: whether a failure of this subject makes the service refuse the new state.
 
         Raises:
-            RefreshRefusedError: such a subject fails.
+            RefreshRefusedError: the new state was refused.
         """
-        # In a thread, so that the old snapshot goes on answering.
+        # In a thread, so that the old snapshot answers in the meantime.
         new = await asyncio.to_thread(self._load, self.models)
         worse = [failure for subject, failure in new.failures.items() if matters(subject)]
         if worse:
@@ -290,7 +292,7 @@ class Runtime:
             _settle_memory()
 
     def _load(self, previous: ServedModels | None) -> ServedModels:
-        # Before anything is read: what changes meanwhile is seen by the next look.
+        # Before the files are read, so that the next poll sees changes made during the load.
         self._seen = self._store.state()
         known = None if previous is None else previous.store
         with progress():
@@ -303,8 +305,8 @@ class Runtime:
         try:
             found = self.models.resolve(reference).reference
         except (ModelUnavailableError, NotReadyError):
-            raise ModelUnusableError("This version was refused when it was loaded.") from None
-        # A model's bare name stays one, so that the alias follows its newest version.
+            raise ModelUnusableError("The service refused to load this version.") from None
+        # With a name without version, the alias follows the newest version of the model.
         newest = reference == found.name
         return AliasTarget(name=found.name, version=None if newest else found.version)
 
@@ -318,23 +320,23 @@ def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
     try:
         return AliasTarget(name=name, version=version if at else None)
     except ValueError:
-        raise AliasConflictError("No alias leads where the request expected.") from None
+        raise AliasConflictError("The value of expected is not a model or version.") from None
 
 
 def _refusal(error: StoreError) -> Exception:
     match error.code:
         case "alias_conflict":
-            return AliasConflictError("The alias does not lead where the request expected.")
+            return AliasConflictError("The alias points to another version than expected.")
         case "name_conflict":
-            return AliasConflictError("A model has this name, so no alias can.")
+            return AliasConflictError("A model already has the name of this alias.")
         case "invalid_reference":
             return RequestError(Reason.INVALID, [Fault((), error.reason)])
         case "unknown_model" | "unknown_version":
-            return UnknownModelError("The store no longer has this version.")
+            return UnknownModelError("The store no longer contains this version.")
         case "locked":
             return StoreBusyError("Another process is writing to the store.")
         case _:
-            return StoreNotWritableError(f"The store's aliases cannot be changed: {error.reason}.")
+            return StoreNotWritableError(f"The service cannot write the aliases: {error.reason}.")
 
 
 def _names(keys: Iterable[Key]) -> list[str]:
@@ -344,10 +346,9 @@ def _names(keys: Iterable[Key]) -> list[str]:
 def _settle_memory() -> None:
     """Exclude long-lived objects from garbage collection.
 
-    A full collection stops every thread for tens of milliseconds. Frozen objects of a replaced
-    snapshot are unfrozen first, or their cycles would never be freed; at the start there are none.
-    Pages that loading has left empty go back to the system, where the C library can do that: some
-    30 MB.
+    A full collection stops every thread for tens of milliseconds. Objects of a replaced snapshot
+    are unfrozen first, because frozen reference cycles are never freed. Where the C library
+    supports it, empty pages (about 30 MB after loading) go back to the system.
     """
     gc.unfreeze()
     if gc.isenabled():

@@ -1,7 +1,8 @@
-"""The scene of a stream and its answers; docs/stream.md is the contract.
+"""The scene of a stream and its answers; docs/stream.md describes the protocol.
 
-A message is merged into the scene on arrival, or refused without effect. Only the newest scene is
-computed, so a superseded update costs no answer. This module knows nothing of WebSockets.
+A valid message is merged into the scene on arrival; an invalid message is refused without effect.
+Only the newest scene is computed, so a superseded update costs no computation. This module is
+independent of WebSockets.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from app.serving.request import Request
 from scene_client.schemas import MissingOptions, OutliersOptions, SceneRequest
 from scene_client.stream_messages import Ask, MergedScene, SceneMessage, Update, Whole, object_id
 
-# Fields of a message beside the scene.
+# Fields of a message that do not belong to the scene.
 _NOT_REQUESTED: Final = frozenset({"ask", "timeout_ms"})
 _DEFAULT_ASK: Final = Ask(missing=MissingOptions(), outliers=OutliersOptions())
 _BY_NAME: Final = {question.name: question for question in QUESTIONS}
@@ -33,8 +34,8 @@ class StreamScene:
     """The scene of one stream and the number of its unanswered messages.
 
     Attributes:
-        seq: of the newest message in the scene; 0: only the opening.
-        pending: messages since the last answer.
+        seq: `seq` of the newest message in the scene; 0 if only `open` has arrived.
+        pending: number of messages since the last answer.
     """
 
     def __init__(self) -> None:
@@ -44,7 +45,7 @@ class StreamScene:
 
     @property
     def timeout_ms(self) -> int | None:
-        """The client's deadline for an answer."""
+        """Time limit for an answer that the client chose, in milliseconds."""
         timeout: int | None = self._scene.fields.get("timeout_ms")
         return timeout
 
@@ -52,12 +53,12 @@ class StreamScene:
         """Merge a message into the scene.
 
         Raises:
-            RequestError: the message, or the scene with it, is invalid; the scene is as before.
+            RequestError: the message or the merged scene is invalid; the scene stays unchanged.
             UnknownModelError, ModelUnavailableError: see `Request.read`.
         """
         faults = Faults()
         if isinstance(message, Whole | Update) and message.seq <= self.seq:
-            text = "must be greater than that of the newest message taken"
+            text = "must be greater than the seq of the newest accepted message"
             faults.add(Reason.INVALID, ("seq",), text)
         for place, name in enumerate(message.remove if isinstance(message, Update) else ()):
             if name not in self._scene.objects:
@@ -69,7 +70,7 @@ class StreamScene:
                 faults.add(Reason.INVALID, ("objects", place, "id"), "another object has this id")
         scene = self._scene.after(message)
         if len(scene.objects) > request.limits.objects:
-            text = f"the scene would hold more than {request.limits.objects} objects"
+            text = f"the scene would have more than {request.limits.objects} objects"
             faults.add(Reason.INVALID, ("objects",), text)
         faults.raise_any()
         try:
@@ -84,7 +85,7 @@ class StreamScene:
             self.pending += 1
 
     async def answer(self, request: Request) -> tuple[Answer, dict[str, ServingError]]:
-        """The answers about the newest scene as a message, and the errors by question."""
+        """Return a message with the answers about the newest scene, and the errors by question."""
         seq, covered = self.seq, self.pending
         found, errors = await _answers(self._scene, request)
         self.pending -= covered
@@ -93,7 +94,7 @@ class StreamScene:
 
 
 def _request(scene: MergedScene, form: type[SceneRequest] = SceneRequest, **given: Any) -> Any:
-    """The scene as one request holds it."""
+    """Return the scene as a request."""
     fields = {name: value for name, value in scene.fields.items() if name not in _NOT_REQUESTED}
     return form(objects=list(scene.objects.values()), **fields, **given)
 
@@ -101,11 +102,15 @@ def _request(scene: MergedScene, form: type[SceneRequest] = SceneRequest, **give
 def _in_message(
     error: RequestError, scene: MergedScene, places: Mapping[str, int], given: Set[str]
 ) -> RequestError:
-    """The faults at their places in the message; below ``scene`` where only the scene has them.
+    """Translate the locations of errors in the scene into locations in the message.
+
+    A location outside the message starts with ``scene``.
 
     Args:
-        places: of the message's objects, by id.
-        given: the message's fields.
+        error: the errors, located in the scene.
+        scene: the merged scene.
+        places: positions of the message's objects, by id.
+        given: names of the message's fields.
     """
     names = list(scene.objects)
 
@@ -124,18 +129,18 @@ def _in_message(
 async def _answers(
     scene: MergedScene, request: Request
 ) -> tuple[dict[str, Answer], dict[str, ServingError]]:
-    """The answers by question, as the routes give them, and the errors of the others."""
+    """Return the answers by question, as the routes return them, and the errors by question."""
     ask = scene.fields.get("ask") or _DEFAULT_ASK
     asked = [question for question in _ASKED if getattr(ask, question.name) is not None]
     names = [question.name for question in asked]
     bare = _request(scene)
     try:
         model, reading = request.read(bare, may_be_empty=True)
-    except RequestError as error:  # another model than when the messages were taken
+    except RequestError as error:  # the alias now points to a model with other classes
         return {}, dict.fromkeys(names, _in_message(error, scene, {}, frozenset()))
     except ServingError as error:
         return {}, dict.fromkeys(names, error)
-    # One reading and one deadline for all questions.
+    # All questions share one reading of the scene and one deadline.
     request = replace(request, known=(model, reading), low_priority=True)
     found: dict[str, Answer] = {}
     errors: dict[str, ServingError] = {}
@@ -160,7 +165,7 @@ async def _answers(
 
 
 class TokenBucket:
-    """A rate limit: ``burst`` tokens at once, then ``rate`` a second."""
+    """A rate limit of ``burst`` tokens at once, then ``rate`` tokens per second."""
 
     def __init__(self, rate: float, burst: float) -> None:
         self._rate = rate
@@ -169,7 +174,7 @@ class TokenBucket:
         self._at = monotonic()
 
     def take(self, count: float) -> float:
-        """Take tokens; the seconds to wait until they are there."""
+        """Take ``count`` tokens and return the seconds to wait until they are available."""
         now = monotonic()
         self._tokens = min(self._burst, self._tokens + (now - self._at) * self._rate) - count
         self._at = now
@@ -180,8 +185,8 @@ class Streams:
     """The open streams of the process.
 
     Args:
-        limit: most streams at once.
-        metrics: counts them.
+        limit: maximum number of open streams.
+        metrics: metrics of the service.
     """
 
     def __init__(self, limit: int, metrics: Metrics) -> None:
@@ -191,15 +196,15 @@ class Streams:
 
     @property
     def is_full(self) -> bool:
-        """Whether one more stream would be too many."""
+        """Whether the maximum number of streams is open."""
         return len(self._open) >= self.limit
 
     @contextmanager
     def place(self, end: Callable[[], None]) -> Iterator[None]:
-        """The place of one stream.
+        """Count a stream as open within the context.
 
         Args:
-            end: lets it end soon; called at most once.
+            end: asks the stream to end; called at most once.
         """
         self._open.add(end)
         self._metrics.streams(len(self._open))
@@ -210,7 +215,7 @@ class Streams:
             self._metrics.streams(len(self._open))
 
     def drain(self) -> None:
-        """Let every stream end after the answer in progress."""
+        """Ask every stream to end after the answer in progress."""
         for end in tuple(self._open):
             self._open.discard(end)
             end()

@@ -24,10 +24,14 @@ _logger = logging.getLogger("app.serving")
 def prepare(
     store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels | None = None
 ) -> ServedModels:
-    """Let every verified model answer each question.
+    """Warm up every verified model: let it answer each question.
 
-    A model that ``previous`` serves from the same artifact has answered already, and keeps its
-    queue.
+    A model that ``previous`` serves from the same artifact needs no warm-up and keeps its queue.
+
+    Args:
+        store: snapshot of the registry.
+        new_queue: creates the queue of a model.
+        previous: the models served so far.
     """
     served: dict[Key, ServedModel] = {}
     failures: dict[Key, Failure] = {}
@@ -41,13 +45,13 @@ def prepare(
         try:
             warm_up(artifact)
         except Exception:
-            # Whatever a broken model raises, it must not take the others down with it.
+            # An exception of a broken model must not stop the other models.
             subject = f"{key[0]}@{key[1]}"
-            _logger.exception("%s did not answer its warm-up", subject)
+            _logger.exception("%s failed its warm-up", subject)
             failures[key] = Failure(
                 subject=subject,
                 reason="warm_up_failed",
-                detail="it verified, but could not answer a question",
+                detail="the files are valid, but the model failed to answer a question",
             )
         else:
             served[key] = ServedModel(artifact, new_queue())
@@ -67,11 +71,11 @@ def warm_up(artifact: Artifact) -> None:
     scenes = related, bare, posed
     numbers = [number for question in QUESTIONS for number in question.warm_up(artifact, scenes)]
     if not all(map(math.isfinite, significant(numbers))):
-        raise ValueError("the model gives answers that are not finite")
+        raise ValueError("an answer of the model is not finite")
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """A row of three objects, or fewer in a smaller vocabulary; one stands on another."""
+    """Return a scene of up to three classes in a row, with one observed relation."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
         SceneObject(str(place), vocabulary.labels[index], index, position=(1.0, 0.5 * place, 0.5))

@@ -1,4 +1,4 @@
-"""What is probably a mistake in a scene: told with the answer, which is given all the same."""
+"""Warnings about probable mistakes in a scene; they accompany the answer."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import SceneRequest, SceneWarning
 
-MOST_DISTANT: Final = 100.0  # m: millimetres taken for metres are a thousand times as far
+MOST_DISTANT: Final = 100.0  # m; millimetres sent as metres exceed this distance
 SMALLEST, LARGEST = 1e-3, 20.0  # m, sides of a box
 _SAME_DEPTH: Final = 1e-3  # m
-_LEAST_FLAT: Final = 3  # objects; two may stand side by side
+_LEAST_FLAT: Final = 3  # objects; two objects may really have the same depth
 
 Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"]
 
@@ -23,42 +23,46 @@ Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknow
 def scene_warnings(
     given: Scene, scene: Scene, vocabulary: Vocabulary, request: SceneRequest
 ) -> list[SceneWarning]:
-    """The warnings of a scene, in a fixed order.
+    """Return the warnings of a scene, in a fixed order.
 
     Args:
-        given: in body axes of the request's frame.
-        scene: the same after `observe`: seen from the viewpoint, if there is one.
+        given: the scene in body axes of the request's frame.
+        scene: the same scene after `observe`, in the viewer's axes if the request has a viewpoint.
+        vocabulary: classes of the model, with their typical sizes.
+        request: the request that holds the scene.
     """
     found: list[SceneWarning] = []
     sized = [thing for thing in scene.objects if thing.size is not None]
-    # Plain comparisons: most scenes have no poses, and all others pass them.
+    # Plain comparisons are fast enough: most scenes have no poses or pass all checks.
     placed = [thing for thing in scene.objects if thing.position is not None]
     if placed:
         _add(
             found,
             "implausible-position",
-            f"more than {MOST_DISTANT:g} m away: positions are metres, not millimetres",
+            f"the object is more than {MOST_DISTANT:g} m away; positions must be in metres",
             _distant(given, request),
         )
     if sized:
         _add(
             found,
             "implausible-size",
-            f"a side below {SMALLEST * 1e3:g} mm or above {LARGEST:g} m: sizes are metres",
+            f"a side is below {SMALLEST * 1e3:g} mm or above {LARGEST:g} m; "
+            "sizes must be in metres",
             [thing for thing in sized if not _is_plausible(thing.size)],
         )
     if request.frame_id is not None and is_optical(request.frame_id) and _is_flat(given):
         _add(
             found,
             "flat-scene",
-            "all positions have one depth along the optical axis: is the depth missing?",
+            "all objects have the same depth along the optical axis; the depth may be missing",
             placed,
         )
     if scene.poses is not None and len(placed) > 1:
         _add(
             found,
             "unknown-sizes",
-            "vertical relations are unobserved: no size is given, and none is typical of the class",
+            "vertical relations are not observed: the object has no size, and its class has no "
+            "typical size",
             _unsized(placed, vocabulary),
         )
     return found
@@ -73,7 +77,10 @@ def _add(
 
 
 def _distant(given: Scene, request: SceneRequest) -> list[SceneObject]:
-    """Objects far from the viewer or, where its place in the world is unknown, from the others."""
+    """Return the objects far from the viewer.
+
+    In a world-fixed frame without a viewpoint, the median position replaces the viewer.
+    """
     placed = [(thing, thing.position) for thing in given.objects if thing.position is not None]
     centre: Point = (0.0, 0.0, 0.0)
     if request.viewpoint is not None:
@@ -89,7 +96,7 @@ def _is_plausible(size: Point | None) -> bool:
 
 
 def _is_flat(given: Scene) -> bool:
-    """Whether all have the same depth along the optical axis, which is x in body axes."""
+    """Return whether all objects have the same depth: x in body axes, along the optical axis."""
     depths = [thing.position[0] for thing in given.objects if thing.position is not None]
     return len(depths) >= _LEAST_FLAT and max(depths) - min(depths) <= _SAME_DEPTH
 

@@ -1,7 +1,7 @@
 "use strict";
 
-// Shows openapi.json with Swagger UI. A file of its own, because the page's policy runs no inline
-// script; validatorUrl is null, because the default asks a server on the internet.
+// Shows openapi.json with Swagger UI. A separate file, because the page's policy forbids inline
+// scripts. validatorUrl is null, because the default uses a server on the internet.
 SwaggerUIBundle({
   url: "openapi.json",
   dom_id: "#docs",

@@ -1,4 +1,4 @@
 "use strict";
 
-// Shows openapi.json with Redoc. A file of its own, because the page's policy runs no inline script.
+// Shows openapi.json with Redoc. A separate file, because the page's policy forbids inline scripts.
 Redoc.init("openapi.json", { disableSearch: false, nativeScrollbars: true }, document.getElementById("docs"));

@@ -37,23 +37,23 @@ def test_axe_finds_nothing_in_any_state(open_board: OpenBoard, scheme: str) -> N
     # Another model that knows all of the example's labels.
     references = [str(one.get_attribute("value")) for one in page.locator("#second option").all()]
     (second,) = [name for name in references if name.startswith("indoor-rbm@")]
-    page.get_by_label("beside it").select_option(second)
+    page.get_by_label("versus").select_option(second)
     page.locator("#list .name").first.click()
     board.settle()
-    board.column("missing").get_by_text("The same from a program").click()
+    board.column("missing").get_by_text("Send this request from a program").click()
     found["two models, form, calls"] = complaints(board)
-    page.get_by_role("button", name="What can be done with bed").click()
+    page.get_by_role("button", name="Actions for bed").click()
     found["menu"] = complaints(board)
     page.keyboard.press("Escape")
-    for tab in ("Wrong", "Relations", "Imagine"):
+    for tab in ("Wrong", "Relations", "Generate"):
         board.tab(tab)
         found[tab] = complaints(board)
-    page.get_by_text("Contexts to hold on").click()
-    page.get_by_role("button", name="Draw a scene").click()
+    page.get_by_text("Contexts that stay on").click()
+    page.get_by_role("button", name="Generate a scene").click()
     page.wait_for_timeout(300)
     board.settle()
     found["drawn"] = complaints(board)
-    page.get_by_role("button", name="Back to mine").click()
+    page.get_by_role("button", name="Back to my scene").click()
     page.get_by_role("combobox", name="Add an object").fill("la")
     found["search"] = complaints(board)
     page.get_by_role("combobox", name="Add an object").press("Escape")
@@ -128,7 +128,7 @@ def test_everything_can_be_done_by_keyboard(open_board: OpenBoard) -> None:
     press("ArrowRight")
     expect(page.get_by_role("tab", name="Wrong")).to_have_attribute("aria-selected", "true")
     press("End")
-    expect(page.get_by_role("tab", name="Imagine")).to_have_attribute("aria-selected", "true")
+    expect(page.get_by_role("tab", name="Generate")).to_have_attribute("aria-selected", "true")
     press("Home")
     board.settle()
     count = len(board.things)
@@ -147,7 +147,7 @@ def test_answers_and_movements_are_announced(open_board: OpenBoard, api: httpx.C
     board.page.keyboard.press("ArrowUp")
     expect(board.page.locator("#live")).to_contain_text("chair: x 1.10, y 0.00")
     board.page.keyboard.press("r")
-    expect(board.page.locator("#live")).to_contain_text("turned to 15 degrees")
+    expect(board.page.locator("#live")).to_contain_text("rotated to 15 degrees")
 
 
 def test_the_dialog_keeps_the_focus_and_gives_it_back(open_board: OpenBoard) -> None:
@@ -185,7 +185,7 @@ def test_nothing_moves_for_who_wants_no_motion(open_board: OpenBoard) -> None:
 @pytest.mark.slow
 def test_a_narrow_page_does_not_scroll_sideways(open_board: OpenBoard) -> None:
     board = open_board(scene=None, width=320)
-    for tab in ("Missing", "Wrong", "Relations", "Imagine"):
+    for tab in ("Missing", "Wrong", "Relations", "Generate"):
         board.tab(tab)
         wide = board.page.evaluate(
             "[...document.querySelectorAll('body *')].filter((one) =>"

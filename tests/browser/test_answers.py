@@ -153,7 +153,7 @@ def test_what_is_accepted_stands_where_the_page_says(bedroom: Board, api: httpx.
 def test_what_is_missing_at_a_place_is_asked_from_an_objects_menu(
     bedroom: Board, api: httpx.Client
 ) -> None:
-    bedroom.page.get_by_role("button", name="What can be done with nightstand").click()
+    bedroom.page.get_by_role("button", name="Actions for nightstand").click()
     bedroom.page.get_by_role("menuitem", name="What is missing on top of it?").click()
     bedroom.settle()
     at = {"relation": "on-top", "object": "nightstand"}
@@ -228,7 +228,7 @@ def test_the_alarm_can_be_set_elsewhere(bedroom: Board, api: httpx.Client) -> No
     found = bedroom.page.locator("#board .object.outlier")
     expect(found).to_have_count(sum(one["is_outlier"] for one in answer["outliers"]))
     assert found.count() > 1
-    bedroom.page.get_by_role("button", name="The model’s own threshold").click()
+    bedroom.page.get_by_role("button", name="Use the model’s threshold").click()
     bedroom.settle()
     assert "threshold" not in bedroom.body("outliers")
 
@@ -237,8 +237,8 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
     bedroom: Board, api: httpx.Client
 ) -> None:
     bedroom.tab("Relations")
-    bedroom.slide("At least", 10)
-    bedroom.slide("At most", 8)
+    bedroom.slide("Minimum probability", 10)
+    bedroom.slide("Maximum number", 8)
     answer = ask(api, "relations", bedroom.scene, top_k=8, min_probability=0.1)
     seen = [
         (one["subject"], one["relation"], one["object"]) for one in answer["observed_relations"]
@@ -252,7 +252,7 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
         assert row.startswith(f"{one['subject']} {SPOKEN[one['relation']]} {one['object']}")
         assert row.endswith(percent(one["probability"]))
         holds = (one["subject"], one["relation"], one["object"]) in seen
-        assert ("so it is" in row) == holds
+        assert ("observed" in row) == holds
         kinds.add("holds" if holds else "expected")
     assert {kind for kind, _ in bedroom.edges} == kinds >= {"holds", "expected"}
     said = {
@@ -263,7 +263,7 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
     assert words
     assert words <= said
     bedroom.page.locator("#list .name", has_text="oven").click()
-    bedroom.page.get_by_label("only those of the selected object").check()
+    bedroom.page.get_by_label("only relations of the selected object").check()
     bedroom.settle()
     of_oven = [
         one
@@ -272,12 +272,12 @@ def test_relations_are_edges_and_those_that_hold_are_told_apart(
     ]
     assert len(bedroom.rows("relations")) == len(of_oven)
     before = len(bedroom.edges)
-    bedroom.page.get_by_label("draw all that positions show").check()
+    bedroom.page.get_by_label("draw all observed relations").check()
     bedroom.settle()
     assert len(bedroom.edges) >= before
-    bedroom.page.get_by_label("only those of the selected object").uncheck()
+    bedroom.page.get_by_label("only relations of the selected object").uncheck()
     # A pair has one edge, and what is expected of it comes first.
-    bedroom.slide("At least", 50)
+    bedroom.slide("Minimum probability", 50)
     bedroom.settle()
     assert "observed" in {kind for kind, _ in bedroom.edges}
 
@@ -314,7 +314,7 @@ def test_disagreements_are_drawn_where_an_answer_has_them(bedroom: Board) -> Non
 
     bedroom.page.route("**/relations", disagreeing)
     bedroom.tab("Relations")
-    bedroom.slide("At most", 10)
+    bedroom.slide("Maximum number", 10)
     assert ("disagrees", "right of 70 %, but left of") in bedroom.edges
     assert "nightstand left of bed 10 % expected: right of, 70 %" in bedroom.rows("relations")
 
@@ -325,7 +325,7 @@ def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> No
     shown = bedroom.page.locator("#second option")
     assert set(references) <= {option.get_attribute("value") for option in shown.all()}
     (second,) = [name for name in references if name.startswith("indoor-rbm@")]
-    bedroom.page.get_by_label("beside it").select_option(second)
+    bedroom.page.get_by_label("versus").select_option(second)
     bedroom.settle()
     for number, model in enumerate(("default", second)):
         answer = ask(api, "missing", bedroom.scene, top_k=5, model=model)
@@ -342,7 +342,7 @@ def test_two_models_answer_side_by_side(bedroom: Board, api: httpx.Client) -> No
     assert {text.split(" %")[0].rsplit(" ", 1)[0] for text in bedroom.ghosts} <= {
         one["label"] for one in answer["missing"]
     }
-    bedroom.page.get_by_label("beside it").select_option("")
+    bedroom.page.get_by_label("versus").select_option("")
     bedroom.settle()
     expect(bedroom.column("missing", 1)).to_be_hidden()
 
@@ -354,8 +354,8 @@ def test_a_label_that_a_model_does_not_know_is_told_at_the_object_and_can_be_lef
     board = open_board(scene, allow=("422",))
     expect(board.page.locator("#list li").nth(1).locator(".error")).to_contain_text("bed")
     expect(board.column("missing").get_by_role("alert")).to_contain_text("bedd: ")
-    board.page.get_by_label("beside it").select_option(index=3)
-    second = board.page.get_by_label("beside it").input_value()
+    board.page.get_by_label("versus").select_option(index=3)
+    second = board.page.get_by_label("versus").input_value()
     told = board.page.locator("#list li").nth(1).locator(".error")
     expect(told).to_contain_text("default: ")
     expect(told).to_contain_text(f"{second}: ")
@@ -363,7 +363,7 @@ def test_a_label_that_a_model_does_not_know_is_told_at_the_object_and_can_be_lef
     board.page.get_by_label("Objects that a model does not know").select_option("ignore")
     board.settle()
     assert board.rows("missing")
-    expect(board.column("missing")).to_contain_text("Left out: bedd")
+    expect(board.column("missing")).to_contain_text("Ignored: bedd")
     expect(board.page.locator("#list li").nth(1).locator(".error")).to_be_empty()
 
 
@@ -400,7 +400,7 @@ def test_the_python_call_shown_gives_the_same_answer(
 
 def test_calls_can_be_copied(open_board: OpenBoard) -> None:
     board = open_board(permissions=["clipboard-read", "clipboard-write"])
-    board.column("missing").get_by_text("The same from a program").click()
+    board.column("missing").get_by_text("Send this request from a program").click()
     board.column("missing").get_by_role("button", name="Copy the curl call").click()
     expect(board.column("missing").get_by_text("copied")).to_be_visible()
     assert board.page.evaluate("navigator.clipboard.readText()") == board.curl("missing")

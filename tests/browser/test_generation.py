@@ -19,7 +19,7 @@ OpenBoard = Callable[..., Board]
 def draw(board: Board, seed: int = 11) -> None:
     form = board.page.locator("#generate")
     form.get_by_label("Seed").fill(str(seed))
-    board.page.get_by_role("button", name="Draw a scene").click()
+    board.page.get_by_role("button", name="Generate a scene").click()
     expect(board.page.get_by_role("slider", name="Sweep")).to_have_attribute(
         "aria-valuetext", "after 50 sweeps", timeout=20_000
     )
@@ -39,7 +39,7 @@ def test_each_stop_is_what_the_service_draws_with_so_many_sweeps(
     open_board: OpenBoard, api: httpx.Client
 ) -> None:
     board = open_board()
-    board.tab("Imagine")
+    board.tab("Generate")
     board.page.locator("#generate").get_by_label("Room").select_option("kitchen")
     draw(board)
     slider = board.page.get_by_role("slider", name="Sweep")
@@ -60,7 +60,7 @@ def test_a_drawn_scene_can_be_kept_and_reads_as_it_was_drawn(
     open_board: OpenBoard, api: httpx.Client
 ) -> None:
     board = open_board()
-    board.tab("Imagine")
+    board.tab("Generate")
     board.page.locator("#generate").get_by_label("Room").select_option("bedroom")
     draw(board)
     (scene,) = api.post("/generate", json=request(board)).json()["scenes"]
@@ -83,13 +83,13 @@ def test_what_is_on_the_board_stays_in_the_drawn_scene(
     open_board: OpenBoard, api: httpx.Client
 ) -> None:
     board = open_board()
-    board.tab("Imagine")
-    board.page.get_by_label("with what is on the board").check()
+    board.tab("Generate")
+    board.page.get_by_label("with the objects on the board").check()
     draw(board)
     assert {"desk", "chair"} <= set(chips(board))
     assert [thing["id"] for thing in request(board)["objects"]] == ["desk", "chair"]
     expect(board.page.locator("#board .object:not(.new)")).to_have_count(2)
-    board.page.get_by_role("button", name="Back to mine").click()
+    board.page.get_by_role("button", name="Back to my scene").click()
     board.settle()
     expect(board.page.locator("#board .object")).to_have_count(2)
 
@@ -97,8 +97,8 @@ def test_what_is_on_the_board_stays_in_the_drawn_scene(
 @pytest.mark.slow
 def test_contexts_are_named_and_can_be_held_on(open_board: OpenBoard, api: httpx.Client) -> None:
     board = open_board()
-    board.tab("Imagine")
-    board.page.get_by_text("Contexts to hold on").click()
+    board.tab("Generate")
+    board.page.get_by_text("Contexts that stay on").click()
     board.page.get_by_label("Find a context by its objects").fill("toilet")
     boxes = board.page.locator("#units label")
     expect(boxes.first).to_contain_text("h1")
@@ -121,7 +121,7 @@ def test_contexts_are_named_and_can_be_held_on(open_board: OpenBoard, api: httpx
 @pytest.mark.slow
 def test_another_seed_draws_another_scene(open_board: OpenBoard) -> None:
     board = open_board()
-    board.tab("Imagine")
+    board.tab("Generate")
     draw(board)
     first = chips(board)
     board.page.get_by_role("button", name="Another seed").click()
@@ -133,18 +133,18 @@ def test_another_seed_draws_another_scene(open_board: OpenBoard) -> None:
 
 def test_a_seed_that_is_none_is_refused_by_the_form(open_board: OpenBoard) -> None:
     board = open_board()
-    board.tab("Imagine")
+    board.tab("Generate")
     board.page.locator("#generate").get_by_label("Seed").fill("")
-    board.page.get_by_role("button", name="Draw a scene").click()
+    board.page.get_by_role("button", name="Generate a scene").click()
     assert board.page.evaluate("document.querySelector('[name=seed]').validity.valueMissing")
     expect(board.page.locator("#draft")).to_be_hidden()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("button", ["Back to mine", "Stop"])
+@pytest.mark.parametrize("button", ["Back to my scene", "Stop"])
 def test_a_drawing_that_runs_can_be_ended(open_board: OpenBoard, button: str) -> None:
     board = open_board()
-    board.tab("Imagine")
+    board.tab("Generate")
     held: list[Route] = []
 
     def slow(route: Route) -> None:
@@ -155,7 +155,7 @@ def test_a_drawing_that_runs_can_be_ended(open_board: OpenBoard, button: str) ->
             held.append(route)
 
     board.page.route("**/generate", slow)
-    board.page.get_by_role("button", name="Draw a scene").click()
+    board.page.get_by_role("button", name="Generate a scene").click()
     expect(board.page.locator("#draft")).to_be_visible()
     expect(board.page.get_by_role("button", name="Stop")).to_be_visible()
     board.page.get_by_role("button", name=button).click()
@@ -164,6 +164,6 @@ def test_a_drawing_that_runs_can_be_ended(open_board: OpenBoard, button: str) ->
     asked = len(held)
     board.page.wait_for_timeout(300)
     assert len(held) == asked <= 3
-    if button == "Back to mine":
+    if button == "Back to my scene":
         expect(board.page.locator("#draft")).to_be_hidden()
         assert board.things == ["desk", "chair"]

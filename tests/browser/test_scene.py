@@ -144,7 +144,7 @@ def test_numbers_can_be_typed(open_board: OpenBoard) -> None:
     form.get_by_label("Name").press("Enter")
     form.get_by_label("ahead (x)").fill("1.25")
     form.get_by_label("height").fill("1.1")
-    form.get_by_label("Turned, degrees").fill("90")
+    form.get_by_label("Rotation, degrees").fill("90")
     form.get_by_label("Confidence").fill("0.8")
     form.get_by_label("Confidence").press("Enter")
     board.settle()
@@ -207,21 +207,21 @@ def test_labels_and_relations_alone_are_laid_out(open_board: OpenBoard, api: htt
 
 NO_SCENES = [
     ("{", "not JSON"),
-    ("[]", "A scene is an object"),
-    ('{"objects": [{"label": "bed", "size": {"x": -1, "y": 1, "z": 1}}]}', "positive metres"),
-    ('{"objects": [{"id": "a", "label": "bed"}, {"id": "a", "label": "bed"}]}', "another one"),
+    ("[]", "A scene must be a JSON object"),
+    ('{"objects": [{"label": "bed", "size": {"x": -1, "y": 1, "z": 1}}]}', "positive numbers"),
+    ('{"objects": [{"id": "a", "label": "bed"}, {"id": "a", "label": "bed"}]}', "another object"),
     ('{"objects": [{"label": "bed", "position": {"x": 1e9, "y": 0, "z": 0}}]}', "100 000 km"),
     ('{"objects": [{"label": "bed", "size": {"x": 2e4, "y": 1, "z": 1}}]}', "10 km"),
-    ('{"objects": ["bed"], "relations": [null]}', "Relation 1 is no object"),
+    ('{"objects": ["bed"], "relations": [null]}', "Relation 1 must have a subject"),
     (
         '{"objects": ["bed", "rug"], "relations": '
         '[{"subject": "rug", "relation": "constructor", "object": "bed"}]}',
-        "none of left, right",
+        "one of left, right",
     ),
     (
         '{"objects": ["bed"], "relations": '
         '[{"subject": "rug", "relation": "under", "object": "bed"}]}',
-        "not in the scene: rug",
+        "outside the scene: rug",
     ),
     ('{"objects": [], "viewpoint": {"x": 0, "y": 0, "yaw": 2e3}}', "±1000"),
 ]
@@ -292,7 +292,7 @@ def test_relations_that_positions_replace_are_told(open_board: OpenBoard) -> Non
     given = [{"subject": "chair", "relation": "left", "object": "desk"}]
     board.put(json.dumps(board.exported() | {"relations": given}))
     expect(board.page.locator("#note")).to_have_text(
-        "1 given relation was left out: the board asks by positions."
+        "1 relation was ignored: requests of the board contain positions only."
     )
     board.page.get_by_role("button", name="Clear").click()
     expect(board.page.locator("#note")).to_be_hidden()

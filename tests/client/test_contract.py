@@ -102,7 +102,7 @@ def test_an_unknown_label_is_a_problem_with_suggestions(caller: Caller) -> None:
     assert error.suggestions[0] == "nightstand"
     assert problem.request_id
     assert problem.title
-    assert "1 fault" in problem.detail
+    assert "1 error" in problem.detail
     assert problem.retry_after is None
 
 

@@ -73,5 +73,5 @@ def test_weights_that_are_not_finite_are_refused(value):
 
 @pytest.mark.parametrize("shape", [(4,), (3, 1), ()])
 def test_logits_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match=r"x must be \(\.\.\., 3\)"):
+    with pytest.raises(ValueError, match=r"x must have the shape \(\.\.\., 3\)"):
         ContextScorer(np.ones((2, 3), np.float32)).gain(np.zeros(shape))

@@ -48,7 +48,7 @@ def test_warns_of_research_data_by_name_and_of_no_other() -> None:
     free, bound = source("free", research_only=False), source("bound", research_only=True)
     assert "commercial robot" not in card(data=[free])
     warned = card(data=[free, bound])
-    assert "learned from bound, whose" in warned
+    assert "trained on bound, whose" in warned
     assert warned.index("commercial robot") < warned.index("## Model"), "before anything else"
 
 

@@ -36,12 +36,12 @@ def test_bad_objects_are_refused(change: dict[str, Any], message: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"objects": (DESK, DESK)}, "share one id"),
+        ({"objects": (DESK, DESK)}, "have the same id"),
         ({"relations": ((4, 0, 1),)}, "relation index 4"),
         ({"relations": ((0, 0, 2),)}, "object 2"),
         ({"relations": ((0, -1, 1),)}, "object -1"),
         ({"relations": ((0, 1, 1),)}, "'monitor' cannot be left itself"),
-        ({"relations": ((0, 0, 1), (0, 1, 0))}, "'left' is claimed both of 'desk' to 'monitor'"),
+        ({"relations": ((0, 0, 1), (0, 1, 0))}, "'left' is stated both for 'desk' to 'monitor'"),
         ({"relations_complete": True}, "relations_complete needs relations"),
         (
             {"poses": PoseRelations(np.zeros((4, 1, 1), bool), np.zeros((4, 1, 1), bool))},

@@ -79,7 +79,7 @@ def test_the_dictionary_form_survives_json() -> None:
 def test_two_classes_cannot_share_a_name() -> None:
     with pytest.raises(ValueError, match=r"'Trash-Cans' names two object classes: 'bin' and 'can'"):
         Vocabulary([ObjectClass("bin", ("trash can",)), ObjectClass("can", ("Trash-Cans",))])
-    with pytest.raises(ValueError, match="'bed room' and 'bedroom' are one"):
+    with pytest.raises(ValueError, match="'bed room' and 'bedroom' have the same name"):
         Vocabulary([ObjectClass("bed")], ["bed room", "bedroom"])
     # An alias that is only another spelling of its own class is harmless.
     assert len(Vocabulary([ObjectClass("book", ("books",))])) == 1

@@ -117,4 +117,4 @@ def test_terms_of_the_users_own_files() -> None:
         "sunrgbd", own.model_copy(update={"research_only": True, "terms": ""})
     )
     assert research_only
-    assert "not stated" in words
+    assert "without stated terms" in words

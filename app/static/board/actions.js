@@ -1,4 +1,4 @@
-/** What people do with objects, by mouse, touch or keyboard. */
+/** Actions on objects, by mouse, touch or keyboard. */
 
 import { floorUnder, moved, round } from './geometry.js';
 import { openMenu } from './menu.js';
@@ -6,11 +6,11 @@ import { sizesOf } from './questions.js';
 import { FULL, freePlace, MOST_OBJECTS, freshId, sizer } from './scene.js';
 import { SPOKEN } from './words.js';
 
-/** The robot is moved like an object; no object may have this id, for it is not printable. */
+/** Id of the robot, which moves like an object. Ids of objects are printable, so they differ from it. */
 export const ROBOT = '\u0000robot';
 const GRID = 0.1; // metres
 
-/** Where something is, as it is read aloud. */
+/** A position in words, for screen readers. */
 export function whereabouts(x, y, viewer = { x: 0, y: 0, yaw: 0 }) {
   const [dx, dy] = [x - viewer.x, y - viewer.y];
   const ahead = dx * Math.cos(viewer.yaw) + dy * Math.sin(viewer.yaw);
@@ -28,7 +28,7 @@ export function createActions(store, say, menu) {
     if (store.get().selected !== id) store.set({ selected: id });
   }
 
-  /** @param {{x: number, y: number}} [at] where it was dropped; else where there is room */
+  /** @param {{x: number, y: number}} [at] position of the drop; without it, a free place */
   function add(label, at) {
     const { things, viewer } = store.get();
     if (things.length >= MOST_OBJECTS) {
@@ -56,7 +56,7 @@ export function createActions(store, say, menu) {
     say(`${id} removed.`);
   }
 
-  /** Whoever removed something goes on at the next one: a keyboard would otherwise begin anew. */
+  /** Moves the focus to the next object after a removal, so that keyboard users keep their place. */
   function refocus(index) {
     const all = document.activeElement?.closest('#board') ? '#board .object' : '#list .name';
     setTimeout(() => {
@@ -66,7 +66,7 @@ export function createActions(store, say, menu) {
     }, 50);
   }
 
-  /** @param {boolean} [again] part of a movement that can be undone already */
+  /** @param {boolean} [again] whether the change continues a movement that undo already covers */
   function place(id, x, y, again = false, exactly = false) {
     const { things, viewer } = store.get();
     const [px, py] = exactly ? [round(x), round(y)] : [snapped(x), snapped(y)];
@@ -93,12 +93,12 @@ export function createActions(store, say, menu) {
     }
     const yaw = round((((find(id).yaw + degrees) % 360) + 360) % 360, 2);
     change(id, { yaw });
-    say(`${id} turned to ${yaw} degrees.`);
+    say(`${id} rotated to ${yaw} degrees.`);
   }
 
   const STEPS = { ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowLeft: [0, 1], ArrowRight: [0, -1] };
 
-  /** Keys on an object of the board or of the list. */
+  /** Handles a key on an object of the board or the list. */
   function keys(event, id) {
     const thing = id === ROBOT ? store.get().viewer : find(id);
     if (!thing || event.ctrlKey || event.metaKey) return;
@@ -125,7 +125,7 @@ export function createActions(store, say, menu) {
     say(`Asking what is missing ${SPOKEN[relation]} ${id}.`);
   }
 
-  /** Opens the menu of an object beside an element, or where a pointer is. */
+  /** Opens the menu of an object at the pointer, or beside the element that opens it. */
   function open(id, opener, pointer) {
     const box = opener.getBoundingClientRect();
     const at = pointer ?? { left: box.left + Math.min(box.width, 40), top: box.bottom };
@@ -133,10 +133,10 @@ export function createActions(store, say, menu) {
     select(id);
     openMenu(menu, opener, at, [
       ...asks.map((relation) => [`What is missing ${SPOKEN[relation]} it?`, () => ask(relation, id)]),
-      ['Turn by 90°', () => turn(id, 90)],
-      ['One more of these', () => add(find(id).label)],
+      ['Rotate by 90°', () => turn(id, 90)],
+      ['Add another object of this class', () => add(find(id).label)],
       ['Remove', () => remove(id)],
-    ], `What can be done with ${id}`);
+    ], `Actions for ${id}`);
   }
 
   return { select, add, remove, place, change, turn, keys, ask, open, find, sized, snapped };

@@ -1,4 +1,4 @@
-/** The service over HTTP: answers, or errors that say what went wrong. */
+/** HTTP calls of the service: they return answers or throw errors. */
 
 /** A problem document of the service. */
 export class ProblemError extends Error {
@@ -17,27 +17,27 @@ let key = null;
 try {
   key = sessionStorage.getItem(KEY);
 } catch {
-  // Storage may be forbidden; the key then lasts as long as the page.
+  // The browser may forbid storage. The key is then kept until the page is closed.
 }
 
 export const hasKey = () => Boolean(key);
 
-/** Remembers the service's API key until the tab is closed. */
+/** Stores the API key of the service until the tab is closed. */
 export function useKey(text) {
   key = text || null;
   try {
     sessionStorage.setItem(KEY, key ?? '');
   } catch {
-    // As above.
+    // See above.
   }
 }
 
-/** Where the service is; the page lies at its root, perhaps behind a proxy's prefix. */
+/** URL of the service. The page is at its root, perhaps below the path prefix of a proxy. */
 export const service = new URL('.', document.baseURI).href.replace(/\/$/, '');
 
 /**
- * @param {string} path as in "models/default/vocabulary"
- * @param {object} [body] to post; without one the path is read
+ * @param {string} path for example "models/default/vocabulary"
+ * @param {object} [body] body of a POST request; without it, a GET request is sent
  * @param {AbortSignal} [signal]
  */
 export async function call(path, body, signal) {

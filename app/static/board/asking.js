@@ -1,6 +1,6 @@
 /**
- * Asks anew whenever the board or a setting changes: once it has been still for a moment, and what
- * was asked before is dropped.
+ * Sends the questions again after each change of the board or a setting. It waits until changes
+ * pause, and aborts earlier requests.
  */
 
 import { call, ProblemError, UnreachableError } from './api.js';

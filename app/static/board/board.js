@@ -1,4 +1,4 @@
-/** The room seen from above: an SVG that d3 keeps in step with the state. */
+/** The room seen from above: an SVG that d3 updates with the state. */
 
 import { ROBOT, whereabouts } from './actions.js';
 import { drawEdges } from './edge_drawing.js';
@@ -17,7 +17,7 @@ const SEEN = [
   'things', 'viewer', 'answers', 'shown', 'tab', 'selected', 'draft', 'words', 'own', 'observed', 'at', 'models',
 ];
 
-/** Ids of the objects that the shown model calls outliers, with their probability. */
+/** Outlier entries of the shown model, by object id. */
 export function outliersOf(state) {
   const answer = state.answers[state.shown].outliers?.answer;
   return new Map((answer?.outliers ?? []).map((one) => [one.object, one]));
@@ -82,7 +82,7 @@ export function createBoard(node, store, actions, takeGhost) {
       return added.call(drag).on('keydown', (event) => actions.keys(event, ROBOT));
     });
     g.attr('transform', `translate(${view.across(y)},${view.down(x)}) rotate(${(-yaw * 180) / Math.PI})`)
-      .attr('aria-label', `Robot at x ${x}, y ${y}, turned by ${Math.round((yaw * 180) / Math.PI)} degrees`);
+      .attr('aria-label', `Robot at x ${x}, y ${y}, rotated by ${Math.round((yaw * 180) / Math.PI)} degrees`);
   }
 
   function drawObjects(state, boxes, wrong) {
@@ -127,7 +127,7 @@ export function createBoard(node, store, actions, takeGhost) {
     if (!store.get().draft) actions.open(box.id, event.currentTarget, pointer);
   }
 
-  /** Labels: inside a box where they fit, else beside it; what stands on something goes first. */
+  /** Draws labels inside their boxes if they fit, else beside them. Upper objects take precedence. */
   function drawLabels(state, boxes, places, wrong) {
     const texts = [];
     for (const box of [...boxes].sort((a, b) => b.z - a.z || a.size.x * a.size.y - b.size.x * b.size.y)) {

@@ -1,10 +1,10 @@
-/** A request as the commands that send it. */
+/** A request as a curl command and as Python code. */
 
 import { hasKey, service } from './api.js';
 
 const quoted = (text) => `'${text.replaceAll("'", `'\\''`)}'`;
 
-/** For a shell. */
+/** A curl command for a shell. */
 export function curl(question, body) {
   const lines = [`curl -sS ${quoted(`${service}/${question}`)}`, `-H 'Content-Type: application/json'`];
   if (hasKey()) lines.push('-H "X-API-Key: $SCENE_API_KEY"');
@@ -12,7 +12,7 @@ export function curl(question, body) {
   return lines.join(' \\\n  ');
 }
 
-/** A value as Python writes it. JSON's escapes are Python's too. */
+/** A value as a Python literal. Python understands the escapes of JSON. */
 function literal(value) {
   if (value === null) return 'None';
   if (typeof value === 'boolean') return value ? 'True' : 'False';
@@ -24,7 +24,7 @@ function literal(value) {
   return JSON.stringify(value);
 }
 
-/** For Python, with the service's own client. */
+/** Python code that uses the client of the service. */
 export function python(question, { objects, ...fields }) {
   const things = objects.map((thing) => `        ${literal(thing)},\n`).join('');
   const keywords = Object.entries(fields).map(([name, value]) => `        ${name}=${literal(value)},\n`);

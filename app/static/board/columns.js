@@ -1,4 +1,4 @@
-/** The answers in words: for each question a column for each model. */
+/** The answers as text: one column per question and model. */
 
 import { listed } from './edges.js';
 import { accept, ghostsOf } from './ghosts.js';
@@ -15,18 +15,18 @@ const signed = (value) => (value > 0 ? `+${value.toFixed(1)}` : value.toFixed(1)
 const reasons = (because) =>
   because.map(({ object, log_odds_change: change }) => `${object} ${signed(change)}`).join(', ');
 
-/** What supports the verdict on an object: what speaks against an outlier, and for any other. */
+/** The evidence on an object: against it if it is an outlier, else for it. */
 const support = ({ is_outlier: out, because, usually_with: company = [] }) =>
   [
     because.length ? `${out ? 'against' : 'for'}: ${reasons(because)}` : '',
     company.length ? `usually with: ${company.join(', ')}` : '',
   ].filter(Boolean).join(' · ');
 
-/** What an answer says of the scene: labels that were left out or taken for others, and warnings. */
+/** Notes of an answer on the scene: ignored labels, mapped labels and warnings. */
 const notes = ({ ignored = [], mapped = [], warnings = [] }) =>
   [
-    ignored.length ? `Left out: ${ignored.join(', ')}.` : '',
-    mapped.length ? `Taken for others: ${mapped.map((one) => `${one.label} → ${one.class}`).join(', ')}.` : '',
+    ignored.length ? `Ignored: ${ignored.join(', ')}.` : '',
+    mapped.length ? `Mapped to the nearest class: ${mapped.map((one) => `${one.label} → ${one.class}`).join(', ')}.` : '',
     ...warnings.map((one) => `Check ${one.objects.join(', ')}: ${one.message}.`),
   ].filter(Boolean).join(' ');
 
@@ -81,7 +81,7 @@ const ROWS = {
       el('li', { class: one.observed ? 'holds' : 'expected' },
         el('div', { class: 'headline' },
           el('span', { class: 'grow' }, `${one.subject} ${SPOKEN[one.relation]} ${one.object}`),
-          one.observed ? el('span', { class: 'flag' }, 'so it is') : null,
+          one.observed ? el('span', { class: 'flag' }, 'observed') : null,
           el('span', {}, percent(one.probability))),
         bar(one.probability, 'relations')));
     return [...odd, ...rows];
@@ -89,12 +89,12 @@ const ROWS = {
 };
 
 const NOTHING = {
-  missing: 'Nothing to suggest.',
-  outliers: 'Nothing to judge.',
-  relations: 'No relation is as likely as that.',
+  missing: 'The model suggests no object.',
+  outliers: 'The model knows none of the objects.',
+  relations: 'No relation reaches the minimum probability.',
 };
 
-/** A disclosure of the commands that send a request; `show` fills it. */
+/** A collapsible section with the commands that send a request; `show` fills it. */
 export function calls() {
   const block = (name) => {
     const code = el('pre', { tabindex: 0, 'aria-label': `${name} call` });
@@ -110,7 +110,7 @@ export function calls() {
     return { code, node: el('div', { class: 'call' }, el('div', { class: 'row' }, el('b', {}, name), button, done), code) };
   };
   const [shell, py] = [block('curl'), block('Python')];
-  const node = el('details', { class: 'calls' }, el('summary', {}, 'The same from a program'), shell.node, py.node);
+  const node = el('details', { class: 'calls' }, el('summary', {}, 'Send this request from a program'), shell.node, py.node);
   return {
     node,
     show(question, body) {
@@ -122,7 +122,7 @@ export function calls() {
   };
 }
 
-/** A problem document in words; each error names the object of the request that it is about. */
+/** A problem document as text. Each error names its object of the request. */
 export function problemWords(problem, body) {
   const errors = (problem.errors ?? []).map((error) => {
     const about = body?.objects[placeOf(error)]?.id;
@@ -168,7 +168,7 @@ export function createColumns(store, parents, askKey) {
     const rows = answer ? ROWS[question](answer, state, store, column) : [];
     redraw(own.rows, rows);
     const said = answer ? notes(answer) : '';
-    const waiting = status === 'down' ? 'Waiting for the service.' : !state.things.length ? 'Put something on the board first.' : '';
+    const waiting = status === 'down' ? 'Waiting for the service.' : !state.things.length ? 'Put an object on the board first.' : '';
     own.note.textContent = `${said} ${rows.length ? '' : answer ? NOTHING[question] : waiting}`.trim();
     own.calls.show(question, entry.body);
   }
@@ -179,7 +179,7 @@ export function createColumns(store, parents, askKey) {
       for (const column of [0, 1]) {
         const busy = state.answers[column][question]?.status === 'asking';
         made.get(`${column}/${question}`).node.setAttribute('aria-busy', String(busy));
-        // What is not looked at is drawn when it will be.
+        // Hidden columns are drawn when their tab opens.
         if (question === state.tab || state.tab !== previous.tab) draw(state, question, column);
       }
     }

@@ -1,4 +1,4 @@
-/** The search for objects: an editable combobox with a list, after the WAI-ARIA pattern. */
+/** The search for objects: an editable combobox with a list (WAI-ARIA pattern). */
 
 import { search } from './words.js';
 
@@ -7,7 +7,7 @@ import { search } from './words.js';
  * @param {HTMLUListElement} list
  * @param {() => import('./words.js').Entry[]} entries
  * @param {(label: string) => void} choose
- * @param {(text: string) => void} complain nothing of this name is known
+ * @param {(text: string) => void} complain shows an error text; '' clears it
  */
 export function combobox(input, list, entries, choose, complain) {
   let found = [];
@@ -65,7 +65,7 @@ export function combobox(input, list, entries, choose, complain) {
   function enter() {
     const best = found[active] ?? (input.value.trim() ? search(entries(), input.value)[0] : null);
     if (best) take(best.label);
-    else if (input.value.trim()) complain(`The model knows no object called “${input.value.trim()}”.`);
+    else if (input.value.trim()) complain(`The model does not know an object called “${input.value.trim()}”.`);
   }
 
   const keys = {
@@ -85,7 +85,7 @@ export function combobox(input, list, entries, choose, complain) {
     event.preventDefault();
     keys[event.key]();
   });
-  // Pressing in the list takes the focus away; it may be the beginning of a drag onto the board.
+  // A press in the list moves the focus away, but it may start a drag to the board.
   list.addEventListener('pointerdown', () => (pressing = true));
   document.addEventListener('pointerup', () => (pressing = false));
   input.addEventListener('blur', () => !pressing && show(false));

@@ -1,4 +1,4 @@
-/** Elements in a line. */
+/** Helpers to create and update elements. */
 
 /**
  * @param {string} tag
@@ -16,7 +16,7 @@ export function el(tag, properties = {}, ...children) {
   return node;
 }
 
-/** Replaces children; the focus stays on what bears the same `data-key`, or goes to the first. */
+/** Replaces children. The focus stays on the element with the same `data-key`, or moves to the first one. */
 export function redraw(parent, children) {
   const key = parent.contains(document.activeElement) ? document.activeElement.dataset.key : null;
   parent.replaceChildren(...children);
@@ -25,7 +25,7 @@ export function redraw(parent, children) {
   (same ?? parent.querySelector('[data-key]'))?.focus({ preventScroll: true });
 }
 
-/** Copies a text; where the page is not served securely, by way of a selection. */
+/** Copies a text. On pages without https, which lack the clipboard API, it uses a selection. */
 export async function copy(text) {
   if (navigator.clipboard) {
     await navigator.clipboard.writeText(text);

@@ -1,11 +1,11 @@
-/** Relations as arrows from subject to object, with words that cover no others. */
+/** Relations as arrows from subject to object, with texts that do not overlap. */
 
 import { widthOf } from './labels.js';
 import { onScreen } from './view.js';
 
 const FONT = '11px system-ui, sans-serif';
 
-/** Where the line from a box's centre towards a point leaves the box. */
+/** The point where the line from a box's centre to another point leaves the box. */
 function border(box, towards) {
   const [dx, dy] = [towards.x - box.x, towards.y - box.y];
   const reach = Math.min(
@@ -19,7 +19,7 @@ function line(edge, rects) {
   const [a, b] = [rects.get(edge.subject), rects.get(edge.object)];
   if (!a || !b) return null;
   const [from, to] = [border(a, b), border(b, a)];
-  // One lies on the other: no line, the words stand beside.
+  // If one box lies on the other, only the text is drawn.
   if (!from || !to) return { ...edge, from: null, spots: [{ x: a.x, y: a.top - 9 }, { x: a.x, y: a.bottom + 9 }] };
   const at = (part) => ({ x: from.x + (to.x - from.x) * part, y: from.y + (to.y - from.y) * part });
   const length = Math.hypot(to.x - from.x, to.y - from.y) || 1;

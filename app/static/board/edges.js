@@ -1,4 +1,4 @@
-/** Which relations are drawn, as edges between the boxes of their objects. */
+/** The relations to draw, as edges between the boxes of their objects. */
 
 /**
  * @typedef {object} Edge
@@ -11,13 +11,13 @@
 
 import { percent, SPOKEN } from './words.js';
 
-/** What is called wrong: objects that do not belong, and relations in the wrong place. */
+/** The alarms of an answer: outliers and misplaced relations. */
 export const wrongIn = (answer) => ({
   outliers: answer.outliers.filter((one) => one.is_outlier),
   misplaced: answer.misplaced.filter((one) => one.is_misplaced),
 });
 
-/** Which relations the list shows: those of the selected object, if so asked. */
+/** The relations in the list: all, or only those of the selected object. */
 export const listed = (state, relations) =>
   state.own && state.selected
     ? relations.filter(({ subject, object }) => [subject, object].includes(state.selected))
@@ -80,7 +80,7 @@ const edge = ({ subject, object, relation = '' }, kind, words) => ({
   key: JSON.stringify([kind, subject, relation, object]), subject, object, words, kind,
 });
 
-/** Best first: further edges of a pair would hide the first one's words. */
+/** Keeps the best edge of each pair, because further edges would hide its text. */
 function onePerPair(edges) {
   const taken = new Set();
   return edges.filter(({ subject, object }) => {

@@ -1,4 +1,4 @@
-/** Scenes to begin with, as the API takes them. */
+/** Example scenes in the format of the API. */
 
 const at = (x, y, z) => ({ x, y, z });
 const thing = (label, position, size, id = label) => ({ id, label, position, size });

@@ -1,11 +1,11 @@
-/** The scene as a text: to copy, to keep in a file, to send as a link. */
+/** The dialog with the scene as text, to copy it, store it in a file or share it as a link. */
 
 import { copy } from './dom.js';
 import { sizesOf } from './questions.js';
 import { SceneError, toScene } from './scene.js';
 import { toHash } from './share.js';
 
-/** @param {(scene: object) => string} put puts a scene on the board, says what is left out; throws SceneError */
+/** @param {(scene: object) => string} put puts a scene on the board and returns a note; throws SceneError */
 export function fileDialog(store, put, say) {
   const get = (id) => document.getElementById(id);
   const [dialog, area, error, done] = ['file', 'json', 'json-error', 'share-done'].map(get);
@@ -43,6 +43,6 @@ export function fileDialog(store, put, say) {
   get('share').addEventListener('click', async () => {
     history.replaceState(null, '', await toHash(scene()));
     await copy(location.href);
-    done.textContent = 'The link is copied; it holds the whole scene and sends it to nobody.';
+    done.textContent = 'The link is copied. It contains the whole scene, and browsers do not send this part to a server.';
   });
 }

@@ -1,15 +1,15 @@
-/** Boxes on the floor: what they cover, what rests on what. Metres; x ahead, y to the left. */
+/** Geometry of boxes: their footprints and supports. Metres; x ahead, y to the left. */
 
 /** @typedef {import('./store.js').Thing} Thing */
 
-/** Of what neither the scene nor the model knows a size. */
+/** Size of an object if neither the scene nor the model has one. */
 export const UNKNOWN_SIZE = { x: 0.4, y: 0.4, z: 0.4 };
 
 export const radians = (degrees) => (degrees * Math.PI) / 180;
 export const round = (value, digits = 3) => Number(value.toFixed(digits));
 
 /**
- * Half of what a box covers along x and y once it is turned.
+ * Half of the extents of a rotated box along x and y.
  * @param {{size: import('./store.js').Extents, yaw: number}} box
  */
 export function halves(box) {
@@ -34,7 +34,7 @@ export function overlap(a, b) {
 const area = (box) => box.size.x * box.size.y;
 const NEAR = 0.03;
 
-/** The height of what lies under a box: the highest of the larger boxes under its centre. */
+/** The height of the support of a box: the top of the highest larger box under its centre. */
 export function floorUnder(boxes, box) {
   let height = 0;
   for (const other of boxes) {
@@ -45,7 +45,7 @@ export function floorUnder(boxes, box) {
   return height;
 }
 
-/** The ids of what rests on a box, at any height. */
+/** The ids of all objects that rest on a box, directly or on each other. */
 function riders(boxes, box, found = new Set()) {
   for (const other of boxes) {
     const rests = Math.abs(other.z - (box.z + box.size.z)) < NEAR;
@@ -60,7 +60,7 @@ function riders(boxes, box, found = new Set()) {
 }
 
 /**
- * The things after one was moved: what rests on it comes along, and it comes to rest again.
+ * The objects after one of them was moved. Objects on top of it move along, and it gets a new support.
  * @param {Thing[]} things
  * @param {(thing: Thing) => Thing & {size: import('./store.js').Extents}} sized
  */

@@ -1,4 +1,4 @@
-/** Suggestions as ghosts: dashed boxes with their probability, and how far they spread. */
+/** Suggestions as dashed boxes ("ghosts") with their probability and spread. */
 
 import { labelPlaces, widthOf } from './labels.js';
 import { onScreen } from './view.js';

@@ -1,21 +1,21 @@
-/** Where missing objects would stand, seen from above. */
+/** The probable places of missing objects, seen from above. */
 
 import { halves, overlap, round, UNKNOWN_SIZE } from './geometry.js';
 import { sizesOf } from './questions.js';
 import { freshId, FULL, MOST_OBJECTS, sizer } from './scene.js';
 
-/** Ahead and left of an anchor, in the robot's axes: what a relation says of where its subject is. */
+/** Direction from the anchor to the subject of a relation, in the robot's axes: [ahead, left]. */
 const DIRECTION = { left: [0, 1], right: [0, -1], front: [-1, 0], behind: [1, 0] };
 const ABOVE = ['on-top', 'above'];
 const VERTICAL = [...ABOVE, 'under', 'below'];
-/** By the service's rules: metres that tell above from on top, and centres apart; gaps of neighbours, nearly. */
+/** Distances in metres by the service's rules: minimum gap of "above", maximum gap of neighbours (nearly). */
 const CLEAR = 0.1;
 const NEIGHBOURS = 0.9;
 const THIN = 0.03;
-const PARTS = [-1, -0.75, -0.5, -0.25, 0, 0.25, 0.5, 0.75, 1]; // of the room on something
-/** Standard deviations within which four of five are found, says the API. */
+const PARTS = [-1, -0.75, -0.5, -0.25, 0, 0.25, 0.5, 0.75, 1]; // candidate positions, as shares of the free extent
+/** Standard deviations that contain 80 % of the objects in the plane, according to the API. */
 const FOUR_OF_FIVE = 1.8;
-const GAP = 0.15; // metres between neighbours where no offset was learnt
+const GAP = 0.15; // metres between neighbours without a learnt offset
 
 /**
  * @typedef {object} Ghost
@@ -26,12 +26,12 @@ const GAP = 0.15; // metres between neighbours where no offset was learnt
  * @property {number} y
  * @property {number} z of its bottom
  * @property {import('./store.js').Extents} size
- * @property {{x: number, y: number, rx: number, ry: number} | null} spread where it was learnt: an ellipse
+ * @property {{x: number, y: number, rx: number, ry: number} | null} spread ellipse of the learnt offset
  */
 
 let last = { keys: [], ghosts: [] };
 
-/** The suggestions that are shown, each at the likeliest place that has room for it. @returns {Ghost[]} */
+/** The shown suggestions, each at its most probable free place. @returns {Ghost[]} */
 export function ghostsOf(state) {
   const answer = state.answers[state.shown].missing?.answer;
   const model = state.models[state.shown];
@@ -62,11 +62,11 @@ function suggest(state, answer, sizes) {
   return ghosts;
 }
 
-/** Under something there must be room for it: what stands on the floor has nothing below. */
+/** Whether a place exists: "under" and "below" need free height below the anchor. */
 const hasRoom = (anchor, relation, size) =>
   anchor && (!['under', 'below'].includes(relation) || anchor.z >= size.z);
 
-/** Turns what is ahead and left of a heading into the axes of the board; `within` turns it back. */
+/** Rotates a vector (ahead, left) of the viewer to the axes of the board; `within` is the inverse. */
 function turned(viewer, ahead, left) {
   const [c, s] = [Math.cos(viewer.yaw), Math.sin(viewer.yaw)];
   return [ahead * c - left * s, ahead * s + left * c];
@@ -74,9 +74,9 @@ function turned(viewer, ahead, left) {
 const within = ({ yaw }, x, y) => turned({ yaw: -yaw }, x, y);
 
 /**
- * Where a suggestion stands in the relation that is said of it, as the service reads relations from
- * places: near where it was learnt, if it was, free of other things where there is room, and not
- * over another suggestion where there is more.
+ * The place of a suggestion, by the rules with which the service derives relations from positions.
+ * Candidates near the learnt offset come first. The first choice is a place without objects and other
+ * suggestions, the second a place without collisions.
  */
 function stand(anchor, placement, size, viewer, boxes, ghosts) {
   const { relation, offset } = placement;
@@ -94,12 +94,12 @@ function stand(anchor, placement, size, viewer, boxes, ghosts) {
   return { ...place, spread };
 }
 
-/** Whether boxes are in each other: those that only touch, or are as thin as a rug, are not. */
+/** Whether two boxes intersect. Boxes that only touch, or are as thin as a rug, do not. */
 function meet(a, b) {
   return overlap(a, b) && a.z + a.size.z > b.z + THIN && b.z + b.size.z > a.z + THIN;
 }
 
-/** Of its bottom. Nothing stands below the floor, even where there is no room above it. */
+/** The height of the bottom of a suggestion; at least 0, the floor. */
 function height(anchor, relation, size, learnt) {
   const top = anchor.z + anchor.size.z;
   const heights = {
@@ -111,11 +111,11 @@ function height(anchor, relation, size, learnt) {
   return heights[relation]?.() ?? learnt ?? 0;
 }
 
-/** Places whose footprint lies on that of the anchor, or around it; the nearest to the learnt one first. */
+/** Places on, above or below the anchor, with overlapping footprints; nearest to the learnt offset first. */
 function* over(anchor, relation, size, viewer, learnt) {
   const half = halves({ size, yaw: -anchor.yaw });
   const room = (axis) => anchor.size[axis] / 2 - half[axis];
-  // What lies beneath may be the larger one: then the anchor's footprint lies on its.
+  // An object below may be larger: its footprint then contains that of the anchor.
   const limit = (axis) => (ABOVE.includes(relation) ? Math.max(0, room(axis)) : Math.abs(room(axis)));
   const along = { yaw: (anchor.yaw * Math.PI) / 180 };
   const [x, y] = learnt ? within(along, learnt.x - anchor.x, learnt.y - anchor.y) : [0, 0];
@@ -128,7 +128,7 @@ function* over(anchor, relation, size, viewer, learnt) {
   }
 }
 
-/** Places out along the relation's axis, until the footprints are apart and that axis says more than the other. */
+/** Places along the axis of a horizontal relation, with separate footprints and the larger offset on this axis. */
 function* beside(anchor, relation, size, viewer, learnt) {
   const [ahead, left] = DIRECTION[relation];
   const [axis, other] = ahead ? ['x', 'y'] : ['y', 'x'];
@@ -158,7 +158,7 @@ const clamp = (value, limit) => Math.min(limit, Math.max(-limit, value));
 const nearest = (places, [x, y]) =>
   places.map((place) => [Math.hypot(place[0] - x, place[1] - y), place]).sort((a, b) => a[0] - b[0]).map(([, place]) => place);
 
-/** Puts a suggestion on the board. @returns {string | null} its id, null: there is no room for more */
+/** Puts a suggestion on the board. @returns {string | null} its id; null if the scene is full */
 export function accept(store, ghost) {
   const { things } = store.get();
   if (things.length >= MOST_OBJECTS) {

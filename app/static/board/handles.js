@@ -1,4 +1,4 @@
-/** Two handles of the selected object: one resizes it, one turns it. The form does both by keyboard. */
+/** Two handles that resize and rotate the selected object. The form does both by keyboard. */
 
 import { radians, round } from './geometry.js';
 

@@ -1,12 +1,12 @@
-/** Texts that do not cover each other: each takes the first of its places that is still free. */
+/** Texts that do not overlap: each takes its first free place. */
 
-/** Pixels that a label is high. */
+/** Height of a label in pixels. */
 export const LINE = 17;
 
 const canvas = document.createElement('canvas').getContext('2d');
 const widths = new Map();
 
-/** Pixels that a text takes. */
+/** Width of a text in pixels. */
 export function widthOf(text, font) {
   const key = `${font}/${text}`;
   if (!widths.has(key)) {
@@ -30,7 +30,7 @@ export class Places {
   }
 
   /**
-   * The first of some centres around which a text of this size is free, or null.
+   * Takes the first centre with free space for a text of this size, or null.
    * @param {{x: number, y: number}[]} centres
    */
   take(width, height, centres) {
@@ -54,7 +54,7 @@ export class Places {
 
 const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
 
-/** Where the text of a box may stand, best first. */
+/** Possible places for the text of a box, best first. */
 export function labelPlaces({ left, right, top, bottom, x, y }, width) {
   const inside = right - left >= width && bottom - top >= LINE
     ? [{ x, y }, { x, y: bottom - LINE / 2 - 1 }, { x, y: top + LINE / 2 + 1 }]

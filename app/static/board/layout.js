@@ -1,11 +1,11 @@
-/** Places for objects that have none, from the relations between them. */
+/** Places for objects without a position, from the relations between them. */
 
 import { halves, round } from './geometry.js';
 
-const ROBOT = '\u0000robot'; // nothing stands where it does, and no object has such an id
+const ROBOT = '\u0000robot'; // node that keeps objects away from the robot; not a valid object id
 const TICKS = 260;
 const GAP = 0.12; // metres
-/** A relation as the one way in which places are made of it. */
+/** The canonical form of each relation, and whether its ends are exchanged. */
 const CANONICAL = {
   left: ['left', false], right: ['left', true], front: ['front', false], behind: ['front', true],
   'on-top': ['on-top', false], under: ['on-top', true], above: ['above', false], below: ['above', true],
@@ -18,7 +18,7 @@ function canonical(relations) {
   });
 }
 
-/** What each thing stands on: the first that is named, unless it stands on the thing itself. */
+/** The support of each object: the first one stated, unless this would make a cycle. */
 function supports(triples, movable) {
   const on = new Map();
   for (const [subject, name, object] of triples) {
@@ -31,7 +31,7 @@ function supports(triples, movable) {
 }
 
 /**
- * A force that has subjects stand left of, or before, their objects.
+ * A force that moves subjects to the left or to the front of their objects.
  * @param {[string, string, string][]} triples
  */
 function beside(triples, nodes) {
@@ -48,7 +48,7 @@ function beside(triples, nodes) {
         a[`v${axis}`] += sign * lacking * 0.3 * alpha;
         b[`v${axis}`] -= sign * lacking * 0.3 * alpha;
       }
-      // Neighbours, not strangers: related objects draw near.
+      // Related objects attract each other.
       for (const each of ['x', 'y']) {
         const pull = (b[each] - a[each]) * 0.04 * alpha;
         a[`v${each}`] += pull;
@@ -59,9 +59,9 @@ function beside(triples, nodes) {
 }
 
 /**
- * Places `free` things among `fixed` ones; all as boxes with a size.
+ * Places `free` boxes among `fixed` boxes.
  * @param {object[]} fixed
- * @param {object[]} free those with x and y begin there
+ * @param {object[]} free boxes; given x and y are the start of the search
  * @param {{subject: string, relation: string, object: string}[]} relations by id
  * @returns {object[]} the free ones, placed
  */
@@ -77,7 +77,7 @@ export function layOut(fixed, free, relations, viewer) {
     ...standing.map((box, index) => ({
       id: box.id,
       half: halves(box),
-      // A spiral, in the order of the vocabulary: the same relations give the same room.
+      // A spiral in a fixed order, so that the same relations give the same layout.
       x: box.x ?? middle.x + 0.35 * Math.sqrt(index) * Math.cos(2.4 * index),
       y: box.y ?? middle.y + 0.35 * Math.sqrt(index) * Math.sin(2.4 * index),
     })),
@@ -100,13 +100,13 @@ export function layOut(fixed, free, relations, viewer) {
   return free.map((box) => placed.get(box.id));
 }
 
-/** Puts things on what they stand on, side by side. */
+/** Puts boxes on their supports, side by side. */
 function stack(boxes, on, placed, middle) {
   const count = new Map();
   let waiting = boxes;
   while (waiting.length) {
     const ready = waiting.filter((box) => placed.has(on.get(box.id)));
-    // Where the support is not on the board, the floor is.
+    // If the support is not on the board, the floor replaces it.
     for (const box of ready.length ? ready : waiting) {
       const below = placed.get(on.get(box.id)) ?? { ...middle, z: 0, yaw: 0, size: { x: 1, y: 1, z: 0 } };
       const number = count.get(on.get(box.id)) ?? 0;

@@ -1,4 +1,4 @@
-/** The objects as a list: what the board shows, for keyboards and screen readers. */
+/** The objects of the board as a list, for keyboards and screen readers. */
 
 import { whereabouts } from './actions.js';
 import { outliersOf } from './board.js';
@@ -20,7 +20,7 @@ export function createList(list, empty, count, actions) {
       },
     }, el('b', {}, id), el('span', { class: 'quiet' }));
     const more = el('button', {
-      type: 'button', class: 'icon', 'aria-haspopup': 'menu', 'aria-label': `What can be done with ${id}`,
+      type: 'button', class: 'icon', 'aria-haspopup': 'menu', 'aria-label': `Actions for ${id}`,
       onclick: (event) => actions.open(id, event.currentTarget),
     }, '⋯');
     const remove = el('button', {
@@ -54,7 +54,7 @@ export function createList(list, empty, count, actions) {
   return (state, previous) => changed(state, previous, ...SEEN) && draw(state);
 }
 
-/** What the service said of each object, by its place in the scene. */
+/** The error messages of the service, by index of the object. */
 function errorsByObject(state) {
   const found = new Map();
   for (const { error, words } of complaints(state)) {
@@ -64,7 +64,7 @@ function errorsByObject(state) {
   return found;
 }
 
-/** What was refused, with whose words it is where two models are asked. */
+/** The error messages of all answers; with two models, each begins with the name of its model. */
 export function complaints(state) {
   return state.answers.flatMap((own, column) =>
     (own.missing?.problem?.errors ?? []).map((error) => ({
@@ -72,7 +72,7 @@ export function complaints(state) {
     })));
 }
 
-/** The place of the object that an error is about. */
+/** The index of the object of an error, or null. */
 export function placeOf({ pointer }) {
   const place = /^#\/objects\/(\d+)/.exec(pointer);
   return place ? Number(place[1]) : null;

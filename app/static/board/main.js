@@ -1,4 +1,4 @@
-/** Puts the parts of the page together. */
+/** Connects the parts of the page. */
 
 import { createActions } from './actions.js';
 import { useKey, UnreachableError } from './api.js';
@@ -37,7 +37,7 @@ const store = createStore({
 
 /**
  * Puts a scene of the API on the board.
- * @returns {string} what of it is not there, in words
+ * @returns {string} a note about ignored relations, or ''
  * @throws {SceneError}
  */
 function put(scene) {
@@ -57,7 +57,7 @@ function put(scene) {
   const unplaced = new Set(loose.map((thing) => thing.id));
   const unused = relations.filter((one) => !unplaced.has(one.subject) && !unplaced.has(one.object)).length;
   const words = unused
-    ? `${unused} given ${unused === 1 ? 'relation was' : 'relations were'} left out: the board asks by positions.` : '';
+    ? `${unused} ${unused === 1 ? 'relation was' : 'relations were'} ignored: requests of the board contain positions only.` : '';
   get('note').textContent = words;
   get('note').hidden = !words;
   return words;
@@ -73,7 +73,7 @@ function tell(error) {
   }
 }
 
-/** Asks for the API key, where the service wants one. */
+/** A form for the API key of the service. */
 function askKey() {
   const input = el('input', { type: 'password', autocomplete: 'off', 'aria-label': 'API key' });
   return el('form', {
@@ -107,7 +107,7 @@ const views = [
   settings(store),
 ];
 
-// Views draw at most once a frame, however often the state changes.
+// Views draw at most once per frame, even if the state changes more often.
 let drawn = null;
 store.subscribe((state, previous) => {
   if (drawn) return;
@@ -163,7 +163,7 @@ async function open() {
 }
 
 addEventListener('hashchange', () => void open());
-// With the model's words come typical sizes, by which scenes without positions are laid out.
+// The vocabulary has the typical sizes, which the layout of scenes without positions needs.
 await models.load();
 if (!(await open())) put(Object.values(EXAMPLES)[0]);
 store.set({ canUndo: false });

@@ -1,4 +1,4 @@
-/** A menu of what can be done with an object, after the WAI-ARIA pattern. */
+/** The menu with the actions for an object (WAI-ARIA pattern). */
 
 /**
  * @param {HTMLElement} menu

@@ -1,4 +1,4 @@
-/** Which models can be asked, and their words. */
+/** The available models and their vocabularies. */
 
 import { call } from './api.js';
 import { el } from './dom.js';
@@ -6,7 +6,7 @@ import { changed } from './store.js';
 
 const plain = (text) => text.toLowerCase().replace(/[\s_-]+/g, ' ').trim();
 
-/** Aliases first, then every version that answers. */
+/** The selectable models: aliases first, then all usable versions. */
 function choices({ models, aliases }) {
   const versions = models.flatMap(({ name, versions: own }) =>
     own.filter(({ status }) => status === 'ready').map(({ version, variant }) => ({
@@ -25,7 +25,7 @@ function words({ objects, room_types: rooms }) {
   for (const { label } of objects) names.set(plain(label), label);
   return {
     objects, rooms,
-    // A map: a label may be “constructor”, and objects have one already.
+    // A Map, because a label such as “constructor” would clash with a property of plain objects.
     sizes: new Map(objects.filter(({ size }) => size).map(({ label, size }) => [label, size])),
     canonical: (label) => names.get(plain(label)) ?? label,
   };

@@ -1,4 +1,4 @@
-/** The form of the selected object: everything about it in numbers. */
+/** The form with the name, pose and size of the selected object. */
 
 import { round } from './geometry.js';
 import { sizesOf } from './questions.js';
@@ -25,12 +25,12 @@ export function createProperties(form, store, actions, say) {
 
   function rename(id, thing) {
     if (!id) throw new Error('An object needs a name.');
-    if (id !== thing.id && actions.find(id)) throw new Error(`There is another ${id}.`);
+    if (id !== thing.id && actions.find(id)) throw new Error(`Another object has the name ${id}.`);
     return { id };
   }
 
   form.addEventListener('submit', (event) => event.preventDefault());
-  // What is being typed is not overwritten by what another field has just changed.
+  // A change in one field must not overwrite the text being typed in another field.
   const typing = new Set();
   form.addEventListener('input', ({ target }) => typing.add(target));
   form.addEventListener('focusout', ({ target }) => typing.delete(target));

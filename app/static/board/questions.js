@@ -1,16 +1,16 @@
-/** The three questions that are asked about every board, as bodies of requests. */
+/** The bodies of the three questions that the page asks about every scene. */
 
 import { toScene } from './scene.js';
 
 export const QUESTIONS = ['missing', 'outliers', 'relations'];
 
-/** What of the state a question depends on: when none of it changed, no answer does. */
+/** The parts of the state that the answers depend on. */
 export const DEPENDS = [
   'things', 'viewer', 'room', 'models', 'at', 'coverage', 'sensitivity', 'threshold', 'suggestions', 'least', 'most', 'unknown',
   'words', 'epoch',
 ];
 
-/** Sizes that a model takes for typical, by label. */
+/** Typical sizes of a model's classes, by label. */
 export const sizesOf = (state, model) => state.words[model]?.sizes ?? new Map();
 
 const OWN = {
@@ -26,7 +26,7 @@ const OWN = {
   relations: (state) => ({ top_k: state.most, min_probability: state.least }),
 };
 
-/** @returns {object | null} null: nothing to ask */
+/** @returns {object | null} null for an empty scene or without a model */
 export function bodyOf(state, question, model) {
   if (!state.things.length || !model) return null;
   return {

@@ -1,4 +1,4 @@
-/** Says that the service is down, waits for it, and has everything asked anew once it is back. */
+/** Shows that the service is down, waits for it, and then sends all questions again. */
 
 import { service } from './api.js';
 
@@ -9,7 +9,7 @@ export function watchService(store, banner, whenBack) {
 
   async function wait() {
     waiting = true;
-    banner.textContent = 'The service does not answer. Your scene is kept; this page asks again as soon as it does.';
+    banner.textContent = 'The service does not answer. The page keeps your scene and tries again until the service answers.';
     banner.hidden = false;
     for (;;) {
       await new Promise((resolve) => setTimeout(resolve, EVERY));

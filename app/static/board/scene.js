@@ -1,17 +1,17 @@
-/** The board as the API's scene, and a scene of the API on the board. */
+/** Conversion between the board and a scene of the API. */
 
 import { halves, radians, round, UNKNOWN_SIZE } from './geometry.js';
 import { SPOKEN } from './words.js';
 
 /** @typedef {import('./store.js').Thing} Thing */
 
-/** Things with a size to draw: their own, the typical one, or a guess. */
+/** Adds a size to an object: its own size, the typical size, or a guess. */
 export const sizer = (sizes) => (thing) => ({
   ...thing,
   size: thing.size ?? sizes.get(thing.label) ?? UNKNOWN_SIZE,
 });
 
-/** The name of a further object of a class. */
+/** An unused id for an object with this label. */
 export function freshId(things, label) {
   const taken = new Set(things.map((thing) => thing.id));
   let id = label;
@@ -20,8 +20,7 @@ export function freshId(things, label) {
 }
 
 /**
- * What the service is asked about: what is drawn, sizes that nobody gave among it, so that every model
- * is asked about the same scene.
+ * The scene for a request. It includes typical and guessed sizes, so that all models get the same scene.
  * @param {{things: Thing[], viewer: object, room: string}} board
  */
 export function toScene({ things, viewer, room }, sizes) {
@@ -48,14 +47,14 @@ export function toScene({ things, viewer, room }, sizes) {
   };
 }
 
-/** What the service takes at most: of a coordinate and an extent in metres, a heading in radians, objects. */
+/** Limits of the service: coordinate and extent in metres, heading in radians, number of objects. */
 const FARTHEST = 1e8;
 const LARGEST = 1e4;
 const MOST_TURNED = 1e3;
 export const MOST_OBJECTS = 256;
-export const FULL = `A scene has at most ${MOST_OBJECTS} objects: remove one first.`;
+export const FULL = `A scene can have at most ${MOST_OBJECTS} objects. Remove one first.`;
 
-/** What is wrong with a scene, in words. */
+/** An error in a scene, with a message for the user. */
 export class SceneError extends Error {}
 
 function fail(condition, words) {
@@ -68,37 +67,37 @@ const isPlace = (value) => isNumber(value) && Math.abs(value) <= FARTHEST;
 const isExtent = (value) => isNumber(value) && value > 0 && value <= LARGEST;
 
 /**
- * Reads a scene of the API. Things without a position are told by `placed`: false.
+ * Reads a scene of the API. Objects without a position get `placed`: false.
  * @returns {{things: (Thing & {placed: boolean})[], viewer: object, room: string, relations: object[]}}
  * @throws {SceneError}
  */
 export function fromScene(scene, sizes) {
-  fail(!scene || typeof scene !== 'object' || Array.isArray(scene), 'A scene is an object: {"objects": [...]}.');
-  fail(!Array.isArray(scene.objects), 'A scene has a list of objects.');
-  fail(scene.objects.length > MOST_OBJECTS, `A scene has at most ${MOST_OBJECTS} objects.`);
-  fail(/_optical(_frame)?$/.test(scene.frame_id ?? ''), 'A camera’s optical frame cannot be drawn from above.');
+  fail(!scene || typeof scene !== 'object' || Array.isArray(scene), 'A scene must be a JSON object: {"objects": [...]}.');
+  fail(!Array.isArray(scene.objects), 'A scene must have a list "objects".');
+  fail(scene.objects.length > MOST_OBJECTS, `A scene can have at most ${MOST_OBJECTS} objects.`);
+  fail(/_optical(_frame)?$/.test(scene.frame_id ?? ''), 'The board cannot show positions in the optical frame of a camera.');
   const things = [];
   scene.objects.forEach((entry, index) => things.push(readThing(entry, index, things, sizes)));
   const { x = 0, y = 0, yaw = 0 } = scene.viewpoint ?? {};
-  fail(!(isPlace(x) && isPlace(y)), 'The viewpoint needs x and y: numbers within ±100 000 km.');
-  fail(!(isNumber(yaw) && Math.abs(yaw) <= MOST_TURNED), 'The viewpoint needs its yaw in radians, within ±1000.');
+  fail(!(isPlace(x) && isPlace(y)), 'The viewpoint needs numbers x and y within ±100 000 km.');
+  fail(!(isNumber(yaw) && Math.abs(yaw) <= MOST_TURNED), 'The viewpoint needs a yaw within ±1000 radians.');
   const relations = scene.relations ?? [];
-  fail(!Array.isArray(relations), 'Relations are a list.');
+  fail(!Array.isArray(relations), '"relations" must be a list.');
   const room = scene.room_type ?? '';
-  fail(typeof room !== 'string', 'The room type is no text.');
+  fail(typeof room !== 'string', 'The room type must be a text.');
   return { things, viewer: { x, y, yaw }, room, relations: relations.map(readRelation(things)) };
 }
 
-/** Reads relations; their ends may be named by an id or by a label. */
+/** Reads relations, whose ends are ids or labels. */
 function readRelation(things) {
   const names = new Map(things.map((thing) => [thing.label, thing.id]).reverse());
   for (const { id } of things) names.set(id, id);
   return (found, index) => {
     const where = `Relation ${index + 1}`;
-    fail(!found || typeof found !== 'object', `${where} is no object with subject, relation and object.`);
+    fail(!found || typeof found !== 'object', `${where} must have a subject, a relation and an object.`);
     const { subject, relation, object } = found;
-    fail(!Object.hasOwn(SPOKEN, relation), `${where} is none of ${Object.keys(SPOKEN).join(', ')}.`);
-    for (const name of [subject, object]) fail(!names.has(name), `${where} names what is not in the scene: ${name}.`);
+    fail(!Object.hasOwn(SPOKEN, relation), `${where} must be one of ${Object.keys(SPOKEN).join(', ')}.`);
+    for (const name of [subject, object]) fail(!names.has(name), `${where} names an object outside the scene: ${name}.`);
     return { subject: names.get(subject), relation, object: names.get(object) };
   };
 }
@@ -106,16 +105,16 @@ function readRelation(things) {
 function readThing(entry, index, before, sizes) {
   const found = typeof entry === 'string' ? { label: entry } : entry;
   const where = `Object ${index + 1}`;
-  fail(!found || typeof found !== 'object', `${where} is neither a label nor an object.`);
-  fail(typeof found.label !== 'string' || !found.label.trim(), `${where} has no label.`);
+  fail(!found || typeof found !== 'object', `${where} must be a label or a JSON object.`);
+  fail(typeof found.label !== 'string' || !found.label.trim(), `${where} needs a label.`);
   const id = found.id ?? freshId(before, found.label);
-  fail(typeof id !== 'string' || !id, `${where} has an id that is no text.`);
-  fail(before.some((thing) => thing.id === id), `${where} has the id of another one: ${id}.`);
+  fail(typeof id !== 'string' || !id, `${where} has an id that is not a text.`);
+  fail(before.some((thing) => thing.id === id), `${where} has the id of another object: ${id}.`);
   const { position, size = null, orientation: q, confidence = 1 } = found;
-  fail(position && !AXES.every((axis) => isPlace(position[axis])), `${where} needs x, y, z as its position: numbers within ±100 000 km.`);
-  fail(size && !AXES.every((axis) => isExtent(size[axis])), `${where} needs three positive metres as its size, at most 10 km.`);
+  fail(position && !AXES.every((axis) => isPlace(position[axis])), `${where} needs a position with numbers x, y, z within ±100 000 km.`);
+  fail(size && !AXES.every((axis) => isExtent(size[axis])), `${where} needs a size with positive numbers x, y, z of at most 10 km.`);
   fail(!(isNumber(confidence) && confidence > 0 && confidence <= 1), `${where} has a confidence outside (0, 1].`);
-  fail(q && !([q.x, q.y, q.z, q.w].every(isNumber) && Math.abs(Math.hypot(q.x, q.y, q.z, q.w) - 1) <= 0.01), `${where} has an orientation that is no unit quaternion.`);
+  fail(q && !([q.x, q.y, q.z, q.w].every(isNumber) && Math.abs(Math.hypot(q.x, q.y, q.z, q.w) - 1) <= 0.01), `${where} has an orientation that is not a quaternion of length 1.`);
   const yaw = q ? (Math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)) * 180) / Math.PI : 0;
   const thing = { id, label: found.label, size, yaw: round(yaw, 2), confidence, x: 0, y: 0, z: 0 };
   const height = sizer(sizes)(thing).size.z;
@@ -125,7 +124,7 @@ function readThing(entry, index, before, sizes) {
 
 const AROUND = 0.5; // metres that stay free around the robot
 
-/** A free place for a new thing: near the middle of what the robot sees, else wherever there is room. */
+/** A free place for a new object: near the centre of the robot's view, else any free place. */
 export function freePlace(boxes, size, viewer) {
   const need = halves({ size, yaw: 0 });
   const [c, s] = [Math.cos(viewer.yaw), Math.sin(viewer.yaw)];
@@ -149,7 +148,7 @@ export function freePlace(boxes, size, viewer) {
   return found ?? beyond(boxes, need, viewer);
 }
 
-/** Farther along x than all there is. */
+/** A place beyond all objects along x. */
 function beyond(boxes, need, viewer) {
   const edge = Math.max(viewer.x + AROUND, ...boxes.map((box) => box.x + halves(box).x));
   return { x: round(edge + need.x + 0.1, 1), y: viewer.y };

@@ -1,11 +1,11 @@
-/** A scene in the fragment of an address, which never leaves the browser. */
+/** A scene in the fragment of a URL, which browsers do not send to a server. */
 
 import { SceneError } from './scene.js';
 
 const NAME = '#scene=';
-/** Bytes of a scene as JSON: 256 objects and 4096 relations have about 300 kB. */
+/** Maximum size in bytes of a scene in JSON; 256 objects and 4096 relations take about 300 kB. */
 const MOST_BYTES = 2 ** 19;
-/** Bytes unpacked in one step, which no limit can interrupt: a thousand times as many come out. */
+/** Bytes unpacked in one step. They can expand by a factor of 1000 before the size is checked. */
 const STEP = 1024;
 
 async function through(bytes, stream) {
@@ -20,7 +20,7 @@ export async function toHash(scene) {
   return NAME + text.replaceAll('+', '-').replaceAll('/', '_').replace(/=+$/, '');
 }
 
-/** @throws {SceneError} more than `MOST_BYTES` come out */
+/** @throws {SceneError} the unpacked scene has more than `MOST_BYTES` */
 async function unpack(packed) {
   let at = 0;
   const steps = new ReadableStream({
@@ -37,13 +37,13 @@ async function unpack(packed) {
     size += part.value.length;
     if (size > MOST_BYTES) {
       reader.cancel().catch(() => {});
-      throw new SceneError(`A scene in a link has at most ${MOST_BYTES / 1024} KiB.`);
+      throw new SceneError(`A scene in a link can have at most ${MOST_BYTES / 1024} KiB.`);
     }
   }
   return new Blob(parts).text();
 }
 
-/** The scene of an address, null where it has none. @throws {Error} it cannot be read */
+/** The scene in a URL fragment, or null without a scene. @throws {Error} the scene is invalid */
 export async function fromHash(hash) {
   if (!hash.startsWith(NAME)) return null;
   const text = hash.slice(NAME.length).replaceAll('-', '+').replaceAll('_', '/');

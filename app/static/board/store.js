@@ -1,6 +1,6 @@
 /**
- * The page's state: one plain object, replaced as a whole at every change, so that a view sees by
- * comparing references whether anything of its own has changed.
+ * The state of the page: one plain object, replaced as a whole at every change. Views compare
+ * references to see whether their parts have changed.
  *
  * @typedef {{x: number, y: number, z: number}} Extents metres
  * @typedef {object} Thing an object on the board
@@ -24,13 +24,13 @@ export function createStore(initial) {
   const past = [];
   return {
     get: () => state,
-    /** Changes some of the state. @param {Partial<State>} change */
+    /** Changes parts of the state. @param {Partial<State>} change */
     set(change) {
       const previous = state;
       state = { ...state, ...change };
       for (const listener of listeners) listener(state, previous);
     },
-    /** Changes what is on the board, so that `undo` brings back what was there. */
+    /** Changes the board, so that `undo` can restore its previous state. */
     edit(change) {
       past.push({ things: state.things, viewer: state.viewer, room: state.room });
       if (past.length > 200) past.shift();
@@ -46,6 +46,6 @@ export function createStore(initial) {
   };
 }
 
-/** Whether any of these parts of the state changed. */
+/** Whether one of these parts of the state has changed. */
 export const changed = (state, previous, ...keys) =>
   keys.some((key) => state[key] !== previous[key]);

@@ -1,12 +1,12 @@
-/** What the answers say, in a sentence for the live region. */
+/** A summary of the answers for the live region, which screen readers read aloud. */
 
 import { wrongIn } from './edges.js';
 import { QUESTIONS } from './questions.js';
 import { percent, SPOKEN } from './words.js';
 
-const MOST_SAID = 3; // relations
+const MOST_SAID = 3; // maximum number of listed relations
 
-/** @returns {string | null} null while something is still asked, or nothing was answered */
+/** @returns {string | null} null until all questions are answered */
 export function summary(state) {
   const own = state.answers[state.shown];
   if (!QUESTIONS.every((question) => own[question]?.status === 'answered')) return null;

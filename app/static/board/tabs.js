@@ -1,4 +1,4 @@
-/** The questions as tabs, after the WAI-ARIA pattern. */
+/** The questions as tabs (WAI-ARIA pattern). */
 
 import { changed } from './store.js';
 

@@ -1,4 +1,4 @@
-/** Light or dark: as the system has it, unless somebody chose. */
+/** The light or dark theme: the user's choice, else that of the system. */
 
 const NAME = 'scene-theme';
 
@@ -10,7 +10,7 @@ export function theme(select) {
   try {
     select.value = localStorage.getItem(NAME) ?? '';
   } catch {
-    // Storage may be forbidden: then the choice lasts as long as the page.
+    // The browser may forbid storage. The choice is then kept until the page is closed.
   }
   apply(select.value);
   select.addEventListener('change', () => {
@@ -18,7 +18,7 @@ export function theme(select) {
     try {
       localStorage.setItem(NAME, select.value);
     } catch {
-      // As above.
+      // See above.
     }
   });
 }

@@ -1,8 +1,8 @@
-/** Metres to pixels: x ahead is up, y to the left is left. */
+/** Conversion of metres to pixels: x (ahead) points up, y (left) points left. */
 
 import { halves } from './geometry.js';
 
-const MARGIN = 0.45; // metres around what is shown
+const MARGIN = 0.45; // metres around the shown boxes
 
 /**
  * A view that shows all boxes, and the robot.
@@ -30,7 +30,7 @@ export function fit(boxes, viewer, width, height) {
 
 const MOST_LINES = 40;
 
-/** Metres between lines: the least of 1, 2, 5, 10, 20 … that draws few of them. */
+/** Metres between grid lines: the smallest of 1, 2, 5, 10, 20 … with at most `MOST_LINES` lines. */
 export function gridStep(metres) {
   for (let ten = 1; ; ten *= 10) {
     const step = [1, 2, 5].find((digit) => metres <= MOST_LINES * digit * ten);
@@ -38,7 +38,7 @@ export function gridStep(metres) {
   }
 }
 
-/** What a box covers, in pixels. */
+/** The rectangle around a box, in pixels. */
 export function onScreen(box, view) {
   const a = (box.yaw * Math.PI) / 180;
   const [c, s] = [Math.abs(Math.cos(a)), Math.abs(Math.sin(a))];

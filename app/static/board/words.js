@@ -1,4 +1,4 @@
-/** Searching a vocabulary: labels and aliases, however they are spelled. */
+/** Search in a vocabulary by labels and aliases, tolerant of spelling. */
 
 /** @typedef {{label: string, aliases: string[], structure: boolean}} Entry */
 
@@ -13,12 +13,12 @@ function rank(name, wanted) {
 
 const MOST_TYPOS = 2;
 
-/** What a plural may be one of: "tvs", "shelves", "boxes". */
+/** Possible singulars of a plural such as "tvs", "shelves" or "boxes". */
 const singulars = (text) =>
   [[/s$/, ''], [/es$/, ''], [/ies$/, 'y'], [/ves$/, 'f']]
     .filter(([ending]) => ending.test(text)).map(([ending, instead]) => text.replace(ending, instead));
 
-/** How many letters are wrong, missing, too many or swapped; words much longer or shorter count as all wrong. */
+/** Number of wrong, missing, extra or swapped letters; Infinity if the lengths differ too much. */
 function typos(a, b) {
   if (Math.abs(a.length - b.length) > MOST_TYPOS) return Infinity;
   const rows = [[...Array(b.length + 1).keys()]];
@@ -33,16 +33,16 @@ function typos(a, b) {
   return rows[a.length][b.length];
 }
 
-/** How unlike a name is to what was typed; short words bear fewer mistakes. */
+/** Number of typing errors, or Infinity if there are too many; short words allow fewer errors. */
 function unlike(name, wanted) {
   const wrong = typos(name, wanted);
   return wrong <= Math.min(MOST_TYPOS, Math.floor(wanted.length / 3)) ? wrong : Infinity;
 }
 
 /**
- * Entries that fit: by what was typed, else by its singular, else those of nearly that name.
+ * Entries that match the text, else its singular, else names with few typing errors.
  * @param {Entry[]} entries
- * @returns {{label: string, alias: string | null}[]} best first; `alias` is the name that fitted where it was not the label
+ * @returns {{label: string, alias: string | null}[]} best first; `alias` is the matching name, if not the label
  */
 export function search(entries, text, limit = 12) {
   const wanted = plain(text);
@@ -54,9 +54,9 @@ export function search(entries, text, limit = 12) {
 }
 
 /**
- * Entries that fit, best first.
+ * Matching entries, best first.
  * @param {Entry[]} entries
- * @param {(name: string, wanted: string) => number} rank the less the better
+ * @param {(name: string, wanted: string) => number} rank lower is better
  */
 function fitting(entries, wanted, rank) {
   const found = [];
@@ -74,7 +74,7 @@ function fitting(entries, wanted, rank) {
   return found.sort((a, b) => a.best - b.best);
 }
 
-/** A relation as it is read aloud: "on top of". */
+/** Relations in words, for example "on top of". */
 export const SPOKEN = {
   left: 'left of',
   right: 'right of',
