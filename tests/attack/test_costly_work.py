@@ -104,7 +104,7 @@ async def test_the_server_limits_deadlines(shared_store: Path) -> None:
                 answer = await client.post(path, json=body, headers=headers)
                 assert answer.status_code == status
         answer = await client.post("/missing", json=HOME, headers={"X-Request-Timeout-Ms": "20001"})
-        assert "20000 milliseconds" in answer.json()["detail"]
+        assert "from 1 to 20000" in answer.json()["detail"]
         document = (await client.get("/openapi.json")).json()
         parameters = document["paths"]["/missing"]["post"]["parameters"]
         assert [p["schema"]["maximum"] for p in parameters if "Timeout" in p["name"]] == [20_000]
