@@ -103,15 +103,16 @@ def outliers(
     threshold: float | None = None,
     details: bool = True,
 ) -> OutliersFound:
-    """Judge every object and every stated relation: least fitting objects first, least likely
-    relations first, ties by position.
+    """Judge every object and every stated relation of a scene.
+
+    The least fitting objects and the least likely relations come first, ties by position.
 
     An object is judged by the log-odds of its class given the rest of the scene. The rest excludes
     all instances of the class and all relations that touch it. So instances of one class have the
     same score. Intruders are often common objects in the wrong room: their prior is proportional
     to popularity^alpha. So alpha times the log-odds of the class in a training scene is subtracted.
-    Structure, such as a wall, always has probability 0. Short lists say little about the scene, so
-    their thresholds are higher.
+    Structure, such as a wall, always has probability 0. A short list gives little evidence about
+    the scene, so its threshold is higher.
 
     Args:
         sensitivity: selects one of the model's thresholds.

@@ -167,7 +167,7 @@ class Posterior:
         return forward, backward
 
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
-        """Log-odds of all relations between absent classes and anchors, if the classes were present.
+        """Log-odds of all relations of absent classes to anchors, if these classes were present.
 
         The effect of the observed relations on a candidate's relations is left out.
 
@@ -197,7 +197,10 @@ class Posterior:
         return -np.logaddexp(np.float32(0.0), -log_odds)
 
     def log_odds_given_rest(self) -> Floats:
-        """Leave-one-out: log-odds of each class, given the scene without its relations, (n,)."""
+        """Leave-one-out log-odds of each class: given the scene without it, (n,).
+
+        The relations of the class are left out, too.
+        """
         found: Floats = self._closed.b[self.present.classes] + self._gains
         return found
 
@@ -263,8 +266,8 @@ def with_unlisted(
         absent: (N,) class indices.
         y: (H1,) logits of h1 in the closed form.
         coverage: probability that a present class is listed.
-        closed: (N,) the closed form at y, if `log_odds` are a better estimate. The change from
-            `closed` to `partial`, times λ, is then added to `log_odds`.
+        closed: (N,) the closed form at y, if `log_odds` are a better estimate. Then λ times the
+            difference between the partial posterior and the closed form is added to `log_odds`.
     """
     completions, weight = artifact.completions, artifact.calibration.coverage_weight
     unlisted = math.log1p(-min(coverage, FULL))
