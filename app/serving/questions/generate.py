@@ -31,7 +31,7 @@ from app.serving.request import Request
 from scene_client.schemas import GenerateAnswer, GenerateRequest
 
 DRAWN_SEED_BITS = 53
-"""A double holds seeds of this size exactly, so every JSON reader can send a seed back unchanged."""
+"""A double holds a seed of this size exactly, so every JSON reader can send it back unchanged."""
 
 _WARM_UP_STEPS: Final = 1  # one Gibbs sweep compiles all loops
 _UNIT_BYTES = 12  # for the number of one hidden unit

@@ -116,7 +116,7 @@ def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
 _EXAMPLES: Final = {
     **SCENES,
     "instances": Example(
-        "two chairs with different ids",
+        "two instances of one class",
         {"objects": ["chair", "chair", "desk"], "top_k": 10},
     ),
     "pairs": Example(
