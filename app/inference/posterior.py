@@ -48,8 +48,8 @@ function.
 
 All requests use the same random numbers, so the same scene always gets the same answer.
 
-The chains drew their samples under different room types. So the samples follow a mixture over these
-types, in which n_s samples have type s. For a scene of room type t,
+The chain samples may have different room types. Then they follow a mixture over these types, in
+which n_s samples have type s. For a scene of room type t,
 
     room = Q[t]·h_f - log sum_s n_s exp(Q[s]·h_f) / Z_s
 
