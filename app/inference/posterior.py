@@ -114,7 +114,7 @@ FULL = Pull()
 class ClosedForm:
     """Log-odds of objects and relations in closed form.
 
-    The same scene gives the same bits, whatever other questions are asked.
+    The same scene always gives bit-identical log-odds. Other questions have no effect on them.
 
     Raises:
         ValueError: the machine does not fit this closed form; see `fits`.
@@ -285,8 +285,7 @@ class Completions:
 
     Args:
         weights: weights and stored samples of the machine.
-        structure: (V,) which classes are structure; these are never added, and their absence from a
-            list is no evidence.
+        structure: (V,) which classes are structure; completions ignore these classes.
         scorer: scorer of the same machine.
         count: M, number of completions of a scene.
 

@@ -3,8 +3,8 @@
 //     scene::Client service({"http://127.0.0.1:8000"});
 //     auto answer = service.missing({{"objects", {"bed", "nightstand"}}, {"top_k", 5}});
 //
-// Requests and answers are JSON as in the HTTP contract (docs/clients.md, /openapi.json). Every call
-// ends within its timeout, except that the system's DNS lookup may take longer.
+// Requests and answers are JSON as in the HTTP contract (docs/clients.md, /openapi.json). Every
+// call ends within its timeout, except that the system's DNS lookup may take longer.
 #pragma once
 
 #ifndef _WIN32
@@ -116,8 +116,8 @@ class Client {
     return call("POST", "/generate", request, timeout);
   }
 
-  // One question about many scenes. `scenes` is an array of requests; each request has its own entry
-  // in `results` of the answer.
+  // One question about many scenes. `scenes` is an array of requests; each request has its own
+  // entry in `results` of the answer.
   json relations_batch(const json& scenes, std::optional<Seconds> timeout = {}) {
     return call("POST", "/relations/batch", {{"scenes", scenes}}, timeout);
   }

@@ -160,7 +160,7 @@ def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
 _EXAMPLES: Final = {
     **SCENES,
     "at": Example(
-        "what is missing from the desk?",
+        "objects that are missing on the desk",
         {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
     ),
     "coverage": Example(

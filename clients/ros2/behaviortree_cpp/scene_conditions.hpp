@@ -7,10 +7,10 @@
 //     <SceneComplete scene="{scene}" because="{why}"/>
 //     <ObjectBelongs scene="{scene}" object="cup_1"/>
 //
-// `scene` is a request as JSON text (docs/robots.md). The first tick of a condition starts a question
-// in a separate thread. The condition is RUNNING until the answer arrives, so a tick never waits. A
-// condition fails if the scene has no objects, or if no answer arrives within the client's timeout.
-// `because` gives the reason.
+// `scene` is a request as JSON text (docs/robots.md). The first tick of a condition starts a
+// question in a separate thread. The condition is RUNNING until the answer arrives, so a tick never
+// waits. A condition fails if the scene has no objects, or if no answer arrives within the client's
+// timeout. `because` gives the reason.
 #pragma once
 
 #include <behaviortree_cpp/action_node.h>
@@ -135,8 +135,8 @@ class SceneCondition : public BT::StatefulActionNode {
   std::thread thread_;  // declared last: it uses the other members
 };
 
-// SUCCESS if all missing objects have log-odds below the port `log_odds`. These are the log-odds that
-// an unlisted object is present. The default 0 stands for a probability of 0.5.
+// SUCCESS if every unlisted object has log-odds of presence below the port `log_odds`. The default
+// 0 is a probability of 0.5.
 class SceneComplete : public SceneCondition {
  public:
   SceneComplete(const std::string& name, const BT::NodeConfig& config,

@@ -68,7 +68,7 @@ class Advisor:
 
     def __post_init__(self) -> None:
         if not self.questions or not set(self.questions) <= set(QUESTIONS):
-            raise ValueError(f"questions must be one or more of {', '.join(QUESTIONS)}")
+            raise ValueError(f"questions must be some of {', '.join(QUESTIONS)}")
         read_label_map(self.label_map)
 
     def advise(self, message: Any, viewpoint: Viewpoint | None = None) -> Advice:
