@@ -98,7 +98,7 @@ def admin() -> dict[str, str]:
 
 @pytest.fixture
 def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
-    """Replace one of the four questions by a function, which gets the question as first argument."""
+    """Replace a question by a function; the function gets the question as its first argument."""
     from app import questions
 
     def replace(name: str, function: Callable[..., Any]) -> None:

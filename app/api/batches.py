@@ -77,8 +77,8 @@ async def _answer_each(
 def _failed(error: Exception, place: int, request_id: str) -> tuple[str, bytes]:
     """The outcome and the entry of a failed scene.
 
-    This is a function of its own to break a reference cycle: local variables of the batch's frame
-    must not refer to the error, because the error refers to that frame.
+    The local variables of the batch's frame must not refer to the error, since the error refers to
+    that frame. A separate function avoids this reference cycle.
     """
     failure = from_exception(error, at=("scenes", place))
     problem = failure.describe(request_id)

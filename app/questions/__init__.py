@@ -5,9 +5,9 @@
     outliers    What does not belong here, or stands in the wrong place?
     generate    What would a scene like this look like?
 
-The first three compute expectations, in closed form or with fixed random numbers. So the same scene
-always gets the same answer. `generate` draws random scenes. Answers refer to an object by its
-position in the scene's list.
+The first three questions compute expectations, in closed form or with fixed random numbers. So the
+same scene always gets the same answer. `generate` draws random scenes. Answers refer to an object
+by its position in the scene's list.
 """
 
 from __future__ import annotations

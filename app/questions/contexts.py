@@ -1,4 +1,4 @@
-"""The classes that each hidden unit favours."""
+"""Describe hidden units by the objects, relations and room types with the largest weights."""
 
 from __future__ import annotations
 

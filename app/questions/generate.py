@@ -1,4 +1,4 @@
-"""What would a scene like this look like?
+"""The question `generate`: draw scenes that contain the given objects and relations.
 
 A Gibbs chain sometimes ends between two kinds of rooms. Such a scene is almost empty, or holds an
 object that belongs to neither room. A scene is drawn again in three cases:
@@ -236,7 +236,7 @@ def _holding(
         given: number of given relations.
         count: n, number of classes.
     """
-    # beyond[d, x, y]: y lies beyond x in direction d.
+    # beyond[d, x, y]: y is beyond x in direction d, directly or through a chain of relations.
     beyond = np.zeros((3, count, count), np.bool_)
     related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
     stay = np.zeros(len(relation) - given, np.bool_)

@@ -1,4 +1,4 @@
-"""What else should be here, and where?"""
+"""The question `missing`: which unlisted objects are probably present, and where?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What does not belong here, or stands in the wrong place?
+"""The question `outliers`: which objects do not belong, and which stated relations are wrong?
 
 The answer for an outlier names its companions: absent classes that usually occur with it. In a
 scene without other objects, the presence of class j raises the log-odds of class i by

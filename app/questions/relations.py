@@ -1,4 +1,4 @@
-"""How do these objects stand to each other? Which observed relations does the model not expect?
+"""The question `relations`: which relations hold between objects, and which are unexpected?
 
 Disagreements: each pair of objects with an observed relation is judged a second time, with all
 relations between their two classes unobserved, in both directions. Otherwise an observation would

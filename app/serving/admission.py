@@ -8,9 +8,9 @@ three reasons: the backlog is full, the expected wait is too long, or the deadli
 
 `WorkQueue` bounds the work of one model, in rows. Each question is computed separately, so an
 answer never depends on other requests. A cheap question runs on the event loop, because a change of
-thread costs as much as most questions. A question runs on the worker thread of its model if it is
-expected to take longer than `CHEAP` seconds, or if its kind was never measured. Compiled loops
-release the interpreter's lock. Drawing scenes may take seconds, so all models share another thread
+thread costs as much as most questions. A costly question runs on the worker thread of its model:
+its expected time exceeds `CHEAP`, or its kind was never measured. Compiled loops release the
+interpreter's lock. Drawing scenes may take seconds, so all models share another thread
 for it. Questions of streams run one at a time, one per tick. A question is dropped if its deadline
 has passed or its client has disconnected before it starts.
 """
@@ -109,7 +109,7 @@ class Backlog:
             raise QueueFullError(f"{count} requests are already waiting.")
         await _wait(self._waiting)
         if monotonic() >= deadline:
-            raise DeadlinePassedError("The deadline passed before the request was read.")
+            raise DeadlinePassedError("The deadline passed before the request started.")
 
     def _is_full(self, allowed: float) -> bool:
         if not self._waiting:
@@ -388,7 +388,11 @@ class WorkQueue:
 
 @asynccontextmanager
 async def _turn(lock: asyncio.Lock, ticket: Ticket) -> AsyncIterator[None]:
-    """Hold the lock for jobs of low priority, if it is free before the deadline."""
+    """Hold the lock for low-priority jobs.
+
+    Raises:
+        DeadlinePassedError: the deadline passed before the lock was free.
+    """
     left = ticket.deadline - monotonic()
     try:
         await asyncio.wait_for(lock.acquire(), left if left < math.inf else None)

@@ -122,7 +122,7 @@ def written(answer: Any) -> bytes:
     try:
         from_json(body, allow_inf_nan=False)
     except ValueError:
-        raise ValueError("a number of an answer is not finite") from None
+        raise ValueError("an answer contains a number that is not finite") from None
     return body
 
 

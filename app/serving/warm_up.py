@@ -1,4 +1,4 @@
-"""Load models: each verified model answers every question before the first request."""
+"""Warm up models: each verified model answers every question before it gets requests."""
 
 from __future__ import annotations
 

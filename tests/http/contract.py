@@ -81,7 +81,7 @@ def form_is_as_documented(_: Any, response: Any, case: Any) -> None:
 
 
 def _is_whole(fault: Any) -> bool:
-    """Whether the error is a float in place of an integer: JSON Schema accepts 1.0 as an integer."""
+    """Whether the input is a float such as 1.0, which JSON Schema accepts as an integer."""
     return fault["type"] == "int_type" and isinstance(fault["input"], float)
 
 

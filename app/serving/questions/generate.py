@@ -1,4 +1,4 @@
-"""What would a scene like this look like?"""
+"""The route of the question `generate`."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _check_context(asked: GenerateRequest, model: ServedModel) -> None:
         size = model.context_sizes.get(layer)
         if size is None:
             layers = tuple(model.context_sizes)
-            faults.add(Reason.INVALID, ("context", layer), "the model has no such layer", layers)
+            faults.add(Reason.INVALID, ("context", layer), "the model has no layer with this name", layers)
             continue
         for place, unit in enumerate(units):
             if unit >= size:

@@ -1,4 +1,4 @@
-"""What else should be here, and where?"""
+"""The route of the question `missing`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
     faults = Faults()
     # The default may exceed the vocabulary's size. A number from the client must not.
     if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
-        message = f"must not be above {len(model.vocabulary)}, the size of the model's vocabulary"
+        message = f"must be at most {len(model.vocabulary)}, the size of the model's vocabulary"
         faults.add(Reason.INVALID, ("top_k",), message)
     candidates = at = None
     if asked.candidates is not None:

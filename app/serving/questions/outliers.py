@@ -1,4 +1,4 @@
-"""What does not belong here, or stands in the wrong place?"""
+"""The route of the question `outliers`."""
 
 from __future__ import annotations
 

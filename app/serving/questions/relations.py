@@ -1,4 +1,4 @@
-"""How do these objects stand to each other?"""
+"""The route of the question `relations`."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _pairs(asked: RelationsRequest, reading: Reading) -> list[tuple[int, int]]:
         if subject is None or other is None:
             continue
         if subject == other:
-            faults.add(Reason.INVALID, location, "a pair needs two objects")
+            faults.add(Reason.INVALID, location, "subject and object must be two different objects")
             continue
         pairs[subject, other] = None
     faults.raise_any()
