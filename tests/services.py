@@ -69,7 +69,7 @@ async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient
 
 @pytest.fixture(scope="session")
 def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store that no test changes."""
+    """A store that all tests share and must not change."""
     from tests.http.stores import make_store
 
     return make_store(tmp_path_factory.mktemp("store"))

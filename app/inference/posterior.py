@@ -209,7 +209,7 @@ class ClosedForm:
 
         Args:
             a: (E,) canonical relations.
-            i, j: (E,) places of subject and object class in the scene.
+            i, j: (E,) indices of subject and object class in the scene.
         """
         given, shift, _ = self.units.said(context)
         slopes = given[a, i, j] if len(given) else np.zeros(len(a), dtype=np.float32)
@@ -223,7 +223,7 @@ class ClosedForm:
         Args:
             candidates: (N,) absent classes.
             relation: canonical relation.
-            anchor: place of the anchor's class in the scene.
+            anchor: index of the anchor's class in the scene.
             outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
         """
         both = self.units.placement_log_odds(context, candidates, np.array([anchor]), relation)
@@ -248,7 +248,7 @@ class ClosedForm:
             context: the context of the scene.
             shares: (n, H1) result of `shares`.
             gains: (n,) result of `gains_given_rest`.
-            rows: (N,) places of the explained classes in the scene.
+            rows: (N,) indices of the explained classes in the scene.
         """
         without: Floats = objects.gains_without_others(
             *(context.object_y, shares, self.W[context.classes], rows),
@@ -311,7 +311,7 @@ class Completions:
         self._odds_against = np.exp(-np.maximum(logits, _LEAST_LOGIT)).T.copy()
         self._noise = np.exp(-_stratified_logits(count, len(self._b), generator)).T.copy()
         self._rooms = _room_weights(weights, contexts)
-        # A cache for each instance: a cache of the method would keep every instance alive.
+        # Each instance has its own cache: a cache of the method would keep every instance alive.
         self._empty = lru_cache(maxsize=_KEPT)(self._unlisted_evidence)
 
     @staticmethod
@@ -356,7 +356,7 @@ class Completions:
         return found
 
     def _unlisted_evidence(self, coverage: float) -> Floats:
-        """sum_i log(1 - c σ(l_i)) over all classes but structure, (N,)."""
+        """Sum of log(1 - c σ(l_i)) over all classes i except structure, for each sample, (N,)."""
         chance = 1 / (1 + self._odds_against[~self._structure])
         total = np.zeros(chance.shape[1], np.float32)
         for start in range(0, len(chance), _FACTORS):

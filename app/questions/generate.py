@@ -74,8 +74,8 @@ def generate(
     """Draw scenes that contain the evidence, by Gibbs chains that start at stored chain samples.
 
     Every drawn scene contains the objects of the evidence, whatever their confidence, and its
-    relations. Relations that the evidence rules out stay off. The chain draws the rest. Drawn
-    structure (floor, wall) is left out of the answer.
+    relations. Relations that the evidence rules out stay off. The chain draws all other objects and
+    relations. Structure (floor, wall) outside the evidence is left out of the answer.
 
     Every chain has its own random stream. So scene k depends only on the seed and on k, whatever
     the `count`.
@@ -192,7 +192,7 @@ def staying(
     likeliest first. A tried relation stays if all of these conditions are met:
 
     - Its two classes have no relation yet (`app.scene.geometry` finds at most one).
-    - It closes no cycle, such as A left of B, B left of C, C left of A.
+    - It does not close a cycle, such as A left of B, B left of C, C left of A.
     - If it is *on-top*, its subject does not stand on another class yet.
     - Its subject and object are different classes.
     - Neither class is structure. Training drops relations of structure, so a drawn one has no
@@ -231,7 +231,7 @@ def _holding(
 
     Args:
         relation: (given + m,), the given relations first.
-        places: (given + m, 2), places of subject and object among the n classes.
+        places: (given + m, 2), indices of subject and object among the n classes.
         order: the relations to try, numbers from 0 to m - 1, likeliest first.
         given: number of given relations.
         count: n, number of classes.

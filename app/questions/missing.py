@@ -102,9 +102,10 @@ def missing(
     Args:
         top_k: maximum number of answers.
         candidates: class indices to choose from; listed classes and structure are ignored.
-        at: (relation, position of an object). If set, `probability` is that of a class being
-            present *and* standing in this relation to this object.
-        coverage: from 0 to 1; by default the model's. At 1 unlisted classes count as absent.
+        at: a place (relation, position of an object). If set, `probability` is the probability that
+            the class is present *and* stands in this relation to the object.
+        coverage: probability that a present class is listed; by default the model's value. At 1,
+            unlisted classes count as absent.
         axes: the viewer's axes, in the frame of the offsets (`viewer_axes`). None if the viewing
             direction is unknown.
         details: whether to add `placements` and `because`.
@@ -234,7 +235,7 @@ def place_log_p(
     Args:
         candidates: (N,) absent classes.
         relation: canonical relation.
-        anchor: place of the anchor's class among the listed classes.
+        anchor: index of the anchor's class among the listed classes.
         outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
     """
     return placement_log_p(

@@ -32,7 +32,7 @@ class Present(NamedTuple):
     Attributes:
         classes: (n,) int64, class indices, ascending.
         counts: (n,) int64, number of instances of each class.
-        row: (N,) int64, place in `classes` of each object's class.
+        row: (N,) int64, index into `classes` for each object's class.
         first: (n,) int64, position of the first object of each class.
         presence: (n,) float32, probability that at least one instance of the class is present.
         log_counts: (n,) float32, log of `counts`.
@@ -148,7 +148,7 @@ class Posterior:
 
         Args:
             relation: (E,) canonical relations.
-            subject, object_: (E,) places in `present.classes`.
+            subject, object_: (E,) indices into `present.classes`.
         """
         return self._closed.unit_log_odds(self._context, relation, subject, object_)
 
@@ -156,7 +156,7 @@ class Posterior:
         """Log-odds of all relations of P pairs, judged as if no relation of the pair were observed.
 
         Args:
-            one, other: (P,) places of the two classes in `present.classes`.
+            one, other: (P,) indices of the two classes in `present.classes`.
 
         Returns:
             (A, P) from `one` to `other`, and (A, P) from `other` to `one`.
@@ -173,7 +173,7 @@ class Posterior:
 
         Args:
             candidates: (N,) absent classes.
-            anchors: (m,) places in `present.classes`.
+            anchors: (m,) indices into `present.classes`.
 
         Returns:
             (N, A, m) from the candidates to the anchors, and (N, A, m) from the anchors back.
@@ -188,7 +188,7 @@ class Posterior:
         Args:
             candidates: (N,) absent classes.
             relation: canonical relation.
-            anchor: place in `present.classes`.
+            anchor: index into `present.classes`.
             outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
         """
         log_odds = self._closed.placed_log_odds(
@@ -211,7 +211,7 @@ class Posterior:
         its relations. The entry of a class for itself is 0.
 
         Args:
-            rows: (N,) places of the explained classes in `present.classes`.
+            rows: (N,) indices of the explained classes in `present.classes`.
         """
         return self._closed.reasons(self._context, self._shares, self._gains, rows)
 

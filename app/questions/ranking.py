@@ -109,7 +109,7 @@ def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposit
         slopes: (A, 4 + 2K), see `RelationSlopes`.
         log_odds: (A, n, n) log-odds of the relations between classes.
         log_counts: (n,) log of the number of instances of each class.
-        row: (N,) place of each object's class among the n classes.
+        row: (N,) index of each object's class among the n classes.
         asked: (N, N) bool, the ordered pairs to answer.
         least: relations of a lower probability are left out.
         opposites: whether to add, as relation A + a, relation a from object to subject.
@@ -186,11 +186,11 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
 
 @compiled
 def strongest(change, rows, count):
-    """Places and values of the largest changes of either sign, (N, k) both.
+    """Indices and values of the largest changes of either sign, each (N, k).
 
     Args:
         change: (N, n) changes of N explained classes by the n classes of the scene.
-        rows: (N,) place of each explained class among the n classes, which is skipped; empty if the
+        rows: (N,) index of each explained class among the n classes, which is skipped; empty if the
             explained classes are absent.
         count: maximum of k.
     """
@@ -221,7 +221,7 @@ def strongest_reasons(
     Args:
         first: (n,) position of the first object of each class of the scene.
         change: (N, n) changes of the explained classes' log-odds by each class of the scene.
-        rows: (N,) places of the explained classes among the n; None for absent classes.
+        rows: (N,) indices of the explained classes among the n; None for absent classes.
     """
     rows = np.zeros(0, np.int64) if rows is None else rows
     places, values = strongest(change, rows, REASONS)
@@ -239,7 +239,7 @@ def observed_pairs(triples, row, asked, classes, relations):
 
     Args:
         triples: (T, 3) relation, subject and object.
-        row: (N,) place of each object's class among the n classes.
+        row: (N,) index of each object's class among the n classes.
         asked: (N, N) bool, the ordered pairs to answer; a pair counts in either order.
         classes, relations: the numbers n and A.
 
@@ -289,7 +289,7 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
         least: smallest probability of an expected relation.
 
     Returns:
-        Four arrays (k,): place of the pair, number of the expected relation, its probability, and
+        Four arrays (k,): index of the pair, number of the expected relation, its probability, and
         the observed probability.
     """
     A, P = forward.shape

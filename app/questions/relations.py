@@ -86,8 +86,8 @@ def relations(
         include_opposites: also list opposite relations, such as right(y, x) for left(x, y).
 
     Returns:
-        Relations, likeliest first, and disagreements, largest probability ratio first. Ties go by
-        position.
+        The relations, likeliest first. The disagreements, ordered by the ratio of `probability` to
+        `observed_probability`, largest first. Ties are ordered by position.
 
     Raises:
         ValueError: top_k below 1, a probability outside [0, 1], or a pair that is not two objects.

@@ -6,13 +6,14 @@ event loop for more than `TICK` seconds. It refuses at most `REFUSALS` requests 
 these bounds, hundreds of simultaneous requests would delay health checks. A request is refused for
 three reasons: the backlog is full, the expected wait is too long, or the deadline has passed.
 
-`WorkQueue` bounds the work of one model, in rows. Each question is computed separately, so an
-answer never depends on other requests. A cheap question runs on the event loop, because a change of
-thread costs as much as most questions. A costly question runs on the worker thread of its model:
-its expected time exceeds `CHEAP`, or its kind was never measured. Compiled loops release the
-interpreter's lock. Drawing scenes may take seconds, so all models share another thread
-for it. Questions of streams run one at a time, one per tick. A question is dropped if its deadline
-has passed or its client has disconnected before it starts.
+`WorkQueue` bounds the rows (scenes) that wait for one model or are computed by it. Each question is
+computed separately, so an answer never depends on other requests. A cheap question runs on the
+event loop, because a change of thread costs as much as most questions. A costly question runs on
+the worker thread of its model: its expected time exceeds `CHEAP`, or its kind was never measured.
+Compiled loops release the interpreter's lock, so the event loop can continue. Drawing scenes may
+take seconds, so all models share another thread for it. Questions of streams run one at a time, one
+per tick. A question is dropped if its deadline has passed or its client has disconnected before it
+starts.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ CHEAP: Final = 2e-3
 
 # Seconds between two ticks if the last one could not start a request.
 _PAUSE: Final = 5e-3
-# Maximum expected wait, as a share of the request's time. Its wait may then still triple.
+# Maximum expected wait, as a share of the request's time. Even a wait three times as long then ends
+# before the deadline.
 _PATIENCE: Final = 0.25
 # Weight of the newest measurement in the moving averages of the backlog.
 _NEWEST_PACE: Final = 0.1
@@ -91,7 +93,7 @@ class Backlog:
 
         Args:
             allowed: total time of the request in seconds.
-            deadline: end of this time, by `time.monotonic`.
+            deadline: value of `time.monotonic` at the end of this time.
 
         Raises:
             QueueFullError: too many requests wait, or the expected wait is too long.
@@ -177,7 +179,7 @@ class Ticket:
     """The deadline of a request, and a check of its client's connection.
 
     Attributes:
-        deadline: deadline by `time.monotonic`; work that starts later is dropped.
+        deadline: value of `time.monotonic` at the deadline; work that starts later is dropped.
         is_gone: function that returns whether the client has disconnected; called before and
             during costly work.
     """
@@ -225,7 +227,7 @@ class Done(Generic[T]):
 class _Costs:
     """Average cost of questions in seconds per unit of size, by kind and order of magnitude.
 
-    Small scenes cost more per unit than large scenes, so the orders of magnitude are kept apart.
+    Small scenes cost more per unit than large ones. So each order of magnitude has its own average.
     """
 
     def __init__(self) -> None:

@@ -117,7 +117,8 @@ def written(answer: Any) -> bytes:
     body = orjson.dumps(answer, default=_fields)
     if b"null" not in body:
         return body
-    # The "null" is an infinite number or NaN, a field without a value, or a part of a name.
+    # `null` has three possible causes: NaN or infinity, a field without a value, or a name that
+    # contains the text "null".
     body = to_json(answer, inf_nan_mode="constants", exclude_none=True)
     try:
         from_json(body, allow_inf_nan=False)

@@ -26,7 +26,7 @@ def prepare(
 ) -> ServedModels:
     """Warm up every verified model, and collect the models that can be served.
 
-    A model that ``previous`` serves from the same artifact is already warm. It keeps its queue.
+    A model that ``previous`` serves from the same artifact is already warm, and keeps its queue.
     """
     served: dict[Key, ServedModel] = {}
     failures: dict[Key, Failure] = {}

@@ -31,8 +31,8 @@ def documented(examples: int) -> Any:
     It does not depend on the store, so tests can be collected before the service starts.
 
     Args:
-        examples: number of random requests of each kind for an operation. The systematic requests
-            for each part of its schema come on top.
+        examples: number of random requests of each kind for an operation, besides the systematic
+            requests for each part of its schema.
     """
     positive = ["2xx", "3xx", "401", "403", "404", "409", "429", "5xx"]
     negative = ["400", "401", "404", "405", "413", "415", "422"]

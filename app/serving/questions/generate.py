@@ -80,7 +80,7 @@ def _check_context(asked: GenerateRequest, model: ServedModel) -> None:
         size = model.context_sizes.get(layer)
         if size is None:
             layers = tuple(model.context_sizes)
-            faults.add(Reason.INVALID, ("context", layer), "the model has no layer with this name", layers)
+            faults.add(Reason.INVALID, ("context", layer), "the model has no such layer", layers)
             continue
         for place, unit in enumerate(units):
             if unit >= size:
