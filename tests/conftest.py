@@ -8,8 +8,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-# Before torch or numpy is imported: one thread, as a serving worker runs, so that tests neither
-# fight over cores nor depend on how a reduction was split.
+# One thread per test, as in a serving worker. So tests do not compete for cores, and results do not
+# depend on the number of threads. This must come before the import of torch or numpy.
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[_variable] = "1"
 
@@ -20,7 +20,8 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 
 pytest_plugins = ["tests.services"]
 
-# `ci`, the default, draws the same examples on every run. HYPOTHESIS_PROFILE=explore looks further.
+# The default profile `ci` draws the same examples on every run. HYPOTHESIS_PROFILE=explore draws
+# more and different examples.
 settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True)
 settings.register_profile(
     "explore",
@@ -40,20 +41,20 @@ def repository() -> Path:
 
 @pytest.fixture(scope="session")
 def anyio_backend() -> str:
-    """Coroutine tests (`@pytest.mark.anyio`) run on the loop that uvicorn serves with."""
+    """Coroutine tests (`@pytest.mark.anyio`) run on asyncio, like uvicorn."""
     return "asyncio"
 
 
 @pytest.fixture(scope="session")
 def require_system_tool() -> Callable[[str], Path]:
-    """Return a function that finds a program, or skips the test where the machine lacks it.
+    """Return a function that finds a program, or skips the test if it is not installed.
 
-    Under REQUIRE_SYSTEM=1, as in continuous integration, a missing program fails the test: there,
-    a skip would hide that nothing was checked.
+    With REQUIRE_SYSTEM=1, as in continuous integration, a missing program fails the test. There, a
+    skipped test would hide that the check did not run.
     """
 
     def find(name: str) -> Path:
-        # Programs from wheels lie beside the interpreter, which need not be on PATH.
+        # Programs from wheels are in the interpreter's folder, which may be missing in PATH.
         search = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
         if program := shutil.which(name, path=search):
             return Path(program)

@@ -1,6 +1,7 @@
-"""The service in process and as a process of its own, over stores of small random machines.
+"""Fixtures for every test: the service in process or as a separate process.
 
-The fixtures are those of every test: `live` is one process for all tests that leave it as it is.
+The stores hold small machines with random weights. All tests share the process of `live`, so they
+must not change its state.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import pytest
 ADMIN_KEY = "correct-horse-battery-staple"
 CONTROL = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}], "seed": 11}
 NAMED = {"allowed_hosts": ["service"]}
-"""Settings of a service in process, which its clients call http://service."""
+"""Settings of a service in process; its clients use the URL http://service."""
 
 Replace = Callable[[str, Callable[..., Any]], None]
 
@@ -36,7 +37,7 @@ from app.__main__ import main
 missing = questions.missing
 
 def fail(artifact, scene, **parameters):
-    # In no other scene, or the models would be refused when they are warmed up.
+    # Scenes without a room type still work, since a failed warm-up would exclude the model.
     if scene.room_type is None:
         return missing(artifact, scene, **parameters)
     raise ZeroDivisionError({message!r})
@@ -44,18 +45,18 @@ def fail(artifact, scene, **parameters):
 questions.missing = fail
 sys.exit(main())
 """
-"""A program for `launch`: a service that cannot say what is missing in a room of a known type."""
+"""A program for `launch`: its question `missing` fails for every scene with a room type."""
 
 
 @asynccontextmanager
 async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient]:
-    """A client of the application over a store, inside its lifespan."""
-    # Here, so that tests without a service do not wait for the import.
+    """Start the application on a store, and yield a client."""
+    # Imported here, so that tests without a service do not wait for the import.
     from app.main import create_app
     from app.settings import Settings
 
     app = create_app(Settings(store=store, **{"admin_key": ADMIN_KEY, **NAMED, **settings}))
-    # As `python -m app` does: the runtime enables it when it has started.
+    # `python -m app` also disables the collector; the runtime enables it after the start.
     gc.disable()
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
@@ -68,7 +69,7 @@ async def serve(store: Path, **settings: Any) -> AsyncIterator[httpx.AsyncClient
 
 @pytest.fixture(scope="session")
 def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store that no test changes."""
+    """A store that all tests share and must not change."""
     from tests.http.stores import make_store
 
     return make_store(tmp_path_factory.mktemp("store"))
@@ -76,7 +77,7 @@ def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
-    """A store of the test's own."""
+    """A store for one test, which may change it."""
     from tests.http.stores import make_store
 
     return make_store(tmp_path / "store")
@@ -91,13 +92,13 @@ async def client(shared_store: Path, anyio_backend: str) -> AsyncIterator[httpx.
 
 @pytest.fixture
 def admin() -> dict[str, str]:
-    """The headers of an administrator."""
+    """Request headers with the administrator's key."""
     return {"X-Admin-Key": ADMIN_KEY}
 
 
 @pytest.fixture
 def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
-    """Put a function in place of one of the four questions; the question is its first argument."""
+    """Replace a question by a function; the function gets the question as its first argument."""
     from app import questions
 
     def replace(name: str, function: Callable[..., Any]) -> None:
@@ -113,13 +114,13 @@ def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
 
 
 def defect(*_: Any, **__: Any) -> Any:
-    """In place of a question."""
+    """A replacement for a question that raises an error."""
     raise ZeroDivisionError("secret detail")
 
 
 @dataclass
 class LiveService:
-    """A running ``python -m app``, which ends with its ``with`` block."""
+    """A running ``python -m app``, which stops at the end of its ``with`` block."""
 
     process: subprocess.Popen[str]
     client: httpx.Client
@@ -128,12 +129,12 @@ class LiveService:
 
     @property
     def url(self) -> str:
-        """Where it listens."""
+        """Base URL of the service."""
         return f"http://127.0.0.1:{self.port}"
 
     @property
     def memory(self) -> int:
-        """Resident bytes."""
+        """Resident memory in bytes."""
         for line in Path(f"/proc/{self.process.pid}/status").read_text("ascii").splitlines():
             if line.startswith("VmRSS:"):
                 return int(line.split()[1]) * 1024
@@ -141,11 +142,11 @@ class LiveService:
 
     @property
     def descriptors(self) -> int:
-        """Open files and sockets."""
+        """Number of open files and sockets."""
         return len(list(Path(f"/proc/{self.process.pid}/fd").iterdir()))
 
     def control(self) -> dict[str, bytes]:
-        """The answers to one question of each kind, which never change."""
+        """Ask one fixed question of each kind. The answers never change."""
         answers = {}
         for question in ("relations", "missing", "outliers", "generate"):
             body = CONTROL | ({"steps": 8} if question == "generate" else {})
@@ -157,7 +158,7 @@ class LiveService:
         return answers
 
     def stop(self) -> str:
-        """End it as an orchestrator does; its whole log."""
+        """Stop the service with SIGTERM, as an orchestrator does, and return its log."""
         self.client.close()
         self.process.terminate()
         try:
@@ -176,7 +177,7 @@ class LiveService:
 def begin(
     store: Path, log: Path, *, program: tuple[str, ...] = ("-m", "app"), **variables: str
 ) -> subprocess.Popen[str]:
-    """Start ``python -m app`` (or another program) and do not wait for it."""
+    """Start ``python -m app`` (or another program) without waiting for it."""
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("SCENE_")
     }
@@ -197,7 +198,7 @@ def launch(
 ) -> LiveService:
     """Start ``python -m app`` (or another program) and wait until it answers.
 
-    The port is a free one unless it is given.
+    By default it listens on a free port.
     """
     if port is None:
         with socket.socket() as probe:
@@ -221,14 +222,14 @@ def launch(
 
 @pytest.fixture(scope="session")
 def live(shared_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    """The service as a process of its own."""
+    """The service as a separate process, shared by all tests."""
     with launch(shared_store, tmp_path_factory.mktemp("live") / "log") as service:
         yield service
 
 
 @pytest.fixture(scope="session")
 def shipped(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    """The same with the shipped models."""
+    """The service as a separate process with the shipped models, shared by all tests."""
     log = tmp_path_factory.mktemp("shipped") / "log"
     with launch(repository / "model_store", log) as service:
         yield service

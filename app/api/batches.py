@@ -1,4 +1,4 @@
-"""Batches: many scenes in one request; each answer equals the answer to the scene alone."""
+"""Batch routes: many scenes in one request, answered in order and independently."""
 
 from __future__ import annotations
 
@@ -64,21 +64,21 @@ async def _answer_each(
                 )
                 results.append(b'{"status":200,"result":%b}' % answer)
                 count(SUCCESS)
-            except Exception as error:  # noqa: BLE001 — an internal error fails only its entry
+            except Exception as error:  # noqa: BLE001 — even a defect fails only one entry
                 outcome, failed = _failed(error, place, request.id)
                 count(outcome)
                 results.append(failed)
             left = max(0, left - len(results[-1]))
-            # Let other tasks run between two scenes, for example health checks.
+            # Let other tasks run between two scenes, above all health checks.
             await asyncio.sleep(0)
     return b'{"request_id":%b,"results":[%b]}' % (to_json(request.id), b",".join(results))
 
 
 def _failed(error: Exception, place: int, request_id: str) -> tuple[str, bytes]:
-    """Return the outcome and the entry of a scene that could not be answered.
+    """The outcome and the entry of a failed scene.
 
-    The error stays in this frame. Its traceback refers to the frame of the batch, whose objects
-    would otherwise stay in memory.
+    The local variables of the batch's frame must not refer to the error, since the error refers to
+    that frame. A separate function avoids this reference cycle.
     """
     failure = from_exception(error, at=("scenes", place))
     problem = failure.describe(request_id)
@@ -89,7 +89,7 @@ def _failed(error: Exception, place: int, request_id: str) -> tuple[str, bytes]:
 
 
 def _reference(scene: Any) -> str:
-    """Return the model that a scene names, before the validation of the scene."""
+    """The model of a scene that has not been validated yet."""
     found = scene.get("model", DEFAULT) if isinstance(scene, dict) else DEFAULT
     return found if isinstance(found, str) else DEFAULT
 
@@ -98,17 +98,17 @@ def _validated(scene: Any, place: int, kind: type[RequestT]) -> RequestT:
     try:
         return kind.model_validate(scene)
     except ValidationError as error:
-        # Only here: a ValidationError in an answer is a defect of the service.
+        # Only this validation error is the client's. A later one would be a defect of the service.
         raise unfit(error, scene, at=("scenes", place)) from None
 
 
 def _answering(question: Question[Any]) -> Callable[..., Awaitable[bytes]]:
-    """The function of a route."""
+    """Create the endpoint function of a question's batch route."""
 
     async def answer(asked: Any, http: Request) -> bytes:
         return await _answer_each(http, asked, question)
 
-    # The framework reads the schema of the body here.
+    # FastAPI reads the schema of the body from the annotations.
     form = BatchRequest[question.request]  # type: ignore[name-defined]
     answer.__annotations__ |= {"asked": form, "http": Request}
     return answer
@@ -122,6 +122,6 @@ for _question in QUESTIONS:
             methods=["POST"],
             name=f"{_question.name}_batch",
             summary=f"POST /{_question.name} for many scenes",
-            description=f"Answer `POST /{_question.name}` for up to {MAX_BATCH} scenes.",
+            description=f"Answer up to {MAX_BATCH} scenes, each like `POST /{_question.name}`.",
             response_model=BatchAnswer[_question.response],  # type: ignore[name-defined]
         )

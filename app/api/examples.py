@@ -1,7 +1,7 @@
 """Worked examples for the documentation: requests and an answer of each operation, by its id.
 
-The documentation page sends the requests as they stand, and so do the tests. The figures of the
-answers illustrate. The examples of a question stand in its module of `app.serving.questions`.
+The documentation page and the tests send the requests unchanged. Figures in the answers are only
+illustrative. The examples of a question are in its module in `app.serving.questions`.
 """
 
 from __future__ import annotations
@@ -66,16 +66,16 @@ REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
     **{f"{question.name}_batch": BATCH for question in QUESTIONS if question.has_batch},
     "move_alias": {
-        "promote": Example("to a version", {"model": "home@1.1.0"}),
+        "promote": Example("move the alias to a version", {"model": "home@1.1.0"}),
         "guarded": Example(
-            "only if it leads where it led when I looked",
+            "move the alias only if it still refers to the expected version",
             {"model": "home@1.1.0", "expected": "home@1.0.0"},
         ),
         "create": Example(
-            "a new one, which must not exist", {"model": "home@1.0.0", "expected": None}
+            "create an alias that does not exist yet", {"model": "home@1.0.0", "expected": None}
         ),
         "model-not-found": Example(
-            "to a model that is not there", {"model": "nobody@9.9.9"}, "model-not-found"
+            "a model that does not exist", {"model": "nobody@9.9.9"}, "model-not-found"
         ),
     },
 }

@@ -37,15 +37,15 @@ router = APIRouter(
     generate_unique_id_function=operation_id,
 )
 
-# The schemas in the routes only document the answers. Validating an answer would take as long as
-# writing its JSON, so the tests do it instead.
+# The service does not validate its answers: validation would take as long as writing the JSON. The
+# tests validate answers against the schemas of the routes.
 
 
 def begin(http: Request) -> serving.Request:
-    """Return the request as the serving layer uses it.
+    """Create the serving request of an HTTP request.
 
     Raises:
-        NotReadyError: the models are not loaded yet.
+        NotReadyError: the models have not been loaded yet.
     """
     state, runtime = http.scope["state"], http.scope["app"].state.runtime
     found: serving.Request = runtime.request(
@@ -55,12 +55,12 @@ def begin(http: Request) -> serving.Request:
 
 
 def _answering(question: Question[Any]) -> Callable[..., Awaitable[bytes]]:
-    """The function of a route."""
+    """Create the endpoint function of a question."""
 
     async def answer(asked: Any, http: Request) -> bytes:
         return written(await question.answer(begin(http), asked))
 
-    # The framework reads the schema of the body here.
+    # FastAPI reads the schema of the body from the annotations.
     answer.__annotations__ |= {"asked": question.request, "http": Request}
     return answer
 

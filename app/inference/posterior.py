@@ -1,50 +1,60 @@
-"""What a machine says of a scene: its context given the observations, and its unlisted classes.
+"""The posterior given a scene: log-odds of objects, relations and unlisted classes.
 
-For machines in the local form. Without given relations p(h1 | v) is factorial, with means
+The machine must have the local form. v are the object units, h1 the hidden units of the first
+layer, and x their logits given the objects. Without observed relations p(h1 | v) is factorial, with
+means m:
 
     m = sigmoid(x),   x = c1 + Q[t] + v'W + J m2
 
-A second layer is held at its mean field m2 given the objects. With given relations, h1 is held at
-its mean field y, see `RelationUnits.fixed_point`. Where given relations must count for less, their
-pull is scaled: y = x + ω (y - x) and ω slope_e take the place of y and slope_e, with an ω for
-questions about objects and another for those about relations (`Pull`). So in any case
+t is the room type. A second layer is fixed at its mean field m2 given the objects.
+
+Observed relations e change the logits of h1 from x to their mean field y, see
+`RelationUnits.fixed_point`. `Pull` can reduce this effect by a factor ω: x + ω (y - x) replaces y,
+and ω slope_e replaces slope_e. Questions about objects and questions about relations have different
+factors ω. Then
 
     object     log-odds_i = b_i + sum_k [softplus(y_k + W_ik) - softplus(y_k)]
     relation   p(r_e = 1) = E[sigmoid(ℓ_e(h1))], see `relations`
 
-The closed form takes the judged unit out of y first. For a given relation that is its own slope.
-For a present object it is W_i, the slopes of all its relations, and its part in the second layer.
-The other slopes stay.
+The judged unit is first subtracted from y. For an observed relation, this is its own slope. For a
+present object it is W_i, the slopes of all its relations, and its effect through the second layer.
+The slopes of other relations are not computed again.
 
-`Completions` are for classes that are there although a scene does not list them. A class that is
-present is listed with probability c, the coverage. So for the listed classes L
+`Completions` estimate the probability of classes that are present but unlisted. Each present class
+is listed with probability c, the coverage. So, for the listed classes L,
 
     p(v, h | L) ∝ p(v, h) (1 - c)^{|v \\ L|}   for v ⊇ L
 
-which is the machine itself with the biases of unlisted classes lowered by log(1 - c). Its
-posterior is estimated from the chain samples v_f that a machine keeps (`fantasies`):
+This is the same machine with log(1 - c) added to the biases of unlisted classes. Its posterior is
+estimated from the chain samples v_f that the machine stores (`fantasies`). σ is the logistic
+function.
 
- 1. Each has a context h_f ~ p(h1 | v_f), drawn once, and logits l = b + W h_f. For a scene it gets
-    the importance weight, σ the logistic function,
+ 1. Each sample has a context h_f ~ p(h1 | v_f), drawn once, and logits l = b + W h_f. Its
+    importance weight for a scene is
 
         log w_f = sum_{i in L} log σ(l_i) + sum_{i not in L} log(1 - c σ(l_i)) + room
 
-    Structure (walls …) is left out of both sums. `room` is 0 without a room type.
- 2. Systematic resampling with offsets (m + 1/2) / M picks M samples.
- 3. Each becomes a completion: an unlisted class j that is no structure is added if
-    l_j + log(1 - c) > logit u_mj, with fixed numbers u: M strata of [0, 1) for each class.
- 4. Given a completion the context is summed out in closed form, the class itself taken out of y:
+    Both sums exclude structure (walls …). `room` is 0 without a room type.
+ 2. Systematic resampling with offsets (m + 1/2) / M selects M samples.
+ 3. Each selected sample m becomes a completion of the scene. It adds each unlisted class j, except
+    structure, for which l_j + log(1 - c) > logit u_mj. The numbers u are fixed: one in each of M
+    equal strata of [0, 1) for each class.
+ 4. Given a completion, the context is summed out in closed form. Class i is first subtracted from
+    y:
 
         log-odds_mi = b_i + log(1 - c) + sum_k [softplus(y_k + W_ik) - softplus(y_k)]
 
     The answer is the log-odds of the mean of σ(log-odds_mi) over the completions.
 
-The random numbers are the same for every request, so the same scene has the same answer.
+All requests use the same random numbers, so the same scene always gets the same answer.
 
-Samples may have been drawn under room types, so they follow a mixture over these. Without a room
-type they stand for all rooms as training had them. With room type t, room = Q[t]·h_f minus the log
-of the mixture, sum_s n_s exp(Q[s]·h_f) / Z_s, with Z_s as in the multistate Bennett acceptance
-ratio.
+The chain samples may have different room types. Then they follow a mixture over these types, in
+which n_s samples have type s. For a scene of room type t,
+
+    room = Q[t]·h_f - log sum_s n_s exp(Q[s]·h_f) / Z_s
+
+with Z_s from the multistate Bennett acceptance ratio. A scene without a room type uses the mixture
+itself.
 
 Sources: self-normalised importance sampling with resampling and one Rao–Blackwellised Gibbs step;
 Shirts and Chodera, "Statistically optimal analysis of samples from multiple equilibrium states"
@@ -72,27 +82,27 @@ Mask = NDArray[np.bool_]
 
 COMPLETIONS = 16
 SEED = 20180521
-"""Of the contexts h_f and the numbers u."""
+"""Seed of the contexts h_f and the numbers u."""
 
-# Slopes up to which what a given relation says of itself is taken out to first order
+# Up to this slope, the effect of an observed relation on itself is subtracted to first order
 # (docs/decisions/inference.md).
 _GENTLE = 0.5
 _NO_SLOPES = np.zeros(0, dtype=np.float32)
 
-# Below it e^-l leaves float32.
+# For smaller logits l, e^-l would overflow float32.
 _LEAST_LOGIT = np.float32(-80.0)
-# Values of the coverage whose weights of an empty scene are kept, 4 N bytes each.
+# Number of coverage values whose weights of an empty scene are cached, 4 N bytes each.
 _KEPT = 32
-# Factors whose product stays within float32: none is below _LEAST.
+# Products of _FACTORS factors of at least _LEAST stay within the range of float32.
 _FACTORS, _LEAST = 4, np.float32(1e-7)
 _ROOM_SWEEPS = 100
 _SETTLED = 1e-7
-# Of log p of a sample beside the best room: products of two such stay within float64.
+# Smallest log p of a sample relative to its best room: products of two stay within float64.
 _LEAST_PULL = -300.0
 
 
 class Pull(NamedTuple):
-    """How strongly observed relations act on the context, from 0 to 1, by kind of question."""
+    """Factors ω of the effect of observed relations on h1, from 0 to 1, by kind of question."""
 
     objects: float = 1.0
     relations: float = 1.0
@@ -104,15 +114,15 @@ FULL = Pull()
 class ClosedForm:
     """Log-odds of objects and relations in closed form.
 
-    The same scene gives the same bits, independent of other questions.
+    The same scene always gives bit-identical log-odds. Other questions have no effect on them.
 
     Raises:
-        ValueError: a machine of another kind; see `fits`.
+        ValueError: the machine does not fit this closed form; see `fits`.
     """
 
     def __init__(self, weights: Weights) -> None:
         if not self.fits(weights):
-            raise ValueError("a closed form needs the local form and moderate weights in float32")
+            raise ValueError("the closed form requires the local form and bounded float32 weights")
         self._weights = weights
         self.W, self.b = weights["W"], weights["b"]
         self._c1, self._Q = weights["c1"], weights["Q"]
@@ -121,7 +131,7 @@ class ClosedForm:
 
     @staticmethod
     def fits(weights: Weights) -> bool:
-        """Whether the machine is one of those that this module is for."""
+        """Whether the machine has the local form and bounded float32 weights."""
         return (
             weights.spec.is_local
             and weights["W"].dtype == np.float32
@@ -140,8 +150,12 @@ class ClosedForm:
         """Logits of h1 given the objects, the room type and the given relations.
 
         Args:
-            room: index of the room type; None where it is not known.
-            pull: how strongly the given relations act.
+            classes: (n,) distinct classes of the scene.
+            presence: (n,) probability that each class is present.
+            log_counts: (n,) log of the number of instances of each class.
+            room: index of the room type; None if unknown.
+            given: observed relations; None without any.
+            pull: factors of the effect of the observed relations.
         """
         x: Floats = self._c1 + presence @ self.W[classes]
         if room is not None and len(self._Q):
@@ -165,7 +179,7 @@ class ClosedForm:
     def _second_layer(
         self, base: Floats, classes: Places, presence: Floats
     ) -> tuple[Floats, Floats]:
-        """x, and what each class adds to it through the second layer."""
+        """x, (H1,), and the effect of each class on x through the second layer, (n, H1)."""
         without = base - presence[:, None] * self.W[classes]
         bases = np.concatenate([base[None], without]).astype(np.float32)
         x, _ = self._weights.with_second_layer(bases)
@@ -173,7 +187,10 @@ class ClosedForm:
         return x[0].astype(np.float32), pulled[0] - pulled[1:]
 
     def relation_log_odds(self, context: Context, between: Between | None = None) -> Floats:
-        """Log-odds of all relations between the classes, each without itself, (A, n, n)."""
+        """Log-odds of all relations between the classes, (A, n, n).
+
+        Each relation is judged as if it were unobserved itself.
+        """
         between = self.units.between(context) if between is None else between
         found = self.units.log_odds(between)
         given, units = context.given, context.units
@@ -188,7 +205,12 @@ class ClosedForm:
         return found
 
     def unit_log_odds(self, context: Context, a: Places, i: Places, j: Places) -> Floats:
-        """The same of some units (E,), relations a from places i to places j."""
+        """Log-odds of E relations, each judged as if it were unobserved itself, (E,).
+
+        Args:
+            a: (E,) canonical relations.
+            i, j: (E,) indices of subject and object class in the scene.
+        """
         given, shift, _ = self.units.said(context)
         slopes = given[a, i, j] if len(given) else np.zeros(len(a), dtype=np.float32)
         return self.units.without_itself(context, a, i, j, slopes, shift)
@@ -196,32 +218,37 @@ class ClosedForm:
     def placed_log_odds(
         self, context: Context, candidates: Places, relation: int, anchor: int, outgoing: bool
     ) -> Floats:
-        """The same of many absent candidates (N,), were they there, to one class.
+        """Log-odds of one relation of N absent classes to an anchor, if they were present, (N,).
 
         Args:
-            anchor: place of the class.
-            outgoing: from the candidate to the anchor; otherwise back.
+            candidates: (N,) absent classes.
+            relation: canonical relation.
+            anchor: index of the anchor's class in the scene.
+            outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
         """
         both = self.units.placement_log_odds(context, candidates, np.array([anchor]), relation)
         return both[0 if outgoing else 1][:, 0, 0]
 
     def shares(self, context: Context) -> Floats:
-        """What each class and its relations add to y, (n, H1)."""
+        """The sum that each class and its relations add to y, (n, H1)."""
         share = self.units.shares(context)
         return share if context.through is None else share + context.through
 
     def gains_given_rest(self, context: Context, shares: Floats) -> Floats:
-        """What the rest of a scene does for the log-odds of each of its classes, (n,)."""
+        """The change of each class's log-odds b_i by the rest of the scene, (n,)."""
         found: Floats = objects.gains_without(
             context.object_y, shares, self.W[context.classes], self._group
         )
         return found
 
     def reasons(self, context: Context, shares: Floats, gains: Floats, rows: Places) -> Floats:
-        """How the gain of the classes in `rows` (N,) changes by each other class, (N, n).
+        """The change of the gains of the classes in `rows` by each other class, (N, n).
 
         Args:
-            gains: (n,) given the rest.
+            context: the context of the scene.
+            shares: (n, H1) result of `shares`.
+            gains: (n,) result of `gains_given_rest`.
+            rows: (N,) indices of the explained classes in the scene.
         """
         without: Floats = objects.gains_without_others(
             *(context.object_y, shares, self.W[context.classes], rows),
@@ -232,7 +259,13 @@ class ClosedForm:
         return change
 
     def reasons_for_absent(self, context: Context, shares: Floats, candidates: Places) -> Floats:
-        """The same of absent classes (N,): what each present one does for them, (N, n)."""
+        """The change of absent classes' log-odds by each class of the scene, (N, n).
+
+        Args:
+            context: the context of the scene.
+            shares: (n, H1) result of `shares`.
+            candidates: (N,) absent classes.
+        """
         found: Floats = objects.reasons_for_absent(
             context.object_y, shares, self.W[candidates], self._group
         )
@@ -240,7 +273,7 @@ class ClosedForm:
 
 
 def _scaled(pull: float, x: Floats, y: Floats, slopes: Floats) -> tuple[Floats, Floats]:
-    """x + pull (y - x) and pull slopes; to the bit x at 0, and y and slopes at 1."""
+    """x + pull (y - x), and pull slopes. A pull of 1 returns y and slopes unchanged."""
     if pull >= 1:
         return y, slopes
     weight = np.float32(pull)
@@ -248,15 +281,16 @@ def _scaled(pull: float, x: Floats, y: Floats, slopes: Floats) -> tuple[Floats, 
 
 
 class Completions:
-    """Posterior of unlisted classes, for a machine whose weights do not change.
+    """Posterior of unlisted classes, for a machine with fixed weights.
 
     Args:
-        structure: (V,) classes that are never added, and tell nothing where they are unlisted.
-        scorer: of the same machine.
-        count: M, completions of a scene.
+        weights: weights and stored samples of the machine.
+        structure: (V,) which classes are structure; completions ignore these classes.
+        scorer: scorer of the same machine.
+        count: M, number of completions of a scene.
 
     Raises:
-        ValueError: a machine without stored samples; see `fits`.
+        ValueError: the machine has no stored samples, or its weights are too large; see `fits`.
     """
 
     def __init__(
@@ -267,22 +301,22 @@ class Completions:
         count: int = COMPLETIONS,
     ) -> None:
         if not self.fits(weights):
-            raise ValueError("completions need stored samples and moderate weights in float32")
+            raise ValueError("completions require stored samples and bounded float32 weights")
         self._scorer, self._structure = scorer, structure
         self._W, self._b = weights["W"], weights["b"]
         generator = np.random.Generator(np.random.Philox(SEED))
         contexts = _contexts(weights, generator)
         logits = self._b + contexts @ self._W.T
-        # Of classes (V,) and samples (N,) or completions (M,): a class lies in one piece.
+        # Shapes (V, N) for samples and (V, M) for completions: each class is contiguous in memory.
         self._odds_against = np.exp(-np.maximum(logits, _LEAST_LOGIT)).T.copy()
         self._noise = np.exp(-_stratified_logits(count, len(self._b), generator)).T.copy()
         self._rooms = _room_weights(weights, contexts)
-        # Of the instance: a cache of the method would keep every instance alive.
+        # Each instance has its own cache: a cache of the method would keep every instance alive.
         self._empty = lru_cache(maxsize=_KEPT)(self._unlisted_evidence)
 
     @staticmethod
     def fits(weights: Weights) -> bool:
-        """Whether the machine keeps samples, and products of its factors are safe."""
+        """Whether the machine stores samples, and its weights are small enough for float32."""
         return weights.spec.N > 0 and group_size(weights["W"]) > 0
 
     def log_odds(
@@ -293,13 +327,16 @@ class Completions:
         coverage: float,
         room: int | None = None,
     ) -> Floats:
-        """Log-odds of every class being there unlisted, (V,); of listed ones, without meaning.
+        """Log-odds that each class is present but unlisted, (V,).
+
+        Entries of listed classes have no meaning.
 
         Args:
-            y: (H1,) logits of h1 given all that is known, unlisted classes absent.
-            classes, presence: (n,) the listed classes.
+            y: (H1,) logits of h1 given the evidence, with unlisted classes absent.
+            classes: (n,) the listed classes.
+            presence: (n,) probability that each listed class is present.
             coverage: c, below 1.
-            room: index of the room type; None where it is not known.
+            room: index of the room type; None if unknown.
         """
         base = self._empty(coverage)
         if room is not None and len(self._rooms):
@@ -319,7 +356,7 @@ class Completions:
         return found
 
     def _unlisted_evidence(self, coverage: float) -> Floats:
-        """sum_i log(1 - c σ(l_i)) over all classes but structure, (N,)."""
+        """Sum of log(1 - c σ(l_i)) over all classes i except structure, for each sample, (N,)."""
         chance = 1 / (1 + self._odds_against[~self._structure])
         total = np.zeros(chance.shape[1], np.float32)
         for start in range(0, len(chance), _FACTORS):
@@ -329,7 +366,7 @@ class Completions:
 
 
 def _contexts(weights: Weights, generator: np.random.Generator) -> Floats:
-    """h_f ~ p(h1 | v_f), (N, H1); with a second layer, h2 at its mean field."""
+    """Draw h_f ~ p(h1 | v_f), (N, H1), with a second layer fixed at its mean field."""
     base = weights["c1"] + weights.scenes @ weights["W"]
     if weights.spec.C:
         rooms = weights["fantasy_rooms"]
@@ -340,7 +377,7 @@ def _contexts(weights: Weights, generator: np.random.Generator) -> Floats:
 
 
 def _stratified_logits(count: int, classes: int, generator: np.random.Generator) -> Floats:
-    """Logits of uniform numbers (M, V): each class has one number in each of M equal strata."""
+    """Logits of uniform numbers, (M, V), one in each of M equal strata for each class."""
     strata = generator.random((count, classes)).argsort(0)
     uniform = (strata + generator.random((count, classes))) / count
     uniform = uniform.clip(1e-12, 1 - 1e-12)
@@ -348,7 +385,7 @@ def _stratified_logits(count: int, classes: int, generator: np.random.Generator)
 
 
 def _room_weights(weights: Weights, contexts: Floats) -> Floats:
-    """What a room type adds to log w of each sample, (C, N)."""
+    """The term `room` of log w for each room type and sample, (C, N)."""
     spec = weights.spec
     if not spec.C:
         return np.zeros((0, 0), dtype=np.float32)
@@ -357,8 +394,8 @@ def _room_weights(weights: Weights, contexts: Floats) -> Floats:
     pull = np.concatenate([pull, np.zeros((len(pull), 1))], 1)
     rooms = weights["fantasy_rooms"]
     drawn, sizes = np.unique(np.where(rooms < 0, spec.C, rooms), return_counts=True)
-    # Both sums of the iteration as products: p(n | room) up to a factor of each sample. None is 0,
-    # so that no sum is.
+    # p(sample | room) up to a factor per sample, so that both sums of the iteration are matrix
+    # products. The lower bound keeps every entry, and so every sum, above 0.
     top = pull[:, drawn].max(1)
     share = np.exp(np.maximum(pull[:, drawn] - top[:, None], _LEAST_PULL))
     log_z = np.zeros(len(drawn))

@@ -5,8 +5,9 @@
     outliers    What does not belong here, or stands in the wrong place?
     generate    What would a scene like this look like?
 
-All but the last are expectations, in closed form or estimated with fixed random numbers: the same
-scene gets the same answer. Objects are named by their position in the scene.
+The first three questions compute expectations, in closed form or with fixed random numbers. So the
+same scene always gets the same answer. `generate` draws random scenes. Answers refer to an object
+by its position in the scene's list.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From a machine's log-odds to the probabilities that the answers promise."""
+"""Calibration: convert a machine's log-odds into the probabilities of the answers."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Floats = NDArray[np.floating[Any]]
 
 @compiled
 def bend(entry: Floats, logits: Floats) -> None:
-    """Bend log-odds (n,) in place by the line of a calibration, see `PairSlope`.
+    """Apply the bends of a calibration to log-odds (n,) in place, see `PairSlope`.
 
     Args:
-        entry: (4 + 2K,) a row of those of `RelationSlopes`.
+        entry: (4 + 2K,), one row of a table in `RelationSlopes`.
     """
     for j in range(len(logits) if len(entry) > 4 else 0):
         x = y = logits[j]
@@ -36,10 +36,10 @@ def relation_probability(
     """Probability that a relation holds between one pair of instances, (B, A, N).
 
     Args:
-        slopes: (A, 4 + 2K), one of those of `RelationSlopes`.
-        log_odds: (B, A, N) of the class-level units.
-        log_count: (N,), log of the instance pairs of both classes.
-        classes: how many distinct ones the scene has.
+        slopes: (A, 4 + 2K), one table of `RelationSlopes`.
+        log_odds: (B, A, N), log-odds of the class-level units.
+        log_count: (N,), log of the number of instance pairs of both classes.
+        classes: number of distinct classes in the scene.
     """
     p = np.empty_like(log_odds)
     size = np.log(classes)
@@ -51,7 +51,7 @@ def relation_probability(
             for j in range(len(row)):
                 found[j] = intercept + slope * row[j] + weight * log_count[j]
             bend(slopes[a], found)
-    # Of all at once, since a row may be short.
+    # One loop over all rows, since a single row may be short.
     logits = p.reshape(-1)
     for e in range(len(logits)):
         logits[e] = logistic(np.float32(logits[e]))
@@ -60,19 +60,19 @@ def relation_probability(
 
 @inlined
 def exclusive(forward: Floats, backward: Floats) -> tuple[Floats, Floats]:
-    """Scale p(a(x,y)) and p(a(y,x)), which exclude each other, down to a sum of at most 1."""
+    """Scale p(a(x,y)) and p(a(y,x)) so that their sum is at most 1: both cannot hold at once."""
     total = np.maximum(forward + backward, np.float32(1.0))
     return forward / total, backward / total
 
 
 def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int) -> Floats:
-    """log p(relation | both are there), calibrated as placements are, from that of the machine.
+    """Calibrate the machine's log p(relation | candidate and anchor are present).
 
     Args:
-        entry: (4 + 2K,), the relation's row of `RelationSlopes.placement`.
-        log_p: of the class-level unit.
-        log_count: of the anchor's instances.
-        classes: how many distinct ones there are with the candidate.
+        entry: (4 + 2K,), the relation's row of a table in `RelationSlopes`.
+        log_p: log probability of the class-level unit.
+        log_count: log of the number of instances of the anchor's class.
+        classes: number of distinct classes in the scene, the candidate included.
     """
     intercept, gain, weight, size = entry[:4]
     odds = log_p - np.log(-np.expm1(np.minimum(log_p, -1e-7)))
@@ -83,10 +83,12 @@ def placement_log_p(entry: Floats, log_p: Floats, log_count: float, classes: int
 
 
 def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, listed: int) -> Floats:
-    """Logits of p(there unlisted) · p(stands so | there).
+    """Logits of p(present but unlisted) · p(relation holds | present), one per candidate.
 
     Args:
+        log_odds: log-odds of presence, not yet calibrated.
         log_p: log of the second factor, calibrated.
+        listed: number of listed classes.
     """
     both = log_p - np.logaddexp(0.0, -calibration.missing.log_odds(log_odds, listed))
     found: Floats = both - np.log(-np.expm1(np.minimum(both, -1e-7)))
@@ -94,12 +96,12 @@ def placed_logits(calibration: Calibration, log_odds: Floats, log_p: Floats, lis
 
 
 def intruder_line(calibration: Calibration, classes: int) -> tuple[float, float]:
-    """Intercept and slope of the log-odds of being an intruder among so many distinct classes."""
+    """Intercept and slope of an intruder's log-odds in a scene of `classes` distinct classes."""
     entry = calibration.outlier
     return entry.intercept + entry.log_count * math.log(classes), entry.slope
 
 
 def false_log_odds(calibration: Calibration, log_odds: Floats) -> Floats:
-    """Log-odds of a stated relation being false."""
+    """Convert the log-odds of stated relations to the log-odds that each is false."""
     entry = calibration.misplaced
     return entry.intercept + entry.slope * log_odds

@@ -1,4 +1,4 @@
-"""The classes that each hidden unit favours."""
+"""Describe hidden units by the objects, relations and room types with the largest weights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from app.scene.relations import CANONICAL
 OBJECTS = 8
 RELATIONS = 3
 ROOM_TYPES = 3
-"""How many of each a unit is described by, at most."""
+"""A unit's description holds at most this many objects, relations and room types."""
 
 _NAMED = 3
 Floats = NDArray[np.float32]
@@ -24,15 +24,15 @@ Named = TypeVar("Named")
 
 @dataclass(frozen=True, slots=True)
 class ContextUnit:
-    """A hidden unit by the classes that it favours.
+    """Description of a hidden unit by the classes that it favours.
 
     Attributes:
         unit: its number in the layer.
-        name: for people to read.
-        objects: (label, weight) of the objects it favours most.
-        relations: ((subject, relation, object), weight) of the relations it favours most, beyond
-            the mean over the layer.
-        room_types: (room type, weight) of the room types that favour it most.
+        name: readable name.
+        objects: (label, weight) of the objects with the largest weights.
+        relations: ((subject, relation, object), weight) of the relations with the largest weights.
+            The mean weight over the layer is subtracted.
+        room_types: (room type, weight) of the room types with the largest weights.
     """
 
     unit: int
@@ -43,14 +43,17 @@ class ContextUnit:
 
 
 def contexts(artifact: Artifact) -> dict[str, tuple[ContextUnit, ...]]:
-    """Layer name to its units, each by what it favours: its largest positive weights.
+    """Describe the hidden units of each layer by their largest positive weights.
 
-    For h1 these are the columns of W, and of U for the relations seen in training; for h2, which
-    meets objects and relations only through h1, those of W J and U J. Where the machine knows room
-    types, the same is done with Q and Q J. Structure is left out.
+    The weights of layer h1 are the columns of W (objects), U (relations seen in training) and Q
+    (room types). Layer h2 is connected to them only through h1, so its weights are the columns of
+    W J, U J and Q J. Q is empty for a machine without room types. Structure is left out.
 
-    A relation's weight counts by how far it is above that relation's mean over the layer: what
-    every unit favours (a faucet on a sink) says nothing of any of them.
+    The mean weight of each relation over the layer is subtracted. So a relation that every unit
+    favours (a faucet on a sink) describes no unit.
+
+    Returns:
+        Layer name to its units, in the order of the layer.
     """
     weights, vocabulary = artifact.weights, artifact.vocabulary
     named = ~vocabulary.structure
@@ -89,7 +92,7 @@ def _name(
     objects: Sequence[tuple[str, float]],
     relations: Sequence[tuple[tuple[str, str, str], float]],
 ) -> str:
-    """For people to read: the first objects and the first relation."""
+    """Readable name: the first three objects and the first relation."""
     parts = [", ".join(label for label, _ in objects[:_NAMED])]
     parts += [" ".join(triple) for triple, _ in relations[:1]]
     return "; ".join(filter(None, parts)) or f"unit {unit}"
@@ -98,7 +101,7 @@ def _name(
 def _strongest(
     weights: Floats, names: Sequence[Named], count: int
 ) -> list[tuple[tuple[Named, float], ...]]:
-    """For each column of (names, units) the names of its largest positive weights."""
+    """The names with the largest positive weights, for each column of weights (names, units)."""
     if not len(weights):
         return [()] * weights.shape[1]
     count = min(count, len(weights))

@@ -1,13 +1,14 @@
-"""What would a scene like this look like?
+"""The question `generate`: draw scenes that contain the given objects and relations.
 
-A chain now and then ends between two kinds of rooms: almost empty, or with a thing that belongs to
-neither. A drawn scene is drawn again where
+A Gibbs chain sometimes ends between two kinds of rooms. Such a scene is almost empty, or holds an
+object that belongs to neither room. A scene is drawn again in three cases:
 
-- it has fewer classes than nine in ten real rooms of its type (`Calibration.smallest`),
-- it suits its room type less than 85 % of the real rooms of that type (`Calibration.room_fit`), or
-- one of its classes raises an alarm of `/outliers` at the default sensitivity.
+- It has fewer classes than nine in ten real rooms of its type (`Calibration.smallest`).
+- 85 % of the real rooms of its type suit this type better (`Calibration.room_fit`).
+- `/outliers` reports one of its classes as an intruder at the default sensitivity. Classes that the
+  request lists do not count.
 
-What a request gives is never a reason. The last of `ATTEMPTS` draws is always taken.
+The last of `ATTEMPTS` draws is always accepted.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from app.scene.scene import Scene, SceneObject
 Triple = tuple[int, int, int]
 
 STEPS: Final = 50
-"""Gibbs sweeps of a chain unless a request says otherwise."""
+"""Default number of Gibbs sweeps of a chain."""
 
 ATTEMPTS: Final = 8
-"""Draws of a scene at most."""
+"""Maximum number of draws for one scene."""
 
-# The direction of each relation: left, front or, for all others, up. A thing on another is higher,
-# as one above it.
+# Direction of each canonical relation: 1 is left, 2 is front, 0 is up. On-top and above both mean
+# that the subject is higher than the object.
 _DIRECTION: Final = np.array([{LEFT: 1, FRONT: 2}.get(a, 0) for a in range(len(CANONICAL))])
 
 
@@ -48,8 +49,8 @@ class GeneratedScene:
 
     Attributes:
         objects: canonical labels of its classes, in the order of the vocabulary.
-        relations: canonical (subject, relation, object) over labels.
-        log_score: see `ConditionedChains.log_score`; comparable between scenes of one model.
+        relations: (subject label, canonical relation, object label).
+        log_score: see `ConditionedChains.log_score`. Scores of one model can be compared.
         context: layer name to its active units.
     """
 
@@ -70,29 +71,26 @@ def generate(
     context: Mapping[str, Sequence[int]] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[GeneratedScene, ...]:
-    """Draw scenes that contain the evidence, by Gibbs chains that start at fantasies.
+    """Draw scenes that contain the evidence, by Gibbs chains that start at stored chain samples.
 
-    Objects of the scene are in every drawn one, whatever their confidence, and so are its
-    relations; what it shows not to hold stays off; all else is drawn. Structure that is no
-    evidence is drawn with the rest and left out of the answer.
+    Every drawn scene contains the objects of the evidence, whatever their confidence, and its
+    relations. Relations that the evidence rules out stay off. The chain draws all other objects and
+    relations. Structure (floor, wall) outside the evidence is left out of the answer.
 
-    Every chain has a random stream of its own. So scene k depends on the seed and on k, not on how
-    many others a request asked for.
+    Every chain has its own random stream. So scene k depends only on the seed and on k, whatever
+    the `count`.
 
-    Structure stands in no relation but those of the evidence.
-
-    The drawn relations can hold all at once (`staying`): two classes have one at most, a class is
-    on top of one other at most, and no circle of left, front or above closes. Evidence stays in any
-    case. A class stands in a relation to itself only where the evidence says so, since a drawn
-    scene holds every class once.
+    `staying` removes drawn relations that cannot hold together. Relations of the evidence always
+    stay. A drawn scene holds every class once, so no class is drawn in a relation to itself.
+    Structure has only the relations of the evidence.
 
     Args:
-        count: how many scenes.
-        seed: of the random numbers; the same seed draws the same scenes.
+        count: number of scenes.
+        seed: seed of the random numbers; the same seed draws the same scenes.
         steps: Gibbs sweeps of a chain, `STEPS` by default.
-        temperature: of the chains; above 1 for more varied scenes.
-        context: layer name ("h1", "h2") to the units that are held on.
-        stop: asked between scenes; once it says so, those drawn so far are all.
+        temperature: temperature of the chains; above 1, scenes are more varied.
+        context: layer name ("h1", "h2") to the hidden units that are held on.
+        stop: called between scenes; after it returns True, the scenes drawn so far are returned.
 
     Raises:
         ValueError: a number out of range, or a layer or unit that the machine does not have.
@@ -128,7 +126,7 @@ def generate(
 def _conditions(
     artifact: Artifact, scene: Scene, context: Mapping[str, Sequence[int]]
 ) -> Conditions:
-    """What stays as it is, with the hidden units of each layer that are held on.
+    """The fixed part of each chain: classes, relations, room type, and hidden units held on.
 
     Raises:
         ValueError: a layer or a unit that the machine does not have.
@@ -188,22 +186,23 @@ def staying(
     given: Collection[Triple],
     structure: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Which of the drawn relations stay, (m,).
+    """Select the drawn relations that can hold together, as a mask (m,).
 
-    Those that are given do. The others are taken from the likeliest on. One stays if
+    Relations of the evidence always stay. The others are tried in order of their probability,
+    likeliest first. A tried relation stays if all of these conditions are met:
 
-    - its two classes have no relation yet (`app.scene.geometry` finds at most one),
-    - it closes no circle, such as A left of B, B left of C, C left of A,
-    - its first class has no other support yet, where it is *on-top*.
-
-    A class stands in no relation to itself. Structure stands in none: training drops its relations,
-    so those that are drawn have no meaning.
+    - Its two classes have no relation yet (`app.scene.geometry` finds at most one).
+    - It does not close a cycle, such as A left of B, B left of C, C left of A.
+    - If it is *on-top*, its subject does not stand on another class yet.
+    - Its subject and object are different classes.
+    - Neither class is structure. Training drops relations of structure, so a drawn one has no
+      meaning.
 
     Args:
-        units: (m, 3) distinct (a, i, j) over classes.
-        logits: (m,) of each; where two are equal, the smaller (a, i, j) comes first.
-        given: (a, i, j) over classes.
-        structure: (V,) which classes are.
+        units: (m, 3) distinct (a, i, j): relation, subject class, object class.
+        logits: (m,), one for each unit; of equal logits, the smaller (a, i, j) comes first.
+        given: (a, i, j) of the evidence.
+        structure: (V,) which classes are structure.
     """
     fixed = np.array(sorted(given), dtype=np.int64).reshape(-1, 3)
     order = np.lexsort((*units.T[::-1], -logits))
@@ -228,16 +227,16 @@ def _holding(
     given: int,
     count: int,
 ) -> NDArray[np.bool_]:
-    """Which of m relations hold beside those that are given, (m,).
+    """Select the relations that can hold together with the given ones, as a mask (m,).
 
     Args:
-        relation: (given + m,), those that are given first.
-        places: (given + m, 2) of the two classes.
-        order: of those to try, 0 to m - 1, likeliest first.
-        given: how many are given.
-        count: n, how many classes there are.
+        relation: (given + m,), the given relations first.
+        places: (given + m, 2), indices of subject and object among the n classes.
+        order: the relations to try, numbers from 0 to m - 1, likeliest first.
+        given: number of given relations.
+        count: n, number of classes.
     """
-    # beyond[d, x, y]: y lies beyond x in direction d.
+    # beyond[d, x, y]: y is beyond x in direction d, directly or through a chain of relations.
     beyond = np.zeros((3, count, count), np.bool_)
     related, supported = np.zeros((count, count), np.bool_), np.zeros(count, np.bool_)
     stay = np.zeros(len(relation) - given, np.bool_)
@@ -259,7 +258,7 @@ def _holding(
 
 
 class Plausible:
-    """The test of drawn scenes for one request.
+    """Test whether a drawn scene is plausible, for one request (see the module).
 
     Args:
         artifact: the model that draws.
@@ -270,13 +269,13 @@ class Plausible:
         self._artifact, self._room = artifact, scene.room_type
         self._given = {thing.class_index for thing in scene.objects}
         smallest = artifact.calibration.smallest
-        # The last entry is for any room.
+        # The last entry is for scenes without a room type.
         self._least = 0
         if smallest:
             self._least = smallest[-1 if scene.room_type is None else scene.room_type]
 
     def __call__(self, classes: list[int]) -> bool:
-        """Whether a drawn scene of these classes is one."""
+        """Whether a drawn scene of these classes is plausible."""
         if len(classes) < self._least or not self._suits_room(classes):
             return False
         if not classes:
@@ -284,7 +283,7 @@ class Plausible:
         labels = self._artifact.vocabulary.labels
         objects = [SceneObject(labels[index], labels[index], index) for index in classes]
         judged = Scene(tuple(objects), room_type=self._room)
-        # A drawn scene is whole, however few its classes are.
+        # A drawn scene is complete, so the thresholds for short lists do not apply.
         whole = self._artifact.calibration.outlier_thresholds.medium
         given = posterior(self._artifact, judged)
         is_intruder = intruder_probability(self._artifact, given) >= whole
@@ -300,11 +299,11 @@ class Plausible:
 
 
 def room_fit(weights: Weights, v: NDArray[np.float32], room: int) -> NDArray[np.float64]:
-    """log p(v | room type) / p(v), up to a constant of the room type, (B,), for presence (B, V).
+    """log p(v | t) / p(v) for presence v (B, V) and room type t, up to a constant of t, (B,).
 
     sum_k [softplus(x_k + Q_tk) - softplus(x_k)],   x = c1 + v'W
 
-    A second layer is left out.
+    The sum goes over the hidden units k of the first layer. A second layer is left out.
     """
     x = weights["c1"] + v @ weights["W"]
     change = softplus(x + weights["Q"][room]) - softplus(x)

@@ -1,4 +1,4 @@
-"""What else should be here, and where?"""
+"""The question `missing`: which unlisted objects are probably present, and where?"""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from app.scene.relations import CANONICAL, FRONT, LEFT, ON_TOP, RELATIONS, canon
 from app.scene.scene import Scene
 
 VIEWER = viewer_axes()
-"""Axes of a viewer at the origin who looks along x."""
+"""Axes of a viewer at the origin, with the viewing direction along x."""
 
 _BLOCK: Final = 32
 
 PLACES: Final = 3
-"""How many placements an answer lists."""
+"""Number of placements in an answer."""
 
 _SEEN_FROM_ANCHORS: Final = tuple(map(opposite, RELATIONS))
 _UNTURNED: Final = np.eye(3)
@@ -42,11 +42,11 @@ _PER_METRE: Final = 1000.0  # answers are rounded to millimetres
 
 
 class Offset(NamedTuple):
-    """From the centre of an anchor to that of a missing thing, in metres.
+    """Vector from the centre of an anchor to the centre of a missing object, in metres.
 
     Attributes:
-        mean, std: along x, y and z.
-        scenes: training scenes that showed the two classes so.
+        mean, std: mean and standard deviation along x, y and z.
+        scenes: number of training scenes with the two classes in this relation.
     """
 
     mean: tuple[float, float, float]
@@ -55,7 +55,7 @@ class Offset(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """A missing thing would stand in `relation` to `object`, at `offset` from it where known."""
+    """A place of a missing object: its `relation` to `object`, and its `offset` where known."""
 
     relation: str
     object: int
@@ -67,11 +67,11 @@ class MissingAnswer(NamedTuple):
     """An absent class.
 
     Attributes:
-        label: canonical.
-        probability: that it is the one that was taken away, given that exactly one was (with a
-            place: given that it stood there).
-        log_odds: of its presence against its absence.
-        placements: where it would stand, likeliest first.
+        label: canonical label.
+        probability: probability that the class is present although the scene does not list it. If
+            the request names a place, the class must also stand there.
+        log_odds: log-odds of its presence.
+        placements: its likeliest places, likeliest first.
         because: the objects that change its log-odds most, strongest first.
     """
 
@@ -93,26 +93,26 @@ def missing(
     axes: Axes | None = VIEWER,
     details: bool = True,
 ) -> tuple[MissingAnswer, ...]:
-    """Unlisted classes by the probability that they are there all the same, likeliest first.
+    """Rank the unlisted classes by the probability that they are present, likeliest first.
 
-    A class that is there is listed with probability `coverage`. The lower the coverage, the less an
-    unlisted class counts as absent. Each probability is of its own: they do not sum to one. Listed
-    classes and structure are never proposed.
+    The model assumes that a present class is listed with probability `coverage`. If the coverage is
+    low, an unlisted class may well be present. Each class is judged separately, so the
+    probabilities do not sum to 1. Listed classes and structure are never proposed.
 
     Args:
-        top_k: at most so many.
-        candidates: class indices to choose from; present classes and structure among them are
-            passed over.
-        at: (relation, position of an object): the probability is that a class is there, unlisted,
-            *and* stands so to that object.
-        coverage: from 0 to 1; by default the model's. At 1 unlisted classes count as absent.
-        axes: the viewer's, in the frame that offsets are answered in (`viewer_axes`); None where
-            the viewing direction is unknown.
-        details: also say where each would stand, and what speaks for it.
+        top_k: maximum number of answers.
+        candidates: class indices to choose from; listed classes and structure are ignored.
+        at: a place (relation, position of an object). If set, `probability` is the probability that
+            the class is present *and* stands in this relation to the object.
+        coverage: probability that a present class is listed; by default the model's value. At 1,
+            unlisted classes count as absent.
+        axes: the viewer's axes, in the frame of the offsets (`viewer_axes`). None if the viewing
+            direction is unknown.
+        details: whether to add `placements` and `because`.
 
     Raises:
         ValueError: top_k below 1, a coverage outside [0, 1], a candidate outside the vocabulary, an
-            unknown relation, or an anchor that is no object of the scene.
+            unknown relation, or an anchor outside the scene.
     """
     spec, calibration = artifact.spec, artifact.calibration
     if top_k < 1:
@@ -137,7 +137,7 @@ def missing(
         logits = calibration.missing.log_odds(log_odds, listed)
     else:
         logits = _at_place(artifact, given, place, absent, chosen, log_odds, listed, top_k)
-    # By logit: probabilities near 0 or 1 may all round to one number.
+    # Ranked by logit: probabilities near 0 or 1 may round to the same number.
     where = best(logits, chosen, top_k)
     probabilities = sigmoid(logits[where].astype(np.float64))
     found = absent[where]
@@ -169,11 +169,11 @@ def _at_place(
     listed: int,
     top_k: int,
 ) -> NDArray[np.floating[Any]]:
-    """Logits of p(there) · p(stands so | there), (N,), for at least the best `top_k` candidates.
+    """Logits of p(present) · p(relation holds | present), (N,).
 
-    Candidates are asked in blocks, the likeliest to be there first. A product is never above its
-    first factor: once the next candidate is less likely to be there than `top_k` others are at the
-    place, no later one can be among the best. What was not asked is -inf.
+    Candidates are scored in blocks, in descending order of p(present), which bounds the product.
+    Scoring stops when the next candidate's p(present) is below the `top_k` best products. The
+    logit of a candidate that was not scored is -inf.
     """
     relation, anchor, outgoing = place
     row = int(given.present.row[anchor])
@@ -192,7 +192,7 @@ def _at_place(
 
 
 def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, ...]]:
-    """The present classes that change the log-odds of each found class most."""
+    """The listed classes that change the log-odds of each found class most."""
     if not len(given.present.classes):
         return [()] * len(found)
     explained = found[:EXPLAINED]
@@ -201,10 +201,10 @@ def _reasons(given: Posterior, found: NDArray[np.int64]) -> list[tuple[Because, 
 
 
 def _place(scene: Scene, relations: int, at: tuple[str, int]) -> tuple[int, int, bool]:
-    """(canonical relation, object, whether the missing thing is the relation's subject)."""
+    """(canonical relation, object, whether the missing object is the relation's subject)."""
     name, anchor = at
     if not 0 <= anchor < len(scene.objects):
-        raise ValueError(f"anchor {anchor} is none of the {len(scene.objects)} objects")
+        raise ValueError(f"anchor {anchor} is outside the {len(scene.objects)} objects")
     relation, subject, _ = canonicalise("missing", name, "anchor")
     if relation >= relations:
         raise ValueError(f"the model has no relation {name!r}, only {CANONICAL[:relations]}")
@@ -214,7 +214,7 @@ def _place(scene: Scene, relations: int, at: tuple[str, int]) -> tuple[int, int,
 def _chosen(
     absent: NDArray[np.int64], classes: int, candidates: Sequence[int]
 ) -> NDArray[np.bool_]:
-    """(N,) bool over the absent classes."""
+    """Which of the N absent classes are candidates, (N,)."""
     for index in candidates:
         if not 0 <= index < classes:
             raise ValueError(f"candidate {index} must be a class index below V = {classes}")
@@ -230,12 +230,13 @@ def place_log_p(
     *,
     outgoing: bool,
 ) -> NDArray[np.floating[Any]]:
-    """Calibrated log p(the candidate stands so to the anchor | it is there), (N,).
+    """Calibrated log p(relation between candidate and anchor | candidate is present), (N,).
 
     Args:
         candidates: (N,) absent classes.
-        relation: canonical; from the candidate to the anchor if `outgoing`, else back.
-        anchor: place in the classes that are present.
+        relation: canonical relation.
+        anchor: index of the anchor's class among the listed classes.
+        outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
     """
     return placement_log_p(
         artifact.relation_slopes.asked_place[relation],
@@ -252,16 +253,17 @@ def placements(
     at: tuple[int, int, bool] | None = None,
     stated: Collection[tuple[int, int, int]] = (),
 ) -> list[tuple[Placement, ...]]:
-    """The likeliest relations of each candidate to the present objects, best first.
+    """The likeliest relations of each candidate to the listed objects, likeliest first.
 
-    All relations in both directions, to all but structure; instances of a class are spoken of by
-    the first. No placement puts a candidate under an object that stands on another.
+    All relations count, in both directions. Structure is never an anchor. If a class has several
+    instances, its first instance is the anchor. If an object stands on another one, candidates are
+    never placed under it.
 
     Args:
         candidates: (N,) absent classes.
-        axes: what offsets are answered in, see `offsets_of`.
-        at: canonical relation, object, and whether the missing thing is its subject: the place that
-            was asked about comes first, named by that object. Structure is never an anchor.
+        axes: see `offsets_of`.
+        at: the place in the request, which is listed first: canonical relation, object, and whether
+            the missing object is the relation's subject.
         stated: canonical relations between the objects of the scene.
     """
     present = given.present
@@ -314,14 +316,14 @@ def offsets_of(
     outgoing: NDArray[np.bool_],
     axes: Axes | None,
 ) -> Sequence[Offset | None]:
-    """From n anchors to n missing things.
+    """Offsets from n anchors to n missing objects; None where the offset is unknown.
 
     Args:
-        relation, missing, anchor: (n,) canonical relation, class of the missing thing and of its
-            anchor.
-        outgoing: (n,) the missing thing is the relation's subject.
-        axes: the viewer's, in the frame to answer in; None where nobody knows where he looks. Then
-            left and front have no offset, and what lies on a thing lies in no direction from it.
+        relation, missing, anchor: (n,) canonical relation, class of the missing object, and class
+            of its anchor.
+        outgoing: (n,) whether the missing object is the relation's subject.
+        axes: the viewer's axes, in the frame of the offsets. None if the viewing direction is
+            unknown: then left and front have no offset, and other mean offsets are vertical.
     """
     ends = (relation, missing, anchor, outgoing)
     if axes is None:
@@ -345,7 +347,7 @@ def _lay(
     axes: NDArray[np.float64],
     looking: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Means and spreads (n, 3), and scenes (n,), of `offsets_of`."""
+    """Means and standard deviations (n, 3) of the offsets, and their numbers of scenes (n,)."""
     subject, other = np.where(outgoing, missing, anchor), np.where(outgoing, anchor, missing)
     offset, scenes = look_up(tables, relation, subject, other)
     n = len(relation)
@@ -367,7 +369,7 @@ def _lay(
                 spread[k, 1] += square
         for axis in range(3):
             value = mean[k, axis] if outgoing[k] else -mean[k, axis]
-            # Adding zero makes 0 of -0.
+            # Adding 0.0 turns -0.0 into 0.0.
             mean[k, axis] = np.rint(value * _PER_METRE) / _PER_METRE + 0.0
             spread[k, axis] = (
                 max(np.rint(math.sqrt(spread[k, axis]) * _PER_METRE), 1.0) / _PER_METRE

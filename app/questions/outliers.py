@@ -1,18 +1,19 @@
-"""What does not belong here, or stands in the wrong place?
+"""The question `outliers`: which objects do not belong, and which stated relations are wrong?
 
-An outlier names companions: absent classes that it is usually found with. The presence of class j
-raises the log-odds of class i, in a scene without others, by
+The answer for an outlier names its companions: absent classes that usually occur with it. In a
+scene without other objects, the presence of class j raises the log-odds of class i by
 
     increase_ij = gain_j(c1 + W_i) - gain_j(c1)
     gain_j(x)   = sum_k softplus(x_k + W_jk) - softplus(x_k)
 
-It is symmetric in i and j, so one row of gains for i holds its increase by every class. The formula
-is exact for one hidden layer in the local form; a second layer, relations and the room type are
-left out.
+Here c1 are the biases of the hidden units k, and W_i are the weights of class i. The increase is
+symmetric in i and j. So one row of gains for class i holds the increase by every class. The formula
+is exact for one hidden layer in the local form. It leaves out a second layer, relations and the
+room type.
 
-The largest increases belong to rare companions (a toilet's: the toilet paper holder), the likeliest
-companions to common things (chairs are everywhere). So classes are ranked by the product of
-increase and probability beside i, and an increase below half of the largest one does not count.
+Rare companions have the largest increases: for a toilet, the toilet paper holder. Common objects
+such as chairs are likely beside any class. So companions are ranked by the product of the increase
+and the probability beside class i. Increases below half of the largest one are ignored.
 """
 
 from __future__ import annotations
@@ -33,27 +34,28 @@ from app.scene.scene import Scene
 
 Sensitivity = Literal["low", "medium", "high"]
 
-# Reasons for one object cost n rows. Where a scene shows very many relations, they are given for
-# fewer objects, so that their rows hold about so many relation units in all.
+# Reasons for one object need n rows of relation units. This limit on the units of all rows bounds
+# the number of explained objects in a scene with very many relations.
 _REASON_UNITS: Final = 1 << 22
 
 COMPANIONS: Final = 3
-"""How many classes an answer names."""
+"""Maximum number of companions in an answer."""
 
-_LEAST_SHARE: Final = 0.5  # of the largest increase
+_LEAST_SHARE: Final = 0.5  # smallest increase of a companion, as a share of the largest
 
 
 class OutlierAnswer(NamedTuple):
     """How badly an object fits.
 
     Attributes:
-        object, label: which one; the label is canonical.
-        probability: that it is an intruder, where half of the scenes are clean.
-        log_odds: of its class being present given the rest of the scene.
-        is_outlier: the probability reaches the threshold.
-        because: the objects that make it unlikely, strongest first; of one that fits, those that
-            make it likely.
-        usually_with: absent classes that would make it likely, at most three; of outliers only.
+        object: position in the scene.
+        label: canonical label.
+        probability: probability that it is an intruder, if half of all scenes have no intruder.
+        log_odds: log-odds that its class is present, given the rest of the scene.
+        is_outlier: whether the probability reaches the threshold.
+        because: for an outlier, the objects that lower its log-odds most, strongest first; for
+            other objects, the objects that raise the log-odds most.
+        usually_with: companions of an outlier, at most three (see the module).
     """
 
     object: int
@@ -66,10 +68,10 @@ class OutlierAnswer(NamedTuple):
 
 
 class MisplacedAnswer(NamedTuple):
-    """A relation of the scene and the probability that it is false.
+    """A stated relation and the probability that it is false.
 
     Attributes:
-        is_misplaced: the probability reaches the threshold.
+        is_misplaced: whether the probability reaches the threshold.
     """
 
     subject: int
@@ -80,10 +82,10 @@ class MisplacedAnswer(NamedTuple):
 
 
 class OutliersFound(NamedTuple):
-    """What does not belong, and what stands in the wrong place.
+    """The objects and the stated relations of a scene, with their probabilities.
 
     Attributes:
-        threshold: probability from which an object is an outlier.
+        threshold: smallest probability of an outlier.
         outliers: every object, least fitting first.
         misplaced: every stated relation, least likely first.
     """
@@ -101,19 +103,21 @@ def outliers(
     threshold: float | None = None,
     details: bool = True,
 ) -> OutliersFound:
-    """Every object, least fitting first, and every stated relation, least likely first.
+    """Judge every object and every stated relation of a scene.
 
-    An object is judged by the log-odds of its class given the rest of the scene: all instances of
-    the class, and all relations that touch it, are taken out first. So instances of one class
-    score alike. Intruders are often common things in the wrong room: their prior is proportional
-    to popularity^alpha, so alpha times the log-odds of the class in a training scene is subtracted
-    from its log-odds here. Structure, such as a wall, is never an intruder: its probability is 0.
-    Ties go by position. A list of few classes says little of the scene, so its threshold is higher.
+    The least fitting objects and the least likely relations come first, ties by position.
+
+    An object is judged by the log-odds of its class given the rest of the scene. The rest excludes
+    all instances of the class and all relations that touch it. So instances of one class have the
+    same score. Intruders are often common objects in the wrong room: their prior is proportional
+    to popularity^alpha. So alpha times the log-odds of the class in a training scene is subtracted.
+    Structure, such as a wall, always has probability 0. A short list gives little evidence about
+    the scene, so its threshold is higher.
 
     Args:
-        sensitivity: which of the model's thresholds decide.
-        threshold: probability from which an object is an outlier; replaces that of `sensitivity`.
-        details: also name the objects that support each verdict, and what goes with an outlier.
+        sensitivity: selects one of the model's thresholds.
+        threshold: smallest probability of an outlier; replaces the threshold of `sensitivity`.
+        details: whether to add `because` and `usually_with`.
 
     Raises:
         ValueError: a threshold outside [0, 1].
@@ -131,7 +135,7 @@ def outliers(
         threshold = _threshold(_presets(calibration, listed), sensitivity)
     log_odds = given.log_odds_given_rest()
     logits = _intruder_logits(artifact, classes, log_odds)
-    # By logit: probabilities near 0 or 1 may all round to one number.
+    # Sorted by logit: probabilities near 0 or 1 may round to the same number.
     order = np.argsort(-logits[given.present.row], kind="stable")
     p = _probability(logits)
     row = given.present.row[order]
@@ -157,14 +161,14 @@ def outliers(
 def misplaced(
     artifact: Artifact, scene: Scene, *, sensitivity: Sensitivity = "medium"
 ) -> tuple[MisplacedAnswer, ...]:
-    """Every stated relation, least likely first: the second list of `outliers` alone."""
+    """Judge every stated relation, least likely first, as `outliers` does, but without objects."""
     if not scene.objects:
         return ()
     return _misplaced(artifact, posterior(artifact, scene), scene, sensitivity)
 
 
 def intruder_probability(artifact: Artifact, given: Posterior) -> NDArray[np.float64]:
-    """The probability that a class of the scene is an intruder, (n,); see `outliers`."""
+    """The probability that each class of the scene is an intruder, (n,); see `outliers`."""
     log_odds = given.log_odds_given_rest()
     return _probability(_intruder_logits(artifact, given.present.classes, log_odds))
 
@@ -184,7 +188,7 @@ def _probability(logits: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _presets(calibration: Calibration, listed: int) -> Thresholds:
-    """The thresholds where so many classes are listed, structure aside."""
+    """The thresholds for a scene with `listed` classes, not counting structure."""
     if 0 < listed <= len(calibration.short_list_thresholds):
         return calibration.short_list_thresholds[listed - 1]
     return calibration.outlier_thresholds
@@ -197,7 +201,7 @@ def _threshold(presets: Thresholds, sensitivity: Sensitivity) -> float:
 def _adjusted(
     artifact: Artifact, classes: NDArray[np.int64], log_odds: NDArray[np.floating[Any]]
 ) -> NDArray[np.floating[Any]]:
-    """Log-odds of presence, less alpha times those of the class in a training scene, (n,)."""
+    """Log-odds of presence minus alpha times the class's log-odds in a training scene, (n,)."""
     popularity = artifact.popularity
     if popularity is None:
         return log_odds
@@ -205,7 +209,7 @@ def _adjusted(
 
 
 def _affordable(given: Posterior) -> int:
-    """For how many objects to give reasons."""
+    """Maximum number of objects that get reasons."""
     per_object = len(given.present.classes) * max(1, given.unit_count)
     return min(EXPLAINED, max(1, _REASON_UNITS // per_object))
 
@@ -213,9 +217,9 @@ def _affordable(given: Posterior) -> int:
 def _reasons(
     given: Posterior, explained: list[int], is_outlier: NDArray[np.bool_]
 ) -> dict[int, tuple[Because, ...]]:
-    """For each explained class, the other classes that support its verdict most.
+    """The strongest reasons for each explained class.
 
-    Of an outlier those that lower its log-odds, of any other those that raise it.
+    Reasons of an outlier lower its log-odds. Reasons of other classes raise their log-odds.
     """
     if len(given.present.classes) < 2:
         return dict.fromkeys(explained, ())
@@ -232,7 +236,7 @@ def _reasons(
 def _misplaced(
     artifact: Artifact, given: Posterior, scene: Scene, sensitivity: Sensitivity
 ) -> tuple[MisplacedAnswer, ...]:
-    """The scene's relations that the machine knows, least likely first, ties by their order."""
+    """Judge the stated relations that the machine knows, least likely first, ties by position."""
     stated = [triple for triple in scene.relations or () if triple[0] < artifact.spec.A]
     if not stated:
         return ()
@@ -256,11 +260,11 @@ def _misplaced(
 def _companions(
     artifact: Artifact, present: NDArray[np.int64], flagged: NDArray[np.int64]
 ) -> list[tuple[str, ...]]:
-    """Labels of absent classes that would make each flagged class likely, best first.
+    """Labels of the companions of each flagged class, best first (see the module).
 
     Args:
-        present: the classes of the scene, which are never named; structure is not either.
-        flagged: class indices.
+        present: classes of the scene; these and structure are never companions.
+        flagged: class indices of the outliers.
     """
     usable = ~artifact.vocabulary.structure
     usable[present] = False

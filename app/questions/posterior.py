@@ -1,4 +1,4 @@
-"""A model's probabilities for the rest of a scene, given its observed part."""
+"""The posterior: probabilities of unobserved objects and relations, given an observed scene."""
 
 from __future__ import annotations
 
@@ -21,19 +21,21 @@ Floats = NDArray[np.floating[Any]]
 Places = NDArray[np.int64]
 
 FULL: Final = 0.999
-"""Coverage from which on every class that is there counts as listed."""
+"""From this coverage on, every present class counts as listed."""
 
 
 class Present(NamedTuple):
-    """The n distinct classes of a scene of N objects: models speak of these, answers of objects.
+    """The n distinct classes of a scene of N objects.
+
+    Models work on classes; answers list objects.
 
     Attributes:
-        classes: (n,) int64, ascending.
-        counts: (n,) int64, instances of each.
-        row: (N,) int64, for each object the place of its class in `classes`.
+        classes: (n,) int64, class indices, ascending.
+        counts: (n,) int64, number of instances of each class.
+        row: (N,) int64, index into `classes` for each object's class.
         first: (n,) int64, position of the first object of each class.
-        presence: (n,) float32, probability that at least one instance of the class is there.
-        log_counts: (n,) float32.
+        presence: (n,) float32, probability that at least one instance of the class is present.
+        log_counts: (n,) float32, log of `counts`.
     """
 
     classes: Places
@@ -45,18 +47,18 @@ class Present(NamedTuple):
 
 
 def present(scene: Scene, spec: MachineSpec) -> Present:
-    """The classes of a scene.
+    """Group the objects of a scene by class.
 
     Raises:
-        ValueError: an object outside the machine's classes, or a room type it does not have.
+        ValueError: an object or a room type that the machine does not know.
     """
     V, indices = spec.V, [thing.class_index for thing in scene.objects]
     for place, index in enumerate(indices):
         if index is None or index >= V:
             name = scene.objects[place].id
-            raise ValueError(f"class_index of {name!r} is {index}, must be below V = {V}")
+            raise ValueError(f"class_index of {name!r} is {index}, but must be below V = {V}")
     if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
-        raise ValueError(f"room_type is {scene.room_type}, must be below C = {spec.C}")
+        raise ValueError(f"room_type is {scene.room_type}, but must be below C = {spec.C}")
     confidence = np.array([thing.confidence for thing in scene.objects], dtype=np.float64)
     classes, first, row, counts, presence = pool_classes(
         np.array(indices, dtype=np.int64), confidence
@@ -66,44 +68,45 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
 
 
 def given_relations(scene: Scene, present: Present, relations: int) -> Given | None:
-    """What is observed, by class; None where the scene says nothing of relations.
+    """The observed relations between classes; None if the scene has neither relations nor poses.
 
     Args:
-        relations: how many the machine knows.
+        relations: number of canonical relations that the machine knows.
     """
     if not relations_given(scene) and scene.poses is None:
         return None
     on, seen = pooled(present.row, len(present.classes), *instance_evidence(scene))
-    # Contiguous, however many: for other layouts the loops would be compiled again.
+    # `np.stack` makes contiguous arrays: for another layout the loops would be compiled again.
     a, i, j = np.stack(np.nonzero(seen[:relations]))
     gate = present.presence[i] * present.presence[j]
     return Given(a, i, j, on[a, i, j].astype(np.float32), gate)
 
 
 def relations_given(scene: Scene) -> bool:
-    """Whether the scene says anything of how its objects stand to each other."""
+    """Whether the scene has observed relations, stated or derived from poses."""
     return bool(scene.relations or scene.relations_complete or scene.poses)
 
 
 def pull_of(scene: Scene, weights: EvidenceWeights) -> Pull:
-    """How strongly the relations of a scene act on the context."""
+    """Weights of the observed relations in the mean field of the hidden units."""
     if scene.poses is None:
         return Pull(weights.relations_on_objects, weights.relations_on_relations)
     return Pull(weights.poses_on_objects, weights.poses_on_relations)
 
 
 class Posterior:
-    """Log-odds given a scene; formulas in `app/inference/posterior.py`.
+    """Log-odds of objects and relations given a scene; see `app/inference/posterior.py`.
 
-    Shapes: V classes, A canonical relations, n classes present. Without given relations objects are
-    exact with one layer; the logits of relations count as normal. No log-odds of a relation is
-    below `NO_UNIT`.
+    Shapes: V classes of the vocabulary, A canonical relations, n classes of the scene. The
+    log-odds of objects are exact for one hidden layer and a scene without observed relations.
+    Logits of relations are approximated by normal variables. `NO_UNIT` is the smallest log-odds of
+    a relation.
 
     Attributes:
         present: the classes of the scene.
 
     Raises:
-        ValueError: an object outside the machine's classes, or a room type it does not have.
+        ValueError: an object or a room type that the machine does not know.
     """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
@@ -118,37 +121,45 @@ class Posterior:
 
     @property
     def unit_count(self) -> int:
-        """Relations that are given: a judgement of one class goes through all of them."""
+        """Number of observed relation units; the cost of judging one class grows with it."""
         return len(self._context.slopes)
 
     def absent_log_odds(self, absent: Places) -> Floats:
-        """Presence of absent classes (N,), each with all its relations unobserved, (N,)."""
+        """Log-odds of presence of absent classes, with their relations unobserved, (N,)."""
         found: Floats = self._closed.b + self._artifact.scorer.gain(self._context.object_y)
         return found[absent]
 
     def absent_posterior(self, absent: Places, coverage: float) -> Floats:
-        """The same where a class which is present is listed with probability `coverage`, (N,)."""
+        """Log-odds that absent classes are present but unlisted, given the coverage, (N,)."""
         return with_unlisted(
             *(self._artifact, self.absent_log_odds(absent), absent, self._context.object_y),
             *(self.present, self._room, coverage),
         )
 
     def relation_log_odds(self) -> Floats:
-        """Every relation between the classes present, each without itself, (A, n, n)."""
+        """Log-odds of every relation between the classes of the scene, (A, n, n).
+
+        Each relation is judged as if it were unobserved itself.
+        """
         return self._closed.relation_log_odds(self._context, self._between)
 
     def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
-        """The same of some relations (E,), from and to places in `present.classes`, (E,)."""
+        """Log-odds of E relations, each judged as if it were unobserved itself, (E,).
+
+        Args:
+            relation: (E,) canonical relations.
+            subject, object_: (E,) indices into `present.classes`.
+        """
         return self._closed.unit_log_odds(self._context, relation, subject, object_)
 
     def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
-        """Relations of pairs of classes (P,) without all that is known of how the two stand.
+        """Log-odds of all relations of P pairs, judged as if no relation of the pair were observed.
 
         Args:
-            one, other: places in `present.classes`.
+            one, other: (P,) indices of the two classes in `present.classes`.
 
         Returns:
-            (A, P) of the one to the other, and of the other to the one.
+            (A, P) from `one` to `other`, and (A, P) from `other` to `one`.
         """
         forward, backward = self._closed.units.log_odds_apart(
             self._context, self._between, one, other
@@ -156,23 +167,29 @@ class Posterior:
         return forward, backward
 
     def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
-        """Relations of absent classes (N,), were they there, to places (m,) in `present.classes`.
+        """Log-odds of all relations of absent classes to anchors, if these classes were present.
 
-        What the observed relations imply for those of a candidate is left out.
+        The effect of the observed relations on a candidate's relations is left out.
+
+        Args:
+            candidates: (N,) absent classes.
+            anchors: (m,) indices into `present.classes`.
 
         Returns:
-            (N, A, m) of the candidate to an anchor, and of the anchor to the candidate.
+            (N, A, m) from the candidates to the anchors, and (N, A, m) from the anchors back.
         """
         return self._closed.units.placement_log_odds(self._context, candidates, anchors)
 
     def placed_log_p(
         self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
     ) -> Floats:
-        """log p(the candidate stands so to the anchor | it is there, evidence), (N,).
+        """log p(relation between candidate and anchor | candidate is present, evidence), (N,).
 
         Args:
-            relation: canonical; from the candidate to the anchor if `outgoing`, else back.
-            anchor: place in `present.classes`.
+            candidates: (N,) absent classes.
+            relation: canonical relation.
+            anchor: index into `present.classes`.
+            outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
         """
         log_odds = self._closed.placed_log_odds(
             self._context, candidates, relation, anchor, outgoing
@@ -180,24 +197,28 @@ class Posterior:
         return -np.logaddexp(np.float32(0.0), -log_odds)
 
     def log_odds_given_rest(self) -> Floats:
-        """Each present class given the scene without it and its relations, (n,)."""
+        """Leave-one-out log-odds of each class: given the scene without it, (n,).
+
+        The relations of the class are left out, too.
+        """
         found: Floats = self._closed.b[self.present.classes] + self._gains
         return found
 
     def reasons(self, rows: Places) -> Floats:
-        """How the log-odds of classes given the rest change by each other class, (N, n).
+        """How much each class of the scene changes the leave-one-out log-odds of others, (N, n).
 
-        With the class, minus without it and its relations. 0 for the class itself.
+        An entry is the log-odds with the changing class, minus the log-odds without this class and
+        its relations. The entry of a class for itself is 0.
 
         Args:
-            rows: (N,) places in `present.classes`.
+            rows: (N,) indices of the explained classes in `present.classes`.
         """
         return self._closed.reasons(self._context, self._shares, self._gains, rows)
 
     def reasons_for_absent(self, candidates: Places) -> Floats:
-        """How the log-odds of absent classes (N,) change by each class that is there, (N, n).
+        """How much each class of the scene changes the log-odds of absent classes, (N, n).
 
-        With the class, minus without it and its relations.
+        An entry is the log-odds with the class, minus the log-odds without it and its relations.
         """
         return self._closed.reasons_for_absent(self._context, self._shares, candidates)
 
@@ -215,7 +236,7 @@ class Posterior:
 
 
 def posterior(artifact: Artifact, scene: Scene) -> Posterior:
-    """The posterior of a scene, by the artifact's oracle if it has one."""
+    """The posterior of a scene, computed by the artifact's oracle if it has one."""
     found: Posterior = (artifact.oracle or Posterior)(artifact, scene)
     return found
 
@@ -230,19 +251,23 @@ def with_unlisted(
     coverage: float,
     closed: Floats | None = None,
 ) -> Floats:
-    """Mix the log-odds of absent classes with those of the partial posterior, (N,).
+    """Mix the closed form and the partial posterior of absent classes, (N,).
 
-    (1 - λ) (closed + log(1 - c)) + λ partial, with λ the calibration's `coverage_weight`. The
-    closed form counts all other unlisted classes as absent and has no sampling error. It stands
-    alone for machines without stored samples, and from a coverage of `FULL` on, which counts as
-    `FULL`: at 1 no class could be there unlisted.
+    (1 - λ) (closed + log(1 - c)) + λ partial
+
+    λ is the calibration's `coverage_weight`, and c is the coverage. `closed` are log-odds in closed
+    form: they count all other unlisted classes as absent, and have no sampling error. `partial` are
+    log-odds estimated from the stored samples (`Completions`). The closed form is used alone for
+    machines without stored samples, and for a coverage of at least `FULL`. Then c = `FULL`, since
+    c = 1 would give log-odds of minus infinity.
 
     Args:
-        log_odds: (N,) of the absent classes, unlisted ones absent.
+        log_odds: (N,) log-odds of the absent classes, with other unlisted classes absent.
+        absent: (N,) class indices.
         y: (H1,) logits of h1 in the closed form.
-        coverage: probability that a class which is present is listed.
-        closed: (N,) the closed form at y, where `log_odds` are a better estimate: what the
-            partial posterior changes is added to these.
+        coverage: probability that a present class is listed.
+        closed: (N,) the closed form at y, if `log_odds` are a better estimate. Then λ times the
+            difference between the partial posterior and the closed form is added to `log_odds`.
     """
     completions, weight = artifact.completions, artifact.calibration.coverage_weight
     unlisted = math.log1p(-min(coverage, FULL))

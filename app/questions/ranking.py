@@ -1,7 +1,4 @@
-"""Compiled loops from log-odds to the best of what an answer can list; ties go by position.
-
-And from numbers to the digits that an answer shows.
-"""
+"""Compiled loops that rank the entries of answers, ties by position, and round their numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +16,8 @@ from app.questions.calibration import exclusive, relation_probability
 DIGITS: Final = 6
 """Significant digits of probabilities, log-odds and metres."""
 
-# Exact doubles: a whole number divided by one of them is the double nearest to the decimal number.
+# These doubles are exact. So an integer divided by one of them is the double nearest to the decimal
+# number.
 _POWERS: Final = np.array([10.0**power for power in range(23)])
 
 
@@ -27,37 +25,40 @@ TupleT = TypeVar("TupleT", bound=tuple[Any, ...])
 
 
 REASONS: Final = 3
-"""How many objects an answer names as reasons."""
+"""Maximum number of reasons for one entry of an answer."""
 
 EXPLAINED: Final = 32
-"""Reasons are given for so many entries of an answer at most, its first."""
+"""Only the first entries of an answer, at most this many, have reasons."""
 
 
 class Because(NamedTuple):
-    """What the presence of one object adds to the log-odds of another; negative speaks against."""
+    """A reason: how much the presence of `object` changes the log-odds of the judged class."""
 
     object: int
     log_odds_change: float
 
 
 def entries(kind: type[TupleT], *columns: Iterable[Any]) -> list[TupleT]:
-    """Named tuples from their fields, column by column: in half the time that calls would take."""
+    """Make named tuples from columns of fields, in half the time of calls to the class."""
     return list(map(partial(tuple.__new__, kind), zip(*columns, strict=True)))
 
 
 @compiled
 def best(values, usable, count):
-    """Positions of the `count` largest usable values, largest first, earlier first among equals.
+    """Positions of the `count` largest usable values, largest first, ties by position.
+
+    The time is O(N log count).
 
     Args:
         values: (N,).
         usable: (N,) bool.
 
     Returns:
-        At most `count` positions. N numbers cost O(N log count).
+        At most `count` positions.
     """
     size, kept = 0, min(count, len(values))
-    # A heap whose first is the worst of the best so far: the smallest, the last among equals.
+    # A heap of the best positions so far. Its root is the worst of them: the smallest value, and
+    # the last position among equal values.
     heap = np.empty(kept, np.int64)
     for position in range(len(values)):
         if not usable[position]:
@@ -81,13 +82,13 @@ def best(values, usable, count):
 
 @compiled
 def _worse(values, one, other):
-    """Whether the value at one position comes after that at another."""
+    """Whether position `one` ranks after position `other`."""
     return values[one] < values[other] or (values[one] == values[other] and one > other)
 
 
 @compiled
 def _sink(values, heap, size, position):
-    """Put a position in the place of the first of a heap."""
+    """Replace the root of a heap by a position, and restore the heap."""
     at = 0
     while 2 * at + 1 < size:
         below = 2 * at + 1
@@ -102,16 +103,16 @@ def _sink(values, heap, size, position):
 
 @compiled
 def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposites, count):
-    """The best `count` relations between objects, by place: subject, object, relation.
+    """The `count` likeliest relations between objects, likeliest first, ties by position.
 
     Args:
         slopes: (A, 4 + 2K), see `RelationSlopes`.
-        log_odds: (A, n, n) between classes.
-        log_counts: (n,).
-        row: (N,) the class of each object.
-        asked: (N, N) bool, which ordered pairs.
-        least: leave out what is less likely.
-        opposites: whether each is also spelled the other way round, as relation A + a.
+        log_odds: (A, n, n) log-odds of the relations between classes.
+        log_counts: (n,) log of the number of instances of each class.
+        row: (N,) index of each object's class among the n classes.
+        asked: (N, N) bool, the ordered pairs to answer.
+        least: relations of a lower probability are left out.
+        opposites: whether to add, as relation A + a, relation a from object to subject.
 
     Returns:
         (k,) subjects, objects, relations and probabilities.
@@ -142,20 +143,23 @@ def likeliest_relations(slopes, log_odds, log_counts, row, asked, least, opposit
 
 @compiled
 def likeliest_places(slopes, forward, backward, log_counts, classes, count, first):
-    """The best k places of each candidate, one candidate after the other.
+    """The k likeliest places of each candidate, one candidate after the other.
 
-    Place (d A + a) m + j is relation a to anchor j, or back if d = 1.
+    Place (d A + a) m + j stands for relation a and anchor j. The candidate is the subject if d = 0;
+    the anchor is the subject if d = 1.
 
     Args:
         slopes: (A, 4 + 2K), see `RelationSlopes`.
-        forward, backward: (N, A, m) log-odds of relations to the anchors, and of those back.
-        log_counts: (m,).
-        classes: how many distinct ones there are with the candidate.
-        first: the place that is listed before all others, however likely; -1 for none.
+        forward, backward: (N, A, m) log-odds of relations from the candidates to the anchors, and
+            from the anchors to the candidates.
+        log_counts: (m,) log of the number of instances of each anchor's class.
+        classes: number of distinct classes in the scene, the candidate included.
+        count: maximum of k.
+        first: the place that is listed first, however likely; -1 for none.
 
     Returns:
-        (N k,) the number of the candidate, the relation, whether it leads from the candidate to the
-        anchor, the number of the anchor, and the probability.
+        Five arrays (N k,): number of the candidate, relation, whether the candidate is its subject,
+        number of the anchor, and probability.
     """
     N, A, m = forward.shape
     size = A * m
@@ -182,12 +186,13 @@ def likeliest_places(slopes, forward, backward, log_counts, classes, count, firs
 
 @compiled
 def strongest(change, rows, count):
-    """The places of the largest changes, of either sign, and these, (N, k) both.
+    """Indices and values of the largest changes of either sign, each (N, k).
 
     Args:
-        change: (N, n).
-        rows: (N,) the place of what is explained, which is no reason for itself; empty where
-            nothing of it is among the n.
+        change: (N, n) changes of N explained classes by the n classes of the scene.
+        rows: (N,) index of each explained class among the n classes, which is skipped; empty if the
+            explained classes are absent.
+        count: maximum of k.
     """
     N, n = change.shape
     kept = min(count, n - (len(rows) > 0))
@@ -209,14 +214,14 @@ def strongest_reasons(
     change: NDArray[np.floating[Any]],
     rows: NDArray[np.int64] | None = None,
 ) -> list[tuple[Because, ...]]:
-    """The classes that change the log-odds of N others most, strongest first, for each of these.
+    """The reasons for each of N explained classes: the largest changes of either sign, first.
 
-    Of either sign; instances of a class are spoken of by the first.
+    A reason names the first object of its class.
 
     Args:
-        first: (n,) the first object of each class present.
-        change: (N, n) by each class present.
-        rows: (N,) places of the explained classes among the n; None for absent classes.
+        first: (n,) position of the first object of each class of the scene.
+        change: (N, n) changes of the explained classes' log-odds by each class of the scene.
+        rows: (N,) indices of the explained classes among the n; None for absent classes.
     """
     rows = np.zeros(0, np.int64) if rows is None else rows
     places, values = strongest(change, rows, REASONS)
@@ -227,19 +232,20 @@ def strongest_reasons(
 
 @compiled
 def observed_pairs(triples, row, asked, classes, relations):
-    """Pairs of objects between which something holds, (P,) each of what follows.
+    """Pairs of objects with at least one observed relation, with the relations as bit sets.
 
-    Relations are numbers, a from subject to object and A + a back, and a set of them is their bits.
+    Bit a stands for relation a from subject to object. Bit A + a stands for relation a from object
+    to subject.
 
     Args:
         triples: (T, 3) relation, subject and object.
-        row: (N,) the class of each object.
-        asked: (N, N) ordered pairs; a pair asked either way counts.
-        classes, relations: how many there are, n and A.
+        row: (N,) index of each object's class among the n classes.
+        asked: (N, N) bool, the ordered pairs to answer; a pair counts in either order.
+        classes, relations: the numbers n and A.
 
     Returns:
-        Subject and object; what holds from the one to the other, and what between any two
-        instances of their classes.
+        Four arrays (P,): subject, object, relations of the pair, and relations between any
+        instances of the two classes.
     """
     size = len(row)
     holds, of_classes = np.zeros((size, size), np.int64), np.zeros((classes, classes), np.int64)
@@ -254,7 +260,8 @@ def observed_pairs(triples, row, asked, classes, relations):
     for x in range(size):
         for y in range(x + 1, size):
             if holds[x, y] and (asked[x, y] or asked[y, x]):
-                # Whose relation comes first: the lowest bit of what holds from x, and from y.
+                # The subject is the object whose first relation, its lowest bit, has the lower
+                # number.
                 one, other = holds[x, y] & forward, holds[y, x] & forward
                 swapped = one == 0 or (other != 0 and (other & -other) < (one & -one))
                 subject, object_ = (y, x) if swapped else (x, y)
@@ -267,19 +274,23 @@ def observed_pairs(triples, row, asked, classes, relations):
 
 @compiled
 def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classes, least, count):
-    """The `count` pairs whose likeliest relation exceeds those observed by the largest ratio.
+    """The `count` pairs with the largest ratio of expected to observed probability.
+
+    The expected relation of a pair is its likeliest relation. The observed probability is that of
+    the likeliest observed relation. A pair counts only if its expected relation is unobserved, both
+    for the pair and for its classes.
 
     Args:
         slopes: (A, 4 + 2K), see `RelationSlopes`.
-        forward, backward: (A, P) log-odds from subject to object, and back.
-        log_counts: (P,) log of the instance pairs of both classes.
-        classes: how many distinct ones the scene has.
-        holds, of_classes: (P,) see `observed_pairs`; what either has is not expected.
-        least: relations of a lower probability are left out.
+        forward, backward: (A, P) log-odds from subject to object, and from object to subject.
+        log_counts: (P,) log of the number of instance pairs of both classes.
+        classes: number of distinct classes in the scene.
+        holds, of_classes: (P,) relations of the pair and of its classes, see `observed_pairs`.
+        least: smallest probability of an expected relation.
 
     Returns:
-        (k,) places, numbers of the expected relations, their probabilities, and those of the
-        likeliest relations that hold.
+        Four arrays (k,): index of the pair, number of the expected relation, its probability, and
+        the observed probability.
     """
     A, P = forward.shape
     to = relation_probability(slopes, forward.reshape(1, A, P), log_counts, classes)[0]
@@ -306,7 +317,7 @@ def disagreeing(slopes, forward, backward, log_counts, classes, holds, of_classe
 
 
 def significant(numbers: Sequence[float]) -> list[float]:
-    """The same numbers to `DIGITS` significant digits."""
+    """Round numbers to `DIGITS` significant digits."""
     values = np.array(numbers, dtype=np.float64)
     exact = _round(values)
     rounded: list[float] = values.tolist()
@@ -317,7 +328,11 @@ def significant(numbers: Sequence[float]) -> list[float]:
 
 @compiled
 def _round(values: NDArray[np.float64]) -> bool:
-    """Round numbers in place; False if one is too small or too large for exact powers of ten."""
+    """Round numbers in place.
+
+    Returns:
+        False if a number is too small or too large for exact powers of ten; it stays unchanged.
+    """
     exact = True
     for k in range(len(values)):
         size = np.abs(values[k])

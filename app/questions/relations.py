@@ -1,15 +1,13 @@
-"""How do these objects stand to each other? Which observed relations does the model not expect?
+"""The question `relations`: which relations hold between objects, and which are unexpected?
 
-Disagreements: a pair of objects of which some relation holds is judged once more as if nothing were
-known of how the two stand: with every relation between their classes unobserved, on or off, in both
-directions. Otherwise an observation would be evidence for itself: left holds, so front was seen
-not to.
-If the likeliest of the eight relations is then none of the observed ones, and likelier than not,
-the two disagree.
+Disagreements: each pair of objects with an observed relation is judged a second time, with all
+relations between their two classes unobserved, in both directions. Otherwise an observation would
+be evidence for itself: if left is observed, front is observed to be off. The pair is a disagreement
+if the likeliest of the eight relations is unobserved and has a probability of at least `EXPECTED`.
 
-Units are those of classes. So where classes have several instances, what any pair of these shows
-counts as observed: one chair to the left and one to the right of the table are as expected as the
-other way round, whichever of the two is likelier.
+The model has relation units between classes. If a class has several instances, a relation of any
+instance counts as observed. Example: one chair is to the left of the table, and another one to the
+right. Then both left and right count as observed for each chair.
 """
 
 from __future__ import annotations
@@ -27,18 +25,18 @@ from app.scene.relations import CANONICAL, OPPOSITES, canonicalise
 from app.scene.scene import Scene
 
 EXPECTED = 0.5
-"""From this probability on a relation is expected: likelier than not.
+"""Smallest probability of an expected relation.
 
-Of two relations that are both unlikely, the likelier one says little.
+If all relations of a pair are unlikely, the likeliest one is a weak expectation.
 """
 
 
 class RelationAnswer(NamedTuple):
-    """`subject` stands in `relation` to `object`.
+    """`relation` from `subject` to `object`, which are positions in the scene.
 
     Attributes:
-        probability: that the relation holds, given that both are in the scene.
-        observed: the scene states it, or its poses show it.
+        probability: probability that the relation holds, given that both objects are present.
+        observed: whether the relation was stated or derived from poses.
     """
 
     subject: int
@@ -49,14 +47,14 @@ class RelationAnswer(NamedTuple):
 
 
 class Disagreement(NamedTuple):
-    """Two objects that stand otherwise than the rest of the scene makes one expect.
+    """Two objects with another relation than the rest of the scene suggests, see the module.
 
     Attributes:
-        subject, object: which two.
-        observed: relations of the one to the other that were stated or observed.
-        expected: the likeliest relation, judged without all that is known of the pair.
-        probability: of it, as that of a `RelationAnswer`.
-        observed_probability: of the likeliest observed one.
+        subject, object: positions in the scene.
+        observed: observed relations from subject to object.
+        expected: the likeliest relation, judged without the observed relations of the pair.
+        probability: probability of `expected`.
+        observed_probability: probability of the likeliest observed relation.
     """
 
     subject: int
@@ -76,20 +74,20 @@ def relations(
     pairs: Sequence[tuple[int, int]] | None = None,
     include_opposites: bool = False,
 ) -> tuple[tuple[RelationAnswer, ...], tuple[Disagreement, ...]]:
-    """The likeliest relations between the objects of a scene, best first, ties by position.
+    """The likeliest relations between the objects of a scene, and its disagreements.
 
-    And the disagreements of the scene, see the module.
-
-    Relations that the scene states are evidence for the others; each is judged without itself.
-    Structure (floor, wall) stands in no relation unless `pairs` asks for it.
+    Observed relations are evidence for other relations. Each relation is judged as if it were
+    unobserved itself. Structure (floor, wall) is left out unless `pairs` contains it.
 
     Args:
-        top_k: at most so many of both.
-        min_probability: leave out what is less likely, or expected with less.
-        pairs: only answers with this (subject, object), positions in `scene.objects`. The order of
-            the two counts: the pair says nothing of how its object stands to its subject, but for
-            the opposite relations.
-        include_opposites: also spell each answer the other way round: right(y, x) for left(x, y).
+        top_k: maximum number of relations, and of disagreements.
+        min_probability: smallest probability of a relation, and of a disagreement's `expected`.
+        pairs: ordered pairs (subject, object) to answer, as positions in `scene.objects`.
+        include_opposites: also list opposite relations, such as right(y, x) for left(x, y).
+
+    Returns:
+        The relations, likeliest first. The disagreements, ordered by the ratio of `probability` to
+        `observed_probability`, largest first. Ties are ordered by position.
 
     Raises:
         ValueError: top_k below 1, a probability outside [0, 1], or a pair that is not two objects.
@@ -108,7 +106,7 @@ def relations(
         *(given.relation_log_odds(), present.log_counts, present.row, asked),
         *(min_probability, include_opposites, top_k),
     )
-    # Relation A + a is a the other way round.
+    # Relation A + a is the opposite of relation a.
     names = CANONICAL[: artifact.spec.A]
     names += tuple([OPPOSITES[name] for name in names])
     subjects, objects, kinds, probabilities = (values.tolist() for values in found)
@@ -131,7 +129,7 @@ def relations(
 def _asked(
     artifact: Artifact, present: Present, pairs: Sequence[tuple[int, int]] | None
 ) -> NDArray[np.bool_]:
-    """(N, N) which ordered pairs to answer."""
+    """The ordered pairs to answer, as a mask (N, N)."""
     size = len(present.row)
     if pairs is None:
         things = ~artifact.vocabulary.structure[present.classes][present.row]
@@ -153,16 +151,16 @@ def _disagreements(
     top_k: int,
     min_probability: float,
 ) -> tuple[Disagreement, ...]:
-    """The pairs of which another relation than any observed one is expected, largest ratio first.
+    """The disagreements of a scene, largest probability ratio first, ties by position.
 
-    Ties go by position. Each is spelled from the subject of its first observed relation, in the
-    order of `CANONICAL`. A relation that the machine has no unit for is never expected.
+    The subject of a disagreement is the subject of its first observed relation, in the order of
+    `CANONICAL`. Relations without a unit in the machine are never expected.
 
     Args:
         given: the posterior of the scene.
-        asked: (N, N) ordered pairs; a pair asked either way counts.
-        top_k: at most so many.
-        min_probability: relations of a lower probability are left out.
+        asked: (N, N) bool, the ordered pairs to answer; a pair counts in either order.
+        top_k: maximum number of disagreements.
+        min_probability: smallest probability of an expected relation.
     """
     A = artifact.spec.A
     stated = [triple for triple in scene.relations or () if triple[0] < A]

@@ -1,18 +1,19 @@
-"""Admission control: which requests begin when, and where the work of each model runs.
+"""Admission control: when a request starts, and in which thread its work runs.
 
-`Backlog` bounds the requests that wait to be read. In one tick of the event loop it starts as many
-requests as took `TICK` together in earlier ticks, and at most `PACE` less the pending ones. It
-refuses at most `REFUSALS` a tick. Without these bounds hundreds of simultaneous requests would hold
-up the event loop, and health checks with it. A request is refused when the backlog is full, when it
-would spend much of its time waiting, and when its deadline has passed.
+`Backlog` bounds the number of requests that wait to start. In one tick of the event loop it starts
+at most `PACE` requests, minus the pending ones. It starts fewer requests if they would hold up the
+event loop for more than `TICK` seconds. It refuses at most `REFUSALS` requests per tick. Without
+these bounds, hundreds of simultaneous requests would delay health checks. A request is refused for
+three reasons: the backlog is full, the expected wait is too long, or the deadline has passed.
 
-`WorkQueue` bounds the work of one model in rows. Each question is computed by itself, so an answer
-never depends on other requests. A cheap one is computed at once, on the event loop: a hop to a
-thread costs as much as most questions. A question that is expected to take longer than `CHEAP`, or
-whose kind was never measured, runs on the one worker thread of its model; compiled loops release
-the interpreter's lock. Drawings, which may take seconds, share one other thread. Questions of
-streams take turns, one a tick. A question whose deadline has passed, or whose client has left, is
-dropped when its turn comes.
+`WorkQueue` bounds the rows (scenes) that wait for one model or are computed by it. Each question is
+computed separately, so an answer never depends on other requests. A cheap question runs on the
+event loop, because a change of thread costs as much as most questions. A costly question runs on
+the worker thread of its model: its expected time exceeds `CHEAP`, or its kind was never measured.
+Compiled loops release the interpreter's lock, so the event loop can continue. Drawing scenes may
+take seconds, so all models share another thread for it. Questions of streams run one at a time, one
+per tick. A question is dropped if its deadline has passed or its client has disconnected before it
+starts.
 """
 
 from __future__ import annotations
@@ -34,44 +35,45 @@ from app.serving.errors import DeadlinePassedError, DisconnectedError, QueueFull
 T = TypeVar("T")
 
 TICK: Final = 8e-3
-"""Seconds that the requests begun in one tick may hold up the event loop."""
+"""Seconds for which the requests of one tick may block the event loop."""
 
 PACE: Final = 32
-"""Most requests begun in one tick, less those begun before whose work is still pending."""
+"""Maximum number of requests started in one tick. Pending requests are subtracted."""
 
 REFUSALS: Final = 8
-"""Requests refused in one tick."""
+"""Maximum number of requests refused in one tick."""
 
 CHEAP: Final = 2e-3
-"""Seconds that a job may hold up the event loop."""
+"""Seconds for which one job may block the event loop."""
 
-# Seconds between two checks of whether the models have caught up.
+# Seconds between two ticks if the last one could not start a request.
 _PAUSE: Final = 5e-3
-# Share of its time that a request may expect to wait: the pace may still drop to a third.
+# Maximum expected wait, as a share of the request's time. Even a wait three times as long then ends
+# before the deadline.
 _PATIENCE: Final = 0.25
-# Share of the newest measurement in the measured pace and in the time that a request takes.
+# Weight of the newest measurement in the moving averages of the backlog.
 _NEWEST_PACE: Final = 0.1
-# Seconds between two checks of whether the client of costly work is still there.
+# Seconds between two checks whether the client of costly work is still connected.
 _LOOK: Final = 0.25
-# Kinds and orders of size whose cost is remembered.
+# Maximum number of remembered costs.
 _MAX_COSTS: Final = 4096
-# Share of the newest measurement in the expected cost.
+# Weight of the newest measurement in the expected cost.
 _NEWEST: Final = 0.2
 
-# Arrival times and wake-ups, oldest first.
+# Arrival times and wake-up futures, oldest first.
 _Line = deque[tuple[float, asyncio.Future[None]]]
 
 
 class Backlog:
-    """Requests that wait to be read, in the order of their arrival.
+    """Requests that wait to start, in the order of their arrival.
 
     Args:
-        limit: most requests that wait.
+        limit: maximum number of waiting requests.
 
     Attributes:
-        pending: questions of requests that wait for a thread or are computed by one; drawings and
-            questions of streams are not counted.
-        draining: nothing new is begun.
+        pending: number of started questions without a result. Drawings and questions of streams
+            are not counted.
+        draining: whether the service has stopped accepting requests.
     """
 
     def __init__(self, limit: int) -> None:
@@ -87,15 +89,15 @@ class Backlog:
         self._refused: _Line = deque()
 
     async def enter(self, allowed: float, deadline: float) -> None:
-        """Wait until the request may begin.
+        """Wait until the request may start.
 
         Args:
-            allowed: seconds that the request has in all.
-            deadline: when they end, by `time.monotonic`.
+            allowed: total time of the request in seconds.
+            deadline: value of `time.monotonic` at the end of this time.
 
         Raises:
-            QueueFullError: too many wait, or the wait would take too long.
-            DeadlinePassedError: the deadline passed first.
+            QueueFullError: too many requests wait, or the expected wait is too long.
+            DeadlinePassedError: the deadline passed during the wait.
         """
         if not self._ticking:
             self._begin_tick()
@@ -106,15 +108,15 @@ class Backlog:
         if self._is_full(allowed):
             count = len(self._waiting)
             await _wait(self._refused)
-            raise QueueFullError(f"{count} requests wait already.")
+            raise QueueFullError(f"{count} requests are already waiting.")
         await _wait(self._waiting)
         if monotonic() >= deadline:
-            raise DeadlinePassedError("The deadline passed before the request was read.")
+            raise DeadlinePassedError("The deadline passed before the request started.")
 
     def _is_full(self, allowed: float) -> bool:
         if not self._waiting:
             return False
-        # The last of a long line waits about as long as its first has waited.
+        # A new request waits about as long as the oldest waiting request has waited.
         wait = max(monotonic() - self._waiting[0][0], len(self._waiting) * self._interval)
         return len(self._waiting) >= self.limit or wait > _PATIENCE * allowed
 
@@ -134,7 +136,7 @@ class Backlog:
         if self._refused:
             _wake(self._refused, REFUSALS)
         loop = asyncio.get_running_loop()
-        # One more tick after the last: requests that arrive in this one are counted in it.
+        # The next tick follows at once: requests that arrive before it count towards this tick.
         if begun or not self._ticking:
             self._ticking = True
             loop.call_soon(self._begin_tick)
@@ -158,7 +160,10 @@ async def _wait(line: _Line) -> None:
 
 
 def _wake(line: _Line, most: int) -> int:
-    """Wake the first of a line; how many there were that had not been cancelled."""
+    """Wake at most `most` requests, oldest first, and return their number.
+
+    Cancelled requests are skipped.
+    """
     count = 0
     while line and count < most:
         _, turn = line.popleft()
@@ -168,46 +173,49 @@ def _wake(line: _Line, most: int) -> int:
     return count
 
 
-# Not frozen: a frozen one takes three times as long to make.
+# Not frozen: creating a frozen dataclass takes three times as long.
 @dataclass(slots=True)
 class Ticket:
-    """How long a request may take, and whether its client still waits.
+    """The deadline of a request, and a check of its client's connection.
 
     Attributes:
-        deadline: by `time.monotonic`; work that has not begun by then is dropped.
-        is_gone: whether the client has left; asked before costly work.
+        deadline: value of `time.monotonic` at the deadline; work that starts later is dropped.
+        is_gone: function that returns whether the client has disconnected; called before and
+            during costly work.
     """
 
     deadline: float
     is_gone: Callable[[], Awaitable[bool]] | None = None
 
     def check(self) -> None:
-        """Return if there is time left.
+        """Check the deadline.
 
         Raises:
-            DeadlinePassedError: there is none.
+            DeadlinePassedError: the deadline has passed.
         """
         if monotonic() >= self.deadline:
-            raise DeadlinePassedError("The deadline passed before the answer was begun.")
+            raise DeadlinePassedError("The deadline passed before the computation started.")
 
     async def check_there(self) -> None:
-        """Return if the client still waits.
+        """Check the connection to the client.
 
         Raises:
-            DisconnectedError: it does not.
+            DisconnectedError: the client has disconnected.
         """
         if self.is_gone is not None and await self.is_gone():
-            raise DisconnectedError("The client has gone.")
+            raise DisconnectedError("The client has disconnected.")
 
 
 @dataclass(slots=True)
 class Done(Generic[T]):
-    """A job that has been done.
+    """The result of a job, with its times in seconds.
 
     Attributes:
-        waited, computed: seconds before it was begun, and that it took.
-        processor: seconds of processor time: `computed` without waiting for other processes and, in
-            a worker thread, for the interpreter.
+        result: return value of the job.
+        waited: time before the job started.
+        computed: duration of the job.
+        processor: processor time of the job. Waiting for other processes or, in a worker thread,
+            for the interpreter's lock is not counted.
     """
 
     result: T
@@ -217,24 +225,24 @@ class Done(Generic[T]):
 
 
 class _Costs:
-    """Seconds that questions took so far, per unit of size, by kind and order of size.
+    """Average cost of questions in seconds per unit of size, by kind and order of magnitude.
 
-    Small scenes cost more a unit than large ones, and must not make these look costly.
+    Small scenes cost more per unit than large ones. So each order of magnitude has its own average.
     """
 
     def __init__(self) -> None:
         self._per_unit: dict[tuple[str, int], float] = {}
 
     def expected(self, kind: str, size: int) -> float:
-        """Seconds; infinite where none of this kind and order has been measured."""
+        """Expected seconds; infinite before the first measurement."""
         return self._per_unit.get((kind, size.bit_length()), math.inf) * size
 
     def learn(self, kind: str, size: int, seconds: float) -> None:
         if len(self._per_unit) >= _MAX_COSTS:
-            self._per_unit.clear()  # clients choose the kinds; all are soon measured again
+            self._per_unit.clear()  # clients can create many kinds; each is soon measured again
         key, measured = (kind, size.bit_length()), seconds / size
         known = self._per_unit.get(key, measured)
-        # One slow measurement must not send all later questions to the thread.
+        # The bound keeps one slow measurement from sending all later questions to the thread.
         self._per_unit[key] = known + _NEWEST * (min(measured, 2 * known) - known)
 
 
@@ -247,33 +255,38 @@ class Threads:
     """The worker threads of a process.
 
     Attributes:
-        drawing: for drawings, shared by all models.
+        drawing: thread that draws scenes, shared by all models.
     """
 
     drawing: Executor = field(default_factory=partial(_one_thread, "drawing"))
     _costly: WeakSet[Executor] = field(default_factory=WeakSet)
 
     def for_model(self) -> Executor:
-        """A thread for the costly questions to one model; it ends when nothing refers to it."""
+        """Create a thread for the costly questions of one model.
+
+        The thread ends when its executor is garbage-collected.
+        """
         executor = _one_thread("costly work")
         self._costly.add(executor)
         return executor
 
     def stop(self) -> None:
-        """Stop them; pending work is dropped."""
+        """Stop the threads and drop pending work."""
         for executor in (self.drawing, *self._costly):
             executor.shutdown(wait=False, cancel_futures=True)
 
 
 @dataclass(eq=False)
 class WorkQueue:
-    """Jobs of one model.
+    """The work of one model.
+
+    A row is one scene, or one scene to draw.
 
     Attributes:
-        limit: most rows (scenes, or drawn scenes) that may wait or be computed.
-        threads: for work that is not cheap.
-        backlog: counts the questions of requests.
-        rows: how many there are now.
+        limit: maximum number of rows that wait or are computed.
+        threads: worker threads for costly work.
+        backlog: the backlog that counts pending questions.
+        rows: current number of rows.
     """
 
     limit: int
@@ -282,24 +295,24 @@ class WorkQueue:
     rows: int = 0
     _costs: _Costs = field(default_factory=_Costs)
     _costly: Executor = field(init=False)
-    # One question of a stream at a time, so that requests wait for one at most.
+    # Questions of streams run one at a time, so that a request waits for at most one of them.
     _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
         self._costly = self.threads.for_model()
 
     def take(self, rows: int) -> None:
-        """Take room for so many rows, until they are given back.
+        """Reserve rows, until `give_back` releases them.
 
         Raises:
-            QueueFullError: there is not enough.
+            QueueFullError: too few rows are free.
         """
         if self.rows + rows > self.limit:
-            raise QueueFullError(f"{self.rows} of {self.limit} rows of this model are taken.")
+            raise QueueFullError(f"{self.rows} of {self.limit} rows of this model are in use.")
         self.rows += rows
 
     def give_back(self, rows: int) -> None:
-        """Give back room that was taken."""
+        """Release reserved rows."""
         self.rows -= rows
 
     async def run(
@@ -311,22 +324,25 @@ class WorkQueue:
         size: int,
         low_priority: bool = False,
     ) -> Done[T]:
-        """Answer a question.
+        """Compute the answer to a question.
 
         Args:
-            call: the work; it may run in another thread.
-            kind: questions of one kind and about one size, at least 1, cost alike.
-            low_priority: of streams; others run between two of them.
+            call: the computation; it may run in another thread.
+            ticket: deadline and client of the request.
+            kind: kind of the question; the expected cost depends on kind and size.
+            size: size of the question, at least 1.
+            low_priority: whether the question belongs to a stream. Other questions can run between
+                two of these.
 
         Raises:
-            DeadlinePassedError: the deadline passed first; the work is dropped, or its result.
-            DisconnectedError: the client has left.
-            Exception: whatever the work raises.
+            DeadlinePassedError: the deadline passed before the result was there.
+            DisconnectedError: the client has disconnected.
+            Exception: any error of `call`.
         """
         came = monotonic()
 
         def measured(_: Callable[[], bool] | None = None) -> Done[T]:
-            # Measured here: after a timeout the request may have ended already.
+            # The cost is measured here, since the request may have ended before the computation.
             began, busy = monotonic(), thread_time()
             result = call()
             done = Done(result, began - came, monotonic() - began, thread_time() - busy)
@@ -355,8 +371,9 @@ class WorkQueue:
         """Draw scenes.
 
         Args:
-            call: the work, for the drawing thread. Its argument says whether the result has been
-                given up; long work asks from time to time.
+            call: the work for the drawing thread. Its argument returns whether the request has
+                ended; long work should call it from time to time.
+            ticket: deadline and client of the request.
 
         Raises:
             DeadlinePassedError, DisconnectedError, Exception: see `run`.
@@ -373,12 +390,16 @@ class WorkQueue:
 
 @asynccontextmanager
 async def _turn(lock: asyncio.Lock, ticket: Ticket) -> AsyncIterator[None]:
-    """Hold the lock for jobs of low priority, if it is free before the deadline."""
+    """Hold the lock for low-priority jobs.
+
+    Raises:
+        DeadlinePassedError: the deadline passed before the lock was free.
+    """
     left = ticket.deadline - monotonic()
     try:
         await asyncio.wait_for(lock.acquire(), left if left < math.inf else None)
     except TimeoutError:
-        raise DeadlinePassedError("The deadline passed before the answer was begun.") from None
+        raise DeadlinePassedError("The deadline passed before the computation started.") from None
     try:
         yield
     finally:
@@ -393,9 +414,9 @@ async def _in_thread(
     given_up = False
 
     def unless_given_up() -> Done[T]:
-        # The thread's own queue holds abandoned work until its turn, and no longer.
+        # Abandoned work stays in the executor's queue, and is skipped here.
         if given_up:
-            raise DeadlinePassedError("given up")
+            raise DeadlinePassedError("The request ended before the computation started.")
         return call(lambda: given_up)
 
     future = asyncio.get_running_loop().run_in_executor(executor, unless_given_up)
@@ -406,11 +427,11 @@ async def _in_thread(
             if future.done():
                 return future.result()
             if left <= _LOOK:
-                raise DeadlinePassedError("The deadline passed before the answer was there.")
+                raise DeadlinePassedError("The deadline passed before the computation finished.")
             await ticket.check_there()
     finally:
         given_up = True
         future.cancel()
-        # The error refers to this frame, and the future to the error: they would keep the whole
-        # request until the collector runs.
+        # The frame, the future and its error form a reference cycle. It would keep the whole
+        # request in memory until the garbage collector runs.
         del future

@@ -1,8 +1,8 @@
-"""What all answers share, as JSON has it.
+"""Answers: the common fields, the limit on their size, and their JSON.
 
-The schemas of `scene_client.schemas` describe the answers: fields in that order, and none that
-would be null. They are made as plain dictionaries, since an answer holds a hundred parts, and to
-make and write each as an object takes twice the time (docs/decisions/http.md).
+The schemas of `scene_client.schemas` describe the answers. Fields have the order of the schema, and
+null fields are left out. Answers are plain dictionaries: objects would take twice the time
+(docs/decisions/http.md).
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from scene_client.schemas import ModelReference, SceneRequest
 
 Answer: TypeAlias = dict[str, Any]
 
-# Bytes of parts of an answer, names aside.
-RELATION_BYTES: Final = 120  # beside its two names
+# Upper bounds in bytes on the parts of an answer, without ids and labels.
+RELATION_BYTES: Final = 120
 CAUSE_BYTES: Final = 60
-OBJECT_BYTES: Final = 200  # missing, or judged
+OBJECT_BYTES: Final = 200  # an entry for one object
 _ENVELOPE_BYTES: Final = 4096
 _WARNING_BYTES: Final = 400
-# Of an id: 128 characters, the most that the contract allows, each of at most four bytes.
+# Bytes of the longest id: 128 characters of at most four bytes each, the quotes and a comma.
 _LONGEST_NAME: Final = 4 * 128 + 3
 
 
 def envelope(
     request: SceneRequest, request_id: str, model: ModelReference, reading: Reading
 ) -> Answer:
-    """See `scene_client.schemas.Answer`."""
+    """The fields that all answers share, see `scene_client.schemas.Answer`."""
     fields: Answer = {"model": model, "request_id": request_id}
     if request.frame_id is not None:
         fields["frame_id"] = request.frame_id
@@ -47,7 +47,7 @@ def envelope(
 
 
 def scene_notes(reading: Reading) -> Answer:
-    """What every answer says of how the scene was read."""
+    """Ignored labels, mapped labels and warnings from reading the scene."""
     return {
         "ignored": list(reading.unknown.ignored),
         "mapped": list(reading.unknown.mapped.values()),
@@ -58,12 +58,12 @@ def scene_notes(reading: Reading) -> Answer:
 def reasons(
     causes: Sequence[questions.Because], ids: Sequence[str], numbered: Iterator[float]
 ) -> list[Answer]:
-    """The objects that an entry names as reasons; their numbers are the next of `numbered`."""
+    """The reasons of one entry; their numbers are the next values of `numbered`."""
     return [{"object": ids[place], "log_odds_change": next(numbered)} for place, _ in causes]
 
 
 def rounded(number: float) -> float:
-    """One number to `DIGITS` significant digits; of many, see `significant`."""
+    """Round one number to `DIGITS` significant digits. Use `significant` for many numbers."""
     return float(f"{number:.{DIGITS}g}")
 
 
@@ -71,13 +71,14 @@ def require_size(size: Callable[[int], int], reading: Reading, limit: int, param
     """Refuse an answer that would be too large.
 
     Args:
-        size: bytes of it beside its envelope, by the bytes of the longest name.
-        reading: of the scene that it is about.
-        limit: bytes that it may have.
-        parameter: what the client can lower.
+        size: function from the bytes of the longest name to the bytes of the answer without its
+            envelope.
+        reading: the scene of the request.
+        limit: maximum size of the answer in bytes.
+        parameter: the request's field that the client can lower.
 
     Raises:
-        RequestError: it is too large.
+        RequestError: the answer would be larger than `limit`.
     """
     longest = max(_LONGEST_NAME, reading.unknown.vocabulary.longest_label + 1)
     if estimated_size(size, reading, longest) <= limit:
@@ -85,15 +86,15 @@ def require_size(size: Callable[[int], int], reading: Reading, limit: int, param
     exact = estimated_size(size, reading, reading.longest_name())
     if exact > limit:
         message = (
-            f"the answer would take up to {exact} bytes, and {limit} are left of "
-            f"SCENE_MAX_ANSWER_BYTES: lower `{parameter}`, send fewer objects, relations or "
-            "scenes, or shorter ids"
+            f"the answer would have up to {exact} bytes; SCENE_MAX_ANSWER_BYTES leaves {limit} "
+            f"bytes for it. Lower `{parameter}`, send fewer objects, relations or scenes, or use "
+            "shorter ids"
         )
         raise RequestError(Reason.ANSWER_TOO_LARGE, [Fault((parameter,), message)])
 
 
 def estimated_size(size: Callable[[int], int], reading: Reading, name: int) -> int:
-    """Bytes of a whole answer whose longest name has so many."""
+    """Bytes of a whole answer whose longest name has `name` bytes."""
     unknown = reading.unknown
     bare = _ENVELOPE_BYTES + size(name)
     if not (unknown.ignored or unknown.mapped or reading.observed or reading.warnings):
@@ -108,20 +109,21 @@ def estimated_size(size: Callable[[int], int], reading: Reading, name: int) -> i
 
 
 def written(answer: Any) -> bytes:
-    """An answer, or a container of answers, as JSON.
+    """Write an answer, or a container of answers, as JSON.
 
     Raises:
-        ValueError: a number in it is not finite.
+        ValueError: a number in the answer is not finite.
     """
     body = orjson.dumps(answer, default=_fields)
     if b"null" not in body:
         return body
-    # A number that is not finite, a field without a value, or a part of a name.
+    # `null` has three possible causes: NaN or infinity, a field without a value, or a name that
+    # contains the text "null".
     body = to_json(answer, inf_nan_mode="constants", exclude_none=True)
     try:
         from_json(body, allow_inf_nan=False)
     except ValueError:
-        raise ValueError("a number of an answer is not finite") from None
+        raise ValueError("an answer contains a number that is not finite") from None
     return body
 
 

@@ -1,4 +1,4 @@
-"""Load models: each verified model answers every question before the first request."""
+"""Warm up models: each verified model answers every question before it gets requests."""
 
 from __future__ import annotations
 
@@ -24,14 +24,9 @@ _logger = logging.getLogger("app.serving")
 def prepare(
     store: ModelSet, new_queue: Callable[[], WorkQueue], previous: ServedModels | None = None
 ) -> ServedModels:
-    """Warm up every verified model: let it answer each question.
+    """Warm up every verified model, and collect the models that can be served.
 
-    A model that ``previous`` serves from the same artifact needs no warm-up and keeps its queue.
-
-    Args:
-        store: snapshot of the registry.
-        new_queue: creates the queue of a model.
-        previous: the models served so far.
+    A model that ``previous`` serves from the same artifact is already warm, and keeps its queue.
     """
     served: dict[Key, ServedModel] = {}
     failures: dict[Key, Failure] = {}
@@ -45,13 +40,13 @@ def prepare(
         try:
             warm_up(artifact)
         except Exception:
-            # An exception of a broken model must not stop the other models.
+            # A broken model may raise any exception; the other models must still be served.
             subject = f"{key[0]}@{key[1]}"
-            _logger.exception("%s failed its warm-up", subject)
+            _logger.exception("the warm-up of model %s failed", subject)
             failures[key] = Failure(
                 subject=subject,
                 reason="warm_up_failed",
-                detail="the files are valid, but the model failed to answer a question",
+                detail="the files are valid, but the model could not answer a question",
             )
         else:
             served[key] = ServedModel(artifact, new_queue())
@@ -59,11 +54,11 @@ def prepare(
 
 
 def warm_up(artifact: Artifact) -> None:
-    """Ask each question with given relations, without relations, and with poses.
+    """Ask each question about three scenes: with relations, without relations, and with poses.
 
     Raises:
-        ValueError: an answer is not finite.
-        Exception: an exception of the model.
+        ValueError: a number of an answer is not finite.
+        Exception: any error of the model.
     """
     related = _scene(artifact.vocabulary)
     bare = replace(related, relations=None)
@@ -71,11 +66,11 @@ def warm_up(artifact: Artifact) -> None:
     scenes = related, bare, posed
     numbers = [number for question in QUESTIONS for number in question.warm_up(artifact, scenes)]
     if not all(map(math.isfinite, significant(numbers))):
-        raise ValueError("an answer of the model is not finite")
+        raise ValueError("the model's answers contain numbers that are not finite")
 
 
 def _scene(vocabulary: Vocabulary) -> Scene:
-    """Return a scene of up to three classes in a row, with one observed relation."""
+    """A row of up to three objects; the third one is on top of the second."""
     proposable = [i for i, entry in enumerate(vocabulary.objects) if not entry.structure]
     objects = tuple(
         SceneObject(str(place), vocabulary.labels[index], index, position=(1.0, 0.5 * place, 0.5))

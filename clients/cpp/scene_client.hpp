@@ -1,10 +1,10 @@
-// A client of the scene-reasoning service for C++17: one header over cpp-httplib and nlohmann/json.
+// C++17 client of the scene-reasoning service: one header, based on cpp-httplib and nlohmann/json.
 //
 //     scene::Client service({"http://127.0.0.1:8000"});
 //     auto answer = service.missing({{"objects", {"bed", "nightstand"}}, {"top_k", 5}});
 //
-// Requests and answers are JSON as in the HTTP contract (docs/clients.md, /openapi.json). A call ends
-// within its timeout whatever happens; only the system's resolution of names cannot be limited.
+// Requests and answers are JSON as in the HTTP contract (docs/clients.md, /openapi.json). Every
+// call ends within its timeout, except that the system's DNS lookup may take longer.
 #pragma once
 
 #ifndef _WIN32
@@ -36,32 +36,32 @@ using Seconds = std::chrono::duration<double>;
 
 // ------------------------------------------------------------------------------------ errors
 
-// A call that has no answer.
+// Base class of all errors of a call.
 struct Error : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-// The request cannot be sent: text that is no UTF-8, a timeout that makes no sense.
+// The client cannot send the request: invalid UTF-8, an invalid URL, or a timeout out of range.
 struct InvalidRequestError : Error {
   using Error::Error;
 };
 
-// No connection, or one that broke; nothing of an answer came.
+// The connection failed, or it broke before a complete answer arrived.
 struct UnreachableError : Error {
   using Error::Error;
 };
 
-// The call's time was over before its answer was there.
+// The timeout of the call passed before the answer arrived.
 struct DeadlineError : Error {
   using Error::Error;
 };
 
-// The service succeeded, and its answer is none that this client can read.
+// The status is 200, but the answer is too long or is not a JSON object.
 struct AnswerError : Error {
   using Error::Error;
 };
 
-// One thing that is wrong with a request.
+// One error in a request.
 struct FieldError {
   std::string pointer;  // JSON pointer into the request, as a URI fragment
   std::string message;
@@ -70,13 +70,13 @@ struct FieldError {
 
 // The service answered with a problem (RFC 9457).
 struct ProblemError : Error {
-  std::string type = "about:blank";  // branch on it: /problems/unknown-labels
+  std::string type = "about:blank";  // identifies the problem: /problems/unknown-labels
   int status = 0;
   std::string title;
   std::string detail;
   std::vector<FieldError> errors;
-  std::string request_id;             // to find it in the service's log
-  std::optional<Seconds> retry_after;  // the service wants to be asked again then
+  std::string request_id;              // id of the request in the service's log
+  std::optional<Seconds> retry_after;  // time to wait before the next attempt
 
   explicit ProblemError(const std::string& what) : Error(what) {}
 };
@@ -85,24 +85,24 @@ struct ProblemError : Error {
 
 struct Options {
   std::string url = "http://127.0.0.1:8000";
-  Seconds timeout{10.0};  // of a whole call, further attempts and pauses included
-  std::string api_key{};  // where the service asks for one
-  int retries = 5;        // after 429, 503 and broken connections, as far as there is time
+  Seconds timeout{10.0};  // for a whole call, including retries and pauses
+  std::string api_key{};  // needed if the service requires a key
+  int retries = 5;        // maximum, after 429, 503 and broken connections, within the timeout
 };
 
-// Asks one service over one connection, which calls share: threads that want to ask at the same
-// time take a client each.
+// Client with one connection to one service. Calls share the connection, so every thread needs a
+// client of its own.
 class Client {
  public:
   explicit Client(Options options = {})
       : options_(std::move(options)), address_(split(options_.url)), http_(address_.server) {
-    if (!http_.is_valid()) throw InvalidRequestError("there is no service at such a URL");
+    if (!http_.is_valid()) throw InvalidRequestError("the URL is invalid");
     http_.set_keep_alive(true);
     http_.set_tcp_nodelay(true);
-    http_.set_decompress(false);  // what is unpacked could be of any size
+    http_.set_decompress(false);  // a decompressed body could have any size
   }
 
-  // The four questions. `timeout` is that of one call; by default the client's.
+  // The four questions. `timeout` limits one call; the default is `Options::timeout`.
   json relations(const json& request, std::optional<Seconds> timeout = {}) {
     return call("POST", "/relations", request, timeout);
   }
@@ -116,7 +116,8 @@ class Client {
     return call("POST", "/generate", request, timeout);
   }
 
-  // The same for many scenes, an array of requests; each has an entry of its own in `results`.
+  // One question about many scenes. `scenes` is an array of requests; each request has its own
+  // entry in `results` of the answer.
   json relations_batch(const json& scenes, std::optional<Seconds> timeout = {}) {
     return call("POST", "/relations/batch", {{"scenes", scenes}}, timeout);
   }
@@ -127,12 +128,12 @@ class Client {
     return call("POST", "/outliers/batch", {{"scenes", scenes}}, timeout);
   }
 
-  // Models, versions and aliases.
+  // List models, versions and aliases.
   json models(std::optional<Seconds> timeout = {}) {
     return call("GET", "/models", nullptr, timeout);
   }
 
-  // Whether the service's default model answers; asked once.
+  // Whether the service's default model can answer. This call has no retries.
   bool is_ready(std::optional<Seconds> timeout = {}) {
     try {
       exchange("GET", "/health/ready", "", timeout.value_or(options_.timeout), 0);
@@ -150,10 +151,10 @@ class Client {
  private:
   struct Address {
     std::string server;  // scheme, host and port
-    std::string prefix;  // path that a proxy strips
+    std::string prefix;  // path of the service behind a proxy
   };
 
-  // What became of one attempt.
+  // Result of one attempt.
   struct Outcome {
     enum { Received, Lost, Late } kind;
     int status = 0;
@@ -163,8 +164,8 @@ class Client {
   };
 
 #ifndef _WIN32
-  // Writing to a connection that has gone raises SIGPIPE, which ends programs that do not expect
-  // it; TLS says goodbye even then. Kept from this thread, and from nobody else.
+  // Blocks SIGPIPE in the current thread. A write to a closed connection raises this signal, which
+  // ends programs that do not handle it. TLS writes even while it closes a broken connection.
   class NoBrokenPipe {
    public:
     NoBrokenPipe() {
@@ -192,8 +193,8 @@ class Client {
   };
 #endif
 
-  // Ends what a client is doing when its time is over. httplib limits each wait on the socket;
-  // a server that sends a byte now and then would keep it for ever.
+  // Stops the HTTP client at the deadline. httplib limits only each wait on the socket, so a server
+  // that sends single bytes slowly could hold a call for ever.
   class Watchdog {
    public:
     Watchdog(httplib::Client& http, Clock::time_point ends)
@@ -216,10 +217,10 @@ class Client {
     std::mutex mutex_;
     std::condition_variable changed_;
     bool done_ = false;
-    std::thread thread_;  // last: it uses the others
+    std::thread thread_;  // declared last: it uses the other members
   };
 
-  static constexpr double kMaxTimeout = 600.0;  // seconds; the service takes no more
+  static constexpr double kMaxTimeout = 600.0;  // seconds; the service's own limit
   static constexpr double kFirstPause = 0.05;
   static constexpr double kLongestPause = 2.0;
   static constexpr std::size_t kMaxAnswer = std::size_t{256} << 20;  // bytes
@@ -246,11 +247,11 @@ class Client {
     const auto received = exchange(method, path, body, limit, options_.retries);
     auto answer = json::parse(received.body, nullptr, /*allow_exceptions=*/false);
     if (!answer.is_object())
-      throw AnswerError("the answer of " + path + " is no JSON object: is this the service?");
+      throw AnswerError("the answer of " + path + " is not a JSON object; check the service's URL");
     return answer;
   }
 
-  // Everything from a call to its answer: attempts, and pauses between them, until the deadline.
+  // Sends a request, with retries and pauses, until it has an answer or the deadline has passed.
   Outcome exchange(const char* method, const std::string& path, const std::string& body,
                    Seconds timeout, int retries) {
     if (!(timeout.count() >= 1e-3 && timeout.count() <= kMaxTimeout))
@@ -260,7 +261,7 @@ class Client {
       const Seconds left = ends - Clock::now();
       if (left.count() <= 0) throw DeadlineError("no answer in time");
       auto outcome = send(method, path, body, ends, left);
-      // An answer that is complete only now is none: whoever named a deadline has gone on without.
+      // A valid answer after the deadline is an error, too: the caller relies on the deadline.
       const bool fine = outcome.kind == Outcome::Received && outcome.status == 200;
       if (outcome.kind == Outcome::Late || (fine && Clock::now() >= ends))
         throw DeadlineError("no answer in time");
@@ -272,7 +273,7 @@ class Client {
         problem = problem_of(outcome);
         if (problem->status == 504) throw DeadlineError(problem->what());
         if (problem->status != 429 && problem->status != 503) throw *problem;
-        // Never earlier than asked, and not all at once.
+        // The random pause comes on top of Retry-After, so that clients do not retry all at once.
         if (problem->retry_after) pause += *problem->retry_after;
       }
       if (attempt >= retries || pause >= ends - Clock::now()) {
@@ -314,7 +315,7 @@ class Client {
     }();
     if (outcome.body.size() > kMaxAnswer) throw AnswerError("the answer is too long");
     if (!result) {
-      // A millisecond early is late all the same: nothing can be done with it.
+      // Less than 1 ms before the deadline counts as late: it is too short for a retry.
       const bool late = Clock::now() + std::chrono::milliseconds(1) >= ends;
       outcome.kind = late ? Outcome::Late : Outcome::Lost;
       outcome.reason = httplib::to_string(result.error());
@@ -325,7 +326,7 @@ class Client {
     return outcome;
   }
 
-  // Doubling, capped, and each client's own.
+  // Random pause; its maximum doubles with each attempt, up to kLongestPause seconds.
   Seconds pause_after(int attempt) {
     const double longest = std::min(kLongestPause, kFirstPause * std::pow(2.0, attempt));
     return Seconds(std::uniform_real_distribution<double>(0.0, longest)(random_));
@@ -335,7 +336,7 @@ class Client {
     const auto found = headers.find("Retry-After");
     if (found == headers.end()) return std::nullopt;
     const auto& text = found->second;
-    // The service says seconds; of a date, which a proxy may say, nothing is made.
+    // The service sends seconds. A proxy may send a date, which is ignored.
     if (text.empty() || text.size() > 6 || text.find_first_not_of("0123456789") != text.npos)
       return std::nullopt;
     return Seconds(std::stod(text));
@@ -347,7 +348,7 @@ class Client {
   }
 
   static ProblemError problem_of(const Outcome& outcome) {
-    // Of a proxy, or of something else altogether, it is no problem document.
+    // A proxy or another server may send a body that is not a problem document.
     auto document = json::parse(outcome.body, nullptr, /*allow_exceptions=*/false);
     if (!document.is_object()) document = json::object();
     std::vector<FieldError> errors;

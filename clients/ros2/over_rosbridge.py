@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Ask about what a robot sees from any machine, without ROS: detections come over rosbridge.
+"""Ask the service about a robot's detections, which arrive over rosbridge. ROS is not needed.
 
     python clients/ros2/over_rosbridge.py ws://robot:9090 /detections_3d
 
-prints one line of JSON for each message that it could ask about. Messages that come while a
-question is in flight are dropped but for the newest. What cannot be asked about is said on
-standard error, and so is what the bridge complains of. It ends when there is no bridge, or no
-longer, with 1: whoever supervises it starts it again.
+The program prints each answer as one line of JSON. While a question is in progress, only the newest
+message is kept. Errors, and the bridge's own errors and warnings, go to standard error. The exit
+status is 1 if the bridge cannot be reached or closes the connection, so that a supervisor can
+restart the program.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ MAX_MESSAGE = 2**24  # bytes
 
 
 def complain(words: str) -> None:
-    """Say on standard error what went wrong, in a line."""
+    """Write an error to standard error, as one line."""
     print(" ".join(words.split()), file=sys.stderr, flush=True)
 
 
 def read(frame: str | bytes) -> dict[str, Any]:
-    """What the bridge says; nothing where that is no JSON object, as of a bridge that packs it."""
+    """Parse a message of the bridge; an empty dictionary if it is not a JSON object."""
     try:
         said = json.loads(frame) if isinstance(frame, str) else None
     except (ValueError, RecursionError):
@@ -48,10 +48,10 @@ def read(frame: str | bytes) -> dict[str, Any]:
 
 
 def messages(socket: ClientConnection, topic: str) -> Iterator[Any]:
-    """What comes on a topic, until the bridge hangs up; of what waits only the newest.
+    """Iterate over the messages of a topic. Of several waiting messages, only the newest is kept.
 
     Raises:
-        ConnectionClosed: it did.
+        ConnectionClosed: the bridge closed the connection.
     """
     socket.send(json.dumps({"op": "subscribe", "topic": topic, "queue_length": 1}))
     end = None
@@ -74,7 +74,7 @@ def messages(socket: ClientConnection, topic: str) -> Iterator[Any]:
 def answer_each(
     bridge: str, topic: str, ask: Callable[..., Any], label_map: str | None, say: Callable[..., Any]
 ) -> NoReturn:
-    """Ask about the newest message, again and again; a question without an answer is reported."""
+    """Ask about each newest message until the connection ends; report failed questions."""
     try:
         socket = connect(bridge, max_size=MAX_MESSAGE)
     except (OSError, WebSocketException, ValueError) as error:
@@ -100,7 +100,7 @@ def main() -> None:
     arguments.add_argument("topic", help="vision_msgs/Detection3DArray or Detection2DArray")
     arguments.add_argument("--service", default="http://127.0.0.1:8000")
     arguments.add_argument("--question", default="missing", choices=["missing", "outliers"])
-    arguments.add_argument("--label-map", help="coco, where class ids are COCO's numbers")
+    arguments.add_argument("--label-map", help="coco, if the class ids are COCO numbers")
     given = arguments.parse_args()
     try:
         client = Client(given.service, timeout=1.0)

@@ -1,4 +1,4 @@
-"""The OpenAPI document as a generator of requests, and what its answers are checked for."""
+"""Generate requests from the OpenAPI document, and check the answers."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _FORMS: dict[str, type[BaseModel]] = {
     "/models/aliases/{alias}": schemas.AliasRequest,
 }
 _UNKNOWN_HEADER = "x-schemathesis-unknown-property"
-# JSON Schema has no words for them; descriptions and messages say what is meant.
+# Types of validation errors for constraints that JSON Schema cannot express.
 _BEYOND_SCHEMAS = {"plain_text", "unit_quaternion"}
 
 
 def documented(examples: int) -> Any:
-    """The document, from which tests are made before there is a service.
+    """The OpenAPI document as a schemathesis schema.
 
-    It does not depend on the store.
+    It does not depend on the store, so tests can be collected before the service starts.
 
     Args:
-        examples: how many requests of each kind are drawn for an operation, beside those that go
-            through its schema place by place.
+        examples: number of random requests of each kind for an operation, besides the systematic
+            requests for each part of its schema.
     """
     positive = ["2xx", "3xx", "401", "403", "404", "409", "429", "5xx"]
     negative = ["400", "401", "404", "405", "413", "415", "422"]
@@ -42,15 +42,15 @@ def documented(examples: int) -> Any:
             {
                 "seed": 1,
                 "generation": {"deterministic": True, "database": "none", "max-examples": examples},
-                # No schema knows a model's vocabulary, or which objects a scene has: a request of
-                # the right form may still make no sense. `form_is_as_documented` tells them apart.
-                # A deadline of two milliseconds, which the header allows, may pass.
+                # The schema does not contain a model's vocabulary or the ids of a scene. So a
+                # request that fits the schema may get 422; `form_is_as_documented` checks the
+                # reason. 504 is valid too, since a request may have a deadline of 2 ms.
                 "checks": {
                     "positive_data_acceptance": {"expected-statuses": [*positive, "422"]},
                     "not_a_server_error": {"expected-statuses": ["2xx", "3xx", "4xx", "504"]},
                 },
-                # A bad scene spoils its own entry of a batch, whose status is 200 all the same:
-                # `bad_scenes_have_problems` looks into it.
+                # A batch with an invalid scene has status 200; only the scene's entry has a
+                # problem. `bad_scenes_have_problems` checks the entries.
                 "operations": [
                     {
                         "include-path-regex": "/batch$",
@@ -65,7 +65,7 @@ def documented(examples: int) -> Any:
 
 
 def form_is_as_documented(_: Any, response: Any, case: Any) -> None:
-    """What the document allows is refused for its sense alone."""
+    """A request that fits the schema is refused only for a reason outside the schema."""
     if response.status_code != 422 or not case.meta.generation.mode.is_positive:
         return
     form = _FORMS[case.operation.path]
@@ -81,12 +81,12 @@ def form_is_as_documented(_: Any, response: Any, case: Any) -> None:
 
 
 def _is_whole(fault: Any) -> bool:
-    """1.0 is an integer to JSON Schema, and no count to the service."""
+    """Whether the input is a float such as 1.0, which JSON Schema accepts as an integer."""
     return fault["type"] == "int_type" and isinstance(fault["input"], float)
 
 
 def bad_scenes_have_problems(_: Any, response: Any, case: Any) -> None:
-    """A batch that violates its schema has an entry that says so."""
+    """A batch that violates its schema has an entry with a problem."""
     if response.status_code != 200 or not case.operation.path.endswith("/batch"):
         return
     results = json.loads(response.content)["results"]
@@ -98,13 +98,13 @@ def bad_scenes_have_problems(_: Any, response: Any, case: Any) -> None:
 
 
 def call(case: schemathesis.Case, service: LiveService, session: requests.Session) -> None:
-    """Send one request and check the answer with every check there is."""
+    """Send one request and run all checks on the answer."""
     if _UNKNOWN_HEADER in (case.headers or {}):
-        return  # no violation: fields that are not known are to be ignored (RFC 9110, section 5.1)
+        return  # a valid request: servers ignore unknown header fields (RFC 9110, section 5.1)
     case.call_and_validate(
         f"http://127.0.0.1:{service.port}",
         session,
-        # Given here, it is taken for a valid key: checks take it away, and put others in its place.
+        # schemathesis takes this key as valid; its checks remove the key or replace it.
         {"X-Admin-Key": ADMIN_KEY},
         additional_checks=[form_is_as_documented, bad_scenes_have_problems],
     )

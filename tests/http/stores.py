@@ -1,4 +1,4 @@
-"""Stores of small untrained machines with random weights: real artifacts, read as any other."""
+"""Model stores for tests: real artifacts of small machines with random weights."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ SPECS = {
 
 
 def random_machine(variant: str, seed: int = 0, classes: int = V) -> BoltzmannMachine:
-    """A machine whose every weight is drawn from N(0, 0.5²), for the first ``classes`` classes."""
+    """A machine for the first ``classes`` classes, with all weights drawn from N(0, 0.5²)."""
     generator = torch.Generator().manual_seed(seed)
     triples = TRIPLES[(TRIPLES[:, 1:] < classes).all(dim=1)]
     machine = build(replace(SPECS[variant], V=classes, T=len(triples))).set_triples(triples)
@@ -73,7 +73,7 @@ def publish(
     alias: str | None = None,
     offsets: Offsets | None = None,
 ) -> None:
-    """Publish a random machine, which knows the first ``classes`` classes."""
+    """Publish a machine with random weights for the first ``classes`` classes."""
     machine = random_machine(variant, seed, classes)
     vocabulary = Vocabulary(VOCABULARY.objects[:classes], VOCABULARY.room_types)
     Store(root).publish(
@@ -108,7 +108,7 @@ def publish(
 
 
 def make_store(root: Path) -> Path:
-    """home 1.0.0 (the default) and 1.1.0 (candidate), and an RBM and a GBM beside them."""
+    """Make a store with home 1.0.0 (default), home 1.1.0 (candidate), an RBM and a GBM."""
     publish(root, "home", "1.0.0", alias="default")
     publish(root, "home", "1.1.0", seed=1, alias="candidate")
     publish(root, "plain", "1.0.0", variant="rbm")
@@ -117,7 +117,7 @@ def make_store(root: Path) -> Path:
 
 
 def corrupt(root: Path, name: str, version: str) -> None:
-    """Change one byte of the weights."""
+    """Change one byte of a version's weights file."""
     weights = root / name / version / "model.safetensors"
     data = bytearray(weights.read_bytes())
     data[-1] ^= 0x40

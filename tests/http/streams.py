@@ -1,4 +1,4 @@
-"""Streams for tests: raw messages over a socket, and scenes that change step by step."""
+"""Helpers for tests of `/stream`: raw WebSocket messages, and random updates of a scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ASK: dict[str, Any] = {
 
 
 def opened(service: LiveService, **arguments: Any) -> AbstractContextManager[ClientConnection]:
-    """A WebSocket to a service."""
+    """Open a WebSocket to a service."""
     address = f"ws://127.0.0.1:{service.port}/stream"
     return connect(address, proxy=None, compression=None, **arguments)
 
@@ -35,19 +35,19 @@ def say(stream: ClientConnection, kind: str, **fields: Any) -> None:
 
 
 def hear(stream: ClientConnection) -> dict[str, Any]:
-    """The next message."""
+    """Receive the next message."""
     found: dict[str, Any] = json.loads(stream.recv(timeout=30))
     return found
 
 
 def talk(stream: ClientConnection, kind: str, **fields: Any) -> dict[str, Any]:
-    """Send one message, and hear what the service has to say."""
+    """Send one message, and receive the next one."""
     say(stream, kind, **fields)
     return hear(stream)
 
 
 def posted(client: httpx.Client, scene: dict[str, Any], ask: dict[str, Any]) -> dict[str, Any]:
-    """The answers to one request of each kind about a scene, by question."""
+    """Send one request per question about a scene, and return the answers by question."""
     found = {}
     for question, options in ask.items():
         response = client.post(f"/{question}", json={**scene, **options})
@@ -57,7 +57,7 @@ def posted(client: httpx.Client, scene: dict[str, Any], ask: dict[str, Any]) -> 
 
 
 def answered(message: dict[str, Any]) -> dict[str, Any]:
-    """The answers of a message of a stream, by question."""
+    """The answers in a message of the stream, by question."""
     assert message["type"] == "answer", message
     assert "problems" not in message
     questions = message.keys() - {"type", "seq", "superseded"}
@@ -65,21 +65,21 @@ def answered(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_problem(message: dict[str, Any], status: int, slug: str, seq: int | None = None) -> None:
-    """Check a message for a problem."""
+    """Check that a message is the expected problem."""
     assert message["type"] == "problem", message
     assert message.get("seq") == seq
     is_document(message["problem"], status, slug)
 
 
 def is_document(document: dict[str, Any], status: int, slug: str) -> None:
-    """Check a problem in a message or a refusal."""
+    """Check that a problem document has the expected type and status, and a request id."""
     assert document["type"] == f"/problems/{slug}"
     assert document["status"] == status
     assert document["request_id"]
 
 
 def closed(stream: Any) -> tuple[int, str]:
-    """How a stream was closed; what was still sent is read."""
+    """Read a stream until it closes, and return the close code and reason."""
     try:
         while True:
             stream.recv(timeout=30)
@@ -88,7 +88,7 @@ def closed(stream: Any) -> tuple[int, str]:
 
 
 def updates(count: int, seed: int, *, poses: bool = True) -> Iterator[tuple[dict, dict]]:
-    """Random updates of a room of up to twenty things, each with the scene that it leads to."""
+    """Random updates of a room of up to 20 objects, each with the resulting scene."""
     draw = random.Random(seed)
     objects: dict[str, dict[str, Any]] = {}
     scene: dict[str, Any] = {}

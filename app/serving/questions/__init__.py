@@ -1,6 +1,6 @@
-"""The questions that the service answers: each module reads a request, asks the model, and answers.
+"""The questions of the service. Each module reads a request, calls the model and builds the answer.
 
-A new question is a module here and an entry in `QUESTIONS`.
+To add a question, add a module to this package and an entry to `QUESTIONS`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,6 @@ from app.serving.questions.question import Question
 from app.serving.questions.relations import RELATIONS
 
 QUESTIONS: Final[tuple[Question[Any], ...]] = (RELATIONS, MISSING, OUTLIERS, GENERATE)
-"""In the order of the documentation."""
+"""All questions, in the order of the documentation."""
 
 __all__ = ["QUESTIONS", "Question"]

@@ -1,4 +1,4 @@
-"""What would a scene like this look like?"""
+"""The route of the question `generate`."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from app.serving.request import Request
 from scene_client.schemas import GenerateAnswer, GenerateRequest
 
 DRAWN_SEED_BITS = 53
-"""Every JSON reader can hand such a seed back: a double holds it exactly."""
+"""A double holds a seed of this size exactly, so every JSON reader can send it back unchanged."""
 
-_WARM_UP_STEPS: Final = 1  # more Gibbs sweeps warm nothing further
-_UNIT_BYTES = 12  # the number of a hidden unit
+_WARM_UP_STEPS: Final = 1  # one Gibbs sweep compiles all loops
+_UNIT_BYTES = 12  # for the number of one hidden unit
 
 
 async def generate(request: Request, asked: GenerateRequest) -> Answer:
-    """Scenes drawn from the model that contain the evidence; the same seed draws the same ones."""
+    """Draw scenes that contain the evidence. The same seed draws the same scenes."""
     model, reading = request.read(asked, may_be_empty=True)
     _check_context(asked, model)
     seed = secrets.randbits(DRAWN_SEED_BITS) if asked.seed is None else asked.seed
@@ -105,16 +105,16 @@ def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
 _EXAMPLES: Final = {
     "room": Example("a bedroom", {"room_type": "bedroom", "count": 2, "seed": 7}),
     "evidence": Example(
-        "scenes that hold these objects and this relation",
+        "scenes that contain these objects and this relation",
         {**BEDROOM, "count": 2, "seed": 7},
     ),
-    "poses": Example("scenes around what the robot sees", {**POSES, "seed": 7}),
+    "poses": Example("scenes around the objects that the robot sees", {**POSES, "seed": 7}),
     "context": Example(
-        "hidden units held on, as GET /models/{name}/contexts shows them",
+        "hidden units held on (GET /models/{name}/contexts lists the units)",
         {"context": {"h1": [0, 3]}, "seed": 7},
     ),
     "varied": Example(
-        "longer and hotter chains: more varied scenes",
+        "more Gibbs steps and a higher temperature, for more varied scenes",
         {"objects": ["desk"], "steps": 100, "temperature": 1.5, "count": 4, "seed": 7},
     ),
     **REFUSED,

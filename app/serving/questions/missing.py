@@ -1,4 +1,4 @@
-"""What else should be here, and where?"""
+"""The route of the question `missing`."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ _OFFSET_BYTES = 250
 
 
 async def missing(request: Request, asked: MissingRequest) -> Answer:
-    """The likeliest absent objects, and where each would stand.
+    """Rank the classes that the scene does not list, likeliest first, with their likeliest places.
 
-    A class that is present is never proposed again: how many chairs a table wants is outside the
-    models.
+    Listed classes are never proposed: the models do not estimate the number of instances of a
+    class.
     """
     model, reading = request.read(asked)
     faults = Faults()
-    # The default is for vocabularies of any size; a client's own number is never cut silently.
+    # The default may exceed the vocabulary's size. A number from the client must not.
     if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
-        message = f"must not be above {len(model.vocabulary)}, the size of the model's vocabulary"
+        message = f"must be at most {len(model.vocabulary)}, the size of the model's vocabulary"
         faults.add(Reason.INVALID, ("top_k",), message)
     candidates = at = None
     if asked.candidates is not None:
@@ -99,7 +99,7 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
 def _candidates(
     labels: list[str], model: ServedModel, reading: Reading, faults: Faults
 ) -> list[int]:
-    """Classes to rank."""
+    """Class indices of the candidate labels."""
     indices: dict[int, None] = {}
     for place, label in enumerate(labels):
         index = model.vocabulary.index(label)
@@ -121,7 +121,7 @@ def _place(
 
 
 def _axes(asked: MissingRequest) -> Axes | None:
-    """The viewer's axes, in the frame that offsets are answered in."""
+    """The viewer's axes in the frame of the offsets; None if the viewing direction is unknown."""
     if asked.frame_id is None and asked.viewpoint is None:
         return VIEWER
     return viewer_axes(asked.frame_id, None if asked.viewpoint is None else asked.viewpoint.yaw)
@@ -160,20 +160,20 @@ def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
 _EXAMPLES: Final = {
     **SCENES,
     "at": Example(
-        "what is missing from the desk?",
+        "objects that are missing on the desk",
         {"objects": ["desk", "chair"], "at": {"relation": "on-top", "object": "desk"}},
     ),
     "coverage": Example(
-        "the whole scene is listed: what is not listed is absent",
+        "complete list: unlisted classes count as absent",
         {**LABELS, "coverage": 1.0},
     ),
     "candidates": Example(
-        "which of these is missing?",
+        "only these candidates",
         {**LABELS, "candidates": ["pillow", "sink", "toilet"], "top_k": 3},
     ),
     **REFUSED,
     "invalid-request": Example(
-        "a place that is not in the scene",
+        "a place at an object that is not in the scene",
         {**LABELS, "at": {"relation": "on-top", "object": "desk"}},
         "invalid-request",
     ),

@@ -1,4 +1,4 @@
-"""What does not belong here, or stands in the wrong place?"""
+"""The route of the question `outliers`."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ from scene_client.schemas import OutliersAnswer, OutliersRequest
 
 
 async def outliers(request: Request, asked: OutliersRequest) -> Answer:
-    """Every object, least fitting first, and every given relation, least likely first.
+    """Judge every object, least fitting first, and every stated relation, least likely first.
 
-    Instances of one class are scored alike; only `misplaced` tells them apart.
+    In `outliers`, all instances of a class have the same probability. `misplaced` judges each
+    relation of each instance.
     """
     model, reading = request.read(asked)
     found = await request.ask(
@@ -88,7 +89,7 @@ def _size(found: questions.OutliersFound) -> Callable[[int], int]:
 
 
 def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Answer:
-    """A canonical relation as the request spelled it."""
+    """Express a canonical relation with the subject and object of the request."""
     ids = reading.ids
     if (CANONICAL.index(relation), subject, object_) in reading.flipped:
         subject, relation, object_ = object_, opposite(relation), subject
@@ -96,7 +97,7 @@ def _spelled(subject: int, relation: str, object_: int, reading: Reading) -> Ans
 
 
 def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
-    # With threshold 0 every object is an outlier: reasons and companions are computed, too.
+    # With threshold 0 every object is an outlier, so companions are computed, too.
     _, found, misplaced = questions.outliers(artifact, scenes[0], threshold=0.0)
     for scene in scenes[1:]:
         found += questions.outliers(artifact, scene).outliers
@@ -118,11 +119,11 @@ _EXAMPLES: Final = {
         },
     ),
     "sensitivity": Example(
-        "alarms more readily",
+        "high sensitivity: a lower threshold",
         {**WITH_TOILET, "sensitivity": "high"},
     ),
     "threshold": Example(
-        "a threshold of one's own",
+        "a threshold set by the client",
         {**WITH_TOILET, "threshold": 0.5},
     ),
     **REFUSED,

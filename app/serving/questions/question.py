@@ -1,4 +1,4 @@
-"""What the service knows of each question: its function, its schemas, its worked examples."""
+"""The record of a question: its function, its schemas and its worked examples."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Example:
     """A worked example for the documentation.
 
     Attributes:
-        summary: its line in the list of examples.
+        summary: title of the example.
         value: the request body.
-        problem: slug of the problem that refuses the request; None where it is answered.
+        problem: slug of the problem in the response; None if the request is valid.
     """
 
     summary: str
@@ -36,15 +36,15 @@ class Question(Generic[RequestT]):
     """One question about a scene. Routes, documentation, warm-up and metrics use this record.
 
     Attributes:
-        answer: answers a request; its name is the name of the question, and its docstring
-            describes the route. Raises what `Request.read` and `Request.ask` raise, and
-            `RequestError` where the answer would be too large.
-        warm_up: asks a model about scenes and returns the numbers of the answers. The first call of
-            a compiled loop compiles it, so every loop must be called here.
+        answer: function that answers a request. Its name is the name of the question. Its docstring
+            is the description of the route. It raises the errors of `Request.read` and
+            `Request.ask`, and `RequestError` if the answer would be too large.
+        warm_up: function that asks a model about scenes and returns the numbers of the answers. It
+            must call every compiled loop of the question, since the first call compiles the loop.
         request, response: schemas of the HTTP contract.
-        examples: by name; the default model knows their labels.
+        examples: examples by name; the default model knows their labels.
         example_answer: an answer with illustrative figures, without its envelope.
-        has_batch: whether the question can be asked about many scenes at once.
+        has_batch: whether one request can ask the question about many scenes.
     """
 
     answer: Callable[[Request, RequestT], Awaitable[Answer]]
@@ -57,22 +57,22 @@ class Question(Generic[RequestT]):
 
     @property
     def name(self) -> str:
-        """The name of the question, as in its address."""
+        """The name of the question, which is also its path."""
         return self.answer.__name__
 
     @property
     def summary(self) -> str:
-        """The question in words."""
+        """Summary of the route."""
         return getdoc(self.request) or ""
 
     @property
     def description(self) -> str:
-        """The answer in words."""
+        """Description of the route."""
         return getdoc(self.answer) or ""
 
     @property
     def empty_answer(self) -> Answer:
-        """The lists of an answer, without entries."""
+        """An answer with empty lists, without its envelope."""
         return {name: [] for name, part in self.example_answer.items() if isinstance(part, list)}
 
 
@@ -125,21 +125,21 @@ _MAP: Final[dict[str, Any]] = {
     "viewpoint": {"x": 0.0, "y": 0.0, "yaw": 0.0},
 }
 SCENES: Final[dict[str, Example]] = {
-    "labels": Example("labels alone", LABELS),
-    "relations": Example("ids, a confidence, a given relation, the room type", BEDROOM),
-    "poses": Example("poses, from which relations are derived", POSES),
+    "labels": Example("labels only", LABELS),
+    "relations": Example("ids, a confidence, a stated relation, the room type", BEDROOM),
+    "poses": Example("poses; the service derives the relations", POSES),
     "camera": Example("poses in a camera's optical frame, without sizes", _CAMERA),
     "map": Example("poses in a map, seen from a viewpoint", _MAP),
     "ignore": Example(
-        "without the labels that the model does not know",
+        "unknown labels are ignored",
         {"objects": ["bed", "nightstand", "flux capacitor"], "unknown_labels": "ignore"},
     ),
     "nearest": Example(
-        "unknown labels mapped to the nearest class",
+        "unknown labels are mapped to the nearest class",
         {"objects": ["bed", "nigthstand", "big lamp"], "unknown_labels": "nearest"},
     ),
 }
-"""Examples that every question about listed objects answers."""
+"""Valid examples for every question that needs a list of objects."""
 
 REFUSED: Final[dict[str, Example]] = {
     "unknown-labels": Example(
@@ -148,7 +148,7 @@ REFUSED: Final[dict[str, Example]] = {
         "unknown-labels",
     ),
     "contradictory-evidence": Example(
-        "a scene that contradicts itself",
+        "two relations that contradict each other",
         {
             "objects": ["bed", "lamp"],
             "relations": [
@@ -159,17 +159,17 @@ REFUSED: Final[dict[str, Example]] = {
         "contradictory-evidence",
     ),
     "model-not-found": Example(
-        "a model that is not there", {**LABELS, "model": "nobody@9.9.9"}, "model-not-found"
+        "a model that does not exist", {**LABELS, "model": "nobody@9.9.9"}, "model-not-found"
     ),
 }
-"""Examples that every question refuses."""
+"""Invalid examples for every question."""
 
 BATCH: Final[dict[str, Example]] = {
     "scenes": Example("two scenes", {"scenes": [LABELS, BEDROOM]}),
     "bad-entry": Example(
-        "a bad scene spoils its own entry alone",
+        "an invalid scene: only its own entry fails",
         {"scenes": [LABELS | {"room_type": "bedroom"}, {"objects": ["desk", "nigthstand"]}]},
     ),
-    "empty": Example("no scene at all", {"scenes": []}, "invalid-request"),
+    "empty": Example("an empty list of scenes", {"scenes": []}, "invalid-request"),
 }
-"""Examples of every batch."""
+"""Examples for every batch route."""

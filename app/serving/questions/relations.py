@@ -1,4 +1,4 @@
-"""How do these objects stand to each other?"""
+"""The route of the question `relations`."""
 
 from __future__ import annotations
 
@@ -26,14 +26,17 @@ from scene_client.schemas import RelationsAnswer, RelationsRequest
 
 
 async def relations(request: Request, asked: RelationsRequest) -> Answer:
-    """The likeliest relations between the objects of a scene, best first."""
+    """Rank the relations between the objects of a scene, likeliest first, and list disagreements.
+
+    A disagreement is a pair of objects with another relation than the rest of the scene suggests.
+    """
     model, reading = request.read(asked)
     found, disagreements = await request.ask(
         model,
         questions.relations,
         reading.scene,
         top_k=asked.top_k,
-        # A little lower: the rounded probability decides which relations are left out.
+        # Slightly lower: the final comparison below uses rounded probabilities.
         min_probability=asked.min_probability * (1 - 1e-5),
         pairs=None if asked.pairs is None else _pairs(asked, reading),
         include_opposites=asked.include_opposites,
@@ -70,7 +73,7 @@ def _pairs(asked: RelationsRequest, reading: Reading) -> list[tuple[int, int]]:
         if subject is None or other is None:
             continue
         if subject == other:
-            faults.add(Reason.INVALID, location, "a pair needs two objects")
+            faults.add(Reason.INVALID, location, "subject and object must be two different objects")
             continue
         pairs[subject, other] = None
     faults.raise_any()
@@ -85,10 +88,11 @@ def _size(
 
 
 def _disagreement(entry: questions.Disagreement, reading: Reading) -> Answer:
-    """A disagreement from the end that the request spelled its relation from."""
+    """A disagreement with the subject and object of the request's relation."""
     subject, object_, observed, expected, probability, observed_probability = entry
     triples = {canonicalise(subject, relation, object_) for relation in observed}
-    # Canonical triples of the pair from this end are flipped if the request spelled the other end.
+    # For each observed relation: whether the request states it with this subject. `flipped` holds
+    # the canonical triples that the request states by their opposite.
     from_here = {(triple[1] == subject) != (triple in reading.flipped) for triple in triples}
     if from_here == {False} and reading.flipped:
         subject, object_ = object_, subject
@@ -112,7 +116,7 @@ def _warm_up(artifact: Artifact, scenes: tuple[Scene, ...]) -> list[float]:
 _EXAMPLES: Final = {
     **SCENES,
     "instances": Example(
-        "two of a class, told apart by their ids",
+        "two instances of one class",
         {"objects": ["chair", "chair", "desk"], "top_k": 10},
     ),
     "pairs": Example(
@@ -124,12 +128,12 @@ _EXAMPLES: Final = {
         },
     ),
     "likely": Example(
-        "what is likelier than not, all unlisted relations known not to hold",
+        "relations with p of at least 0.5; unlisted relations do not hold",
         {**BEDROOM, "relations_complete": True, "min_probability": 0.5},
     ),
     **REFUSED,
     "invalid-request": Example(
-        "a pair that is not in the scene",
+        "a pair with an object that is not in the scene",
         {**LABELS, "pairs": [{"subject": "lamp", "object": "desk"}]},
         "invalid-request",
     ),

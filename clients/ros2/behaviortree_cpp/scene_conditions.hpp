@@ -1,4 +1,4 @@
-// Conditions for BehaviorTree.CPP 4 (and so for Nav2): is something missing, does something belong?
+// Conditions for BehaviorTree.CPP 4, which Nav2 uses: SceneComplete and ObjectBelongs.
 //
 //     scene::Options service{"http://127.0.0.1:8000", scene::Seconds(0.5)};
 //     factory.registerNodeType<SceneComplete>("SceneComplete", service);
@@ -7,9 +7,10 @@
 //     <SceneComplete scene="{scene}" because="{why}"/>
 //     <ObjectBelongs scene="{scene}" object="cup_1"/>
 //
-// `scene` is a request as JSON text (docs/robots.md). A condition asks when it is first ticked, in a
-// thread of its own, and is RUNNING until the answer is there: no tick waits. It fails where nothing
-// was seen or no answer came; `because` says why. The client's timeout bounds how long that takes.
+// `scene` is a request as JSON text (docs/robots.md). The first tick of a condition starts a
+// question in a separate thread. The condition is RUNNING until the answer arrives, so a tick never
+// waits. A condition fails if the scene has no objects, or if no answer arrives within the client's
+// timeout. `because` gives the reason.
 #pragma once
 
 #include <behaviortree_cpp/action_node.h>
@@ -23,7 +24,7 @@
 
 #include "scene_client.hpp"
 
-// Conditions of BehaviorTree.CPP must not be RUNNING, so these are actions in its sense.
+// A BT::ConditionNode must not return RUNNING, so the base class is an action node.
 class SceneCondition : public BT::StatefulActionNode {
  public:
   using Question = scene::json (scene::Client::*)(const scene::json&, std::optional<scene::Seconds>);
@@ -35,7 +36,7 @@ class SceneCondition : public BT::StatefulActionNode {
         question_(question),
         thread_([this] { answer_each(); }) {}
 
-  // Waits for a question in flight, which ends within the client's timeout.
+  // Waits for the question in progress, which ends within the client's timeout.
   ~SceneCondition() override {
     {
       std::lock_guard<std::mutex> lock(mutex_);
@@ -75,7 +76,7 @@ class SceneCondition : public BT::StatefulActionNode {
     }
   }
 
-  // Nobody reads the answer any more: the next question's takes its place.
+  // The new number makes the thread discard the answer of the question in progress.
   void onHalted() override {
     std::lock_guard<std::mutex> lock(mutex_);
     ++asked_;
@@ -84,12 +85,12 @@ class SceneCondition : public BT::StatefulActionNode {
 
  protected:
   static BT::PortsList ports(BT::PortsList own) {
-    own.insert(BT::InputPort<std::string>("scene", "a request, as JSON"));
-    own.insert(BT::OutputPort<std::string>("because", "why it holds, or does not"));
+    own.insert(BT::InputPort<std::string>("scene", "the request as JSON text"));
+    own.insert(BT::OutputPort<std::string>("because", "the reason for the result"));
     return own;
   }
 
-  // Whether the condition holds, and why.
+  // Whether the condition holds, and the reason.
   virtual std::pair<bool, std::string> judge(const scene::json& answer) = 0;
 
  private:
@@ -115,10 +116,10 @@ class SceneCondition : public BT::StatefulActionNode {
         error = problem.what();
       }
       lock.lock();
-      if (asked != asked_) continue;  // halted meanwhile
+      if (asked != asked_) continue;  // the condition was halted in the meantime
       answer_ = std::move(answer);
       error_ = std::move(error);
-      emitWakeUpSignal();  // the tree need not sleep on
+      emitWakeUpSignal();  // end the tree's sleep early
     }
   }
 
@@ -131,11 +132,11 @@ class SceneCondition : public BT::StatefulActionNode {
   std::optional<scene::json> waiting_;
   std::optional<scene::json> answer_;
   std::string error_;
-  std::thread thread_;  // last: it uses the others
+  std::thread thread_;  // declared last: it uses the other members
 };
 
-// SUCCESS as long as nothing is missing that is rather there than not: the log-odds of presence
-// against absence from which on a thing counts as missing are 0, which is even, unless told.
+// SUCCESS if every unlisted object has log-odds of presence below the port `log_odds`. The default
+// 0 is a probability of 0.5.
 class SceneComplete : public SceneCondition {
  public:
   SceneComplete(const std::string& name, const BT::NodeConfig& config,
@@ -143,7 +144,7 @@ class SceneComplete : public SceneCondition {
       : SceneCondition(name, config, service, &scene::Client::missing) {}
 
   static BT::PortsList providedPorts() {
-    return ports({BT::InputPort<double>("log_odds", 0.0, "from which on a thing is missing")});
+    return ports({BT::InputPort<double>("log_odds", 0.0, "smallest value of a missing object")});
   }
 
  protected:
@@ -159,8 +160,8 @@ class SceneComplete : public SceneCondition {
   }
 };
 
-// SUCCESS if a thing that was seen fits the scene; FAILURE if it is an outlier, or not there. The
-// thing is named by its id, or by a label: then every thing of this label has to belong.
+// SUCCESS if an object fits the scene; FAILURE if it is an outlier or is not in the scene. The port
+// `object` is an id or a label. With a label, every object of this label must fit.
 class ObjectBelongs : public SceneCondition {
  public:
   ObjectBelongs(const std::string& name, const BT::NodeConfig& config,
@@ -168,7 +169,7 @@ class ObjectBelongs : public SceneCondition {
       : SceneCondition(name, config, service, &scene::Client::outliers) {}
 
   static BT::PortsList providedPorts() {
-    return ports({BT::InputPort<std::string>("object", "an id or a label")});
+    return ports({BT::InputPort<std::string>("object", "id or label of the object")});
   }
 
  protected:

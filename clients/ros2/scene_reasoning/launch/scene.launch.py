@@ -1,4 +1,4 @@
-"""Start the node with the parameters of config/scene.yaml, on the topic of a detector.
+"""Start the node with the parameters of config/scene.yaml and the topic of a detector.
 
 Usage:
     ros2 launch scene_reasoning scene.launch.py detections:=/my_detector/detections

@@ -1,1 +1,1 @@
-"""A robot's detections, put to the scene-reasoning service."""
+"""Ask the scene-reasoning service about a robot's detections."""

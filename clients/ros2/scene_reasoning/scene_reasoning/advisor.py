@@ -1,4 +1,4 @@
-"""What a node does apart from ROS: from a message of detections to answers."""
+"""The part of the node that does not need ROS: turn a message of detections into answers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ QUESTIONS = ("missing", "outliers", "relations")
 
 
 class Asker(Protocol):
-    """The three questions about a scene, as `scene_client.Client` answers them."""
+    """The methods of `scene_client.Client` that an `Advisor` calls."""
 
     def missing(self, **fields: Any) -> Answer: ...
     def outliers(self, **fields: Any) -> Answer: ...
@@ -23,18 +23,18 @@ class Asker(Protocol):
 
 @dataclass(frozen=True)
 class Advice:
-    """What the service says of one message.
+    """The answers to the questions about one message.
 
     Attributes:
-        fields: what was asked, with notes on what was left out.
-        answers: by question, as JSON; empty where nothing was seen.
+        fields: fields of the request, with notes on the detections that were left out.
+        answers: question to answer as JSON; empty if the message has no objects.
     """
 
     fields: SceneFields
     answers: dict[str, dict[str, Any]]
 
     def to_json(self) -> dict[str, Any]:
-        """What subscribers get: the header of the detections, the answers, and the notes."""
+        """The published message: header of the detections, answers and notes."""
         return {
             "frame_id": self.fields.get("frame_id"),
             "stamp": self.fields.get("stamp"),
@@ -45,18 +45,18 @@ class Advice:
 
 @dataclass
 class Advisor:
-    """Turns a message into a request and asks.
+    """Convert messages to requests and send them to the service.
 
     Attributes:
-        client: who is asked.
-        questions: which of `QUESTIONS`.
-        label_map: what the class ids mean; may be replaced at any time.
-        min_score: leave out what the detector is less sure of.
-        boxes: False where boxes are pixels: positions are then those of the hypotheses.
-        own: fields of a question of its own, such as ``{"missing": {"top_k": 5}}``.
+        client: client of the service.
+        questions: one or more of `QUESTIONS`.
+        label_map: labels of the class ids; may be replaced at any time.
+        min_score: detections with a lower score are left out.
+        boxes: False if boxes are in pixels; positions are then taken from the hypotheses.
+        own: extra fields for each question, such as ``{"missing": {"top_k": 5}}``.
 
     Raises:
-        ValueError: a question that there is none, or a wrong label map.
+        ValueError: an unknown question, or an invalid label map.
     """
 
     client: Asker
@@ -75,8 +75,8 @@ class Advisor:
         """Ask every question about the detections of a message.
 
         Raises:
-            MessageError: no scene can be made of it.
-            ClientError: a question has no answer.
+            MessageError: the message cannot be converted to a scene.
+            ClientError: the service did not answer a question.
         """
         fields = from_message(
             message,

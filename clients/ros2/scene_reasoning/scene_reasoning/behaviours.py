@@ -1,11 +1,12 @@
-"""Conditions of behaviour trees (py_trees): is something missing, does something belong?
+"""Conditions for behaviour trees (py_trees): `SceneComplete` and `ObjectBelongs`.
 
     scene = lambda: from_detection3d_array(newest_message)
     root.add_children([SceneComplete("table is set", client, scene, candidates=["fork"]), leave])
 
-A condition asks when it is first ticked and is RUNNING until its answer is there, so no tick waits
-for the service. It fails where nothing was seen, or no answer comes in time: a tree goes on only
-with what somebody knows. Its ``feedback_message`` says why, and ``answer`` is the answer.
+The first tick of a condition starts a question in a separate thread. The condition is RUNNING until
+the answer arrives, so a tick never waits for the service. A condition fails if the scene has no
+objects, or if no answer arrives in time. ``feedback_message`` gives the reason, and ``answer`` is
+the answer.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ SceneSource = Callable[[], Mapping[str, Any] | None]
 
 
 class SceneCondition(Behaviour):
-    """Asks one question about the newest scene.
+    """A condition that asks one question about the newest scene.
 
     Args:
-        name: of the node in the tree.
-        client: who is asked.
-        scene: gives the fields of a request, or None as long as nothing was seen. Called in the
-            condition's thread: a conversion of detections may be put here.
+        name: name of the node in the tree.
+        client: client of the service.
+        scene: function that returns the fields of a request, or None without objects. It runs in
+            the condition's thread, so it may convert detections.
         timeout: seconds from the first tick until the condition fails.
-        own: further fields of the question.
+        own: extra fields of the request.
     """
 
     def __init__(
@@ -72,7 +73,8 @@ class SceneCondition(Behaviour):
         return Status.SUCCESS if holds else Status.FAILURE
 
     def terminate(self, new_status: Status) -> None:
-        # A question of a tick long past: it ends with its own timeout, and nobody reads it.
+        # A running question cannot be cancelled. It ends within the client's timeout, and its
+        # answer is ignored.
         if self._asked is not None:
             self._asked.cancel()
             self._asked = None
@@ -92,20 +94,20 @@ class SceneCondition(Behaviour):
 
     @abstractmethod
     def ask(self, fields: dict[str, Any]) -> Any:
-        """Put the question; called in the condition's thread."""
+        """Ask the question; called in the condition's thread."""
 
     @abstractmethod
     def judge(self, answer: Any) -> tuple[bool, str]:
-        """Whether the condition holds, and why."""
+        """Whether the condition holds, and the reason."""
 
 
 class SceneComplete(SceneCondition):
-    """SUCCESS as long as nothing is missing that is rather there than not.
+    """SUCCESS if no unlisted object is likely to be present.
 
     Args:
-        log_odds: of presence against absence, from which on a thing counts as missing. 0 is even;
-            2.2 is nine to one.
-        own: ``candidates`` and ``at`` narrow the question: what could be missing, and where.
+        log_odds: an unlisted object counts as missing if its log-odds of being present are at least
+            this value. 0 is a probability of 0.5; 2.2 is a probability of 0.9.
+        own: extra fields, such as ``candidates`` (objects to consider) and ``at`` (place).
     """
 
     def __init__(
@@ -123,11 +125,11 @@ class SceneComplete(SceneCondition):
 
 
 class ObjectBelongs(SceneCondition):
-    """SUCCESS if a thing that was seen fits the scene, FAILURE if it is an outlier or not there.
+    """SUCCESS if an object fits the scene; FAILURE if it is an outlier or is not in the scene.
 
     Args:
-        thing: its id, or a label: then every thing of this label has to belong.
-        own: ``threshold`` says from which probability on a thing is an outlier.
+        thing: id or label of the object. With a label, every object of this label must fit.
+        own: extra fields, such as ``threshold``, the smallest probability of an outlier.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Where missing things would stand, as places to draw."""
+"""Ghosts: markers for missing objects, at their likely positions."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import Any
 
 from scene_reasoning.advisor import Advice
 
-# Metres. What a spread is drawn as at least and at most.
+# Smallest and largest extent of a marker, in metres.
 _SMALLEST, _LARGEST = 0.05, 1.5
 
 
 @dataclass(frozen=True)
 class Ghost:
-    """A missing thing.
+    """A marker for a missing object.
 
     Attributes:
-        text: what is missing, and where.
-        position: x, y, z in metres in the frame of the detections: where it would stand, or the
-            thing that it would stand by where no distance is known.
-        extent: x, y, z in metres: two standard deviations of its place; None where unknown.
+        text: label of the missing object, and its relation to the anchor.
+        position: x, y, z in metres in the frame of the detections. If the offset from the anchor is
+            unknown, this is the position of the anchor.
+        extent: x, y, z in metres: two standard deviations of the position; None if unknown.
     """
 
     text: str
@@ -28,7 +28,7 @@ class Ghost:
 
 
 def ghosts(advice: Advice, most: int) -> list[Ghost]:
-    """The likeliest missing things that have a place, at most so many."""
+    """Markers for the likeliest missing objects whose anchor has a position, at most `most`."""
     places = {
         thing["id"]: (thing["label"], thing["position"])
         for thing in advice.fields["objects"]

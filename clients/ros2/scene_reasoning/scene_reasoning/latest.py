@@ -1,4 +1,4 @@
-"""One question at a time, always about the newest thing, without ever waiting for it."""
+"""Ask one question at a time, about the newest message, without blocking the caller."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ AnswerT = TypeVar("AnswerT")
 
 @dataclass(frozen=True)
 class Outcome(Generic[T, AnswerT]):
-    """What became of one question.
+    """The result of one question.
 
     Attributes:
-        about: what was asked about.
-        future: done: holds the answer, or the error.
-        superseded: how many newer things came and went before anybody could ask about them, since
-            the outcome before this one.
+        about: the message of the question.
+        future: completed future with the answer or the error.
+        superseded: number of messages since the last outcome that a newer message replaced.
     """
 
     about: T
@@ -29,31 +28,31 @@ class Outcome(Generic[T, AnswerT]):
 
 
 class Latest(Generic[T, AnswerT]):
-    """Asks about the newest thing seen, in a thread of its own.
+    """Ask about the newest message, in a separate thread.
 
-    `see` and `tick` return at once, whatever the service does: put them into the callbacks of a
-    subscription and a timer. While a question is in flight newer things replace each other.
+    `see` and `tick` return at once. Call `see` from the callback of a subscription, and `tick` from
+    the callback of a timer. While a question is in progress, only the newest message is kept.
 
     Args:
-        ask: answers, or raises; called in the thread.
+        ask: function that returns the answer to a message; called in the thread.
     """
 
     def __init__(self, ask: Callable[[T], AnswerT]) -> None:
         self._ask = ask
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scene")
-        self._lock = Lock()  # a multi-threaded executor may run both callbacks at once
+        self._lock = Lock()  # a multi-threaded ROS executor may run both callbacks at once
         self._waiting: list[T] = []
         self._superseded = 0
         self._asked: tuple[T, Future[AnswerT]] | None = None
 
     def see(self, thing: T) -> None:
-        """Remember it in place of whatever was waiting."""
+        """Keep a message for the next question; it replaces a waiting message."""
         with self._lock:
             self._superseded += len(self._waiting)
             self._waiting = [thing]
 
     def tick(self) -> Outcome[T, AnswerT] | None:
-        """Take the outcome if there is one, and ask about the newest thing if nobody is asking."""
+        """Return the outcome of a finished question, and start the next question if possible."""
         with self._lock:
             outcome = None
             if self._asked is not None and self._asked[1].done():
@@ -65,5 +64,5 @@ class Latest(Generic[T, AnswerT]):
             return outcome
 
     def close(self) -> None:
-        """Ask no more. The question in flight ends with its own timeout."""
+        """Stop asking. The question in progress ends within the client's timeout."""
         self._thread.shutdown(wait=False, cancel_futures=True)

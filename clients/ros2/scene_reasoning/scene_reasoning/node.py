@@ -1,9 +1,10 @@
-"""The node: detections in; answers, markers and diagnostics out.
+"""ROS 2 node that asks the service about detections, and publishes answers and markers.
 
-Subscribes to ``detections`` (vision_msgs/Detection3DArray or Detection2DArray), ``label_info``
-(vision_msgs/LabelInfo) and ``pose`` (geometry_msgs/PoseWithCovarianceStamped); publishes
-``~/answers`` (std_msgs/String, JSON), ``~/ghosts`` (visualization_msgs/MarkerArray) and
-``/diagnostics``. No callback waits for the service.
+Subscriptions: ``detections`` (vision_msgs/Detection3DArray or Detection2DArray), ``label_info``
+(vision_msgs/LabelInfo) and ``pose`` (geometry_msgs/PoseWithCovarianceStamped).
+Publications: ``~/answers`` (std_msgs/String, JSON), ``~/ghosts`` (visualization_msgs/MarkerArray)
+and ``/diagnostics``.
+Questions run in a separate thread, so callbacks never wait for the service.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from scene_reasoning.latest import Latest, Outcome
 
 KINDS = {"3d": Detection3DArray, "2d": Detection2DArray}
 
-# What was seen: the message, and where the robot stood then.
+# A message of detections, and the viewpoint (x, y, yaw) at its arrival.
 Seen = tuple[Any, "tuple[float, float, float] | None"]
 
 
 class SceneNode(Node):
-    """Keeps the service's view of the newest detections published."""
+    """Ask about the newest detections, and publish the answers."""
 
     def __init__(self) -> None:
         super().__init__("scene")
@@ -59,8 +60,8 @@ class SceneNode(Node):
 
         kind = KINDS[self._parameter("kind", "3d")]
         self.create_subscription(kind, "detections", self.on_detections, qos_profile_sensor_data)
-        # Some publishers keep their last message for whoever comes late, and only a subscription
-        # that asks for it gets it; that one does not hear publishers that keep nothing.
+        # A transient-local subscription gets the last message of publishers that started earlier,
+        # but does not match volatile publishers. So each topic has both kinds of subscription.
         for durability in (DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE):
             qos = QoSProfile(depth=1, durability=durability)
             self.create_subscription(LabelInfo, "label_info", self.on_label_info, qos)
@@ -76,7 +77,7 @@ class SceneNode(Node):
     # ---------------------------------------------------------------------------- callbacks
 
     def on_detections(self, message: Any) -> None:
-        # A pose says where the robot stands in its own frame only.
+        # A pose is valid only for detections in the frame of the pose.
         fits = self.pose_frame in (None, message.header.frame_id)
         self.latest.see((message, self.viewpoint if fits else None))
 
@@ -101,7 +102,8 @@ class SceneNode(Node):
         try:
             advice = outcome.future.result()
         except (ClientError, MessageError) as error:
-            # Of the service or of the detections; anything else is a defect, and ends the node.
+            # Errors of the service or of the message are reported. Any other error is a defect of
+            # the node, and ends it.
             self._report(DiagnosticStatus.ERROR, outcome, f"{type(error).__name__}: {error}")
             return
         self.answers.publish(String(data=json.dumps(advice.to_json())))
@@ -114,7 +116,10 @@ class SceneNode(Node):
     # ------------------------------------------------------------------------------ messages
 
     def _drawn(self, message: Any, shown: list[Ghost]) -> MarkerArray:
-        """A text for each ghost, and a ball where it would stand; all others go."""
+        """Markers for ghosts: a text, and a sphere if the extent is known.
+
+        The first marker deletes all earlier markers.
+        """
         clear = Marker()
         clear.header = message.header
         clear.action = Marker.DELETEALL
