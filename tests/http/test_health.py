@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import httpx
@@ -91,6 +92,13 @@ async def test_another_broken_version_is_listed_as_refused(store: Path) -> None:
             "/v2/models/plain/ready",
         ):
             problem(await client.get(path), 503, "model-unavailable")
+
+
+async def test_an_alias_to_a_removed_version_is_unavailable_and_not_unknown(store: Path) -> None:
+    shutil.rmtree(store / "home" / "1.1.0")
+    async with serve(store) as client:
+        body = {"objects": ["bed"], "model": "candidate"}
+        problem(await client.post("/relations", json=body), 503, "model-unavailable")
 
 
 async def test_an_empty_store_is_not_ready(tmp_path: Path, admin: dict[str, str]) -> None:

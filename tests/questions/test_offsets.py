@@ -100,7 +100,7 @@ def test_no_zero_is_negative_and_no_spread_is_nothing():
 
 
 def test_a_relation_without_poses_has_no_offset():
-    some = np.array([9, 0, 9, 9])
+    some = np.array([1, 0, 9, 9])
     pairs = {"pair": np.zeros(0, np.int64), "pair_offset": np.zeros((0, 6), "f4")}
     partial = replace(OFFSETS, relation_scenes=some, pair_scenes=np.zeros(0, np.int64), **pairs)
     assert one(FRONT, 1, 2, offsets=partial) is None
