@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from app.inference import MachineSpec
-from app.inference.posterior import Pull
-from app.inference.relations import Between, Given
+from app.inference.posterior import Pull, ScenePosterior
+from app.inference.relations import Given
 from app.registry.artifact import Artifact
 from app.registry.description import EvidenceWeights
 from app.scene.evidence import instance_evidence, pool_classes, pooled
@@ -94,13 +93,8 @@ def pull_of(scene: Scene, weights: EvidenceWeights) -> Pull:
     return Pull(weights.poses_on_objects, weights.poses_on_relations)
 
 
-class Posterior:
-    """Log-odds of objects and relations given a scene; see `app/inference/posterior.py`.
-
-    Shapes: V classes of the vocabulary, A canonical relations, n classes of the scene. The
-    log-odds of objects are exact for one hidden layer and a scene without observed relations.
-    Logits of relations are approximated by normal variables. `NO_UNIT` is the smallest log-odds of
-    a relation.
+class Posterior(ScenePosterior):
+    """Log-odds of objects and relations given a scene and a published model.
 
     Attributes:
         present: the classes of the scene.
@@ -111,128 +105,27 @@ class Posterior:
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
         self.present = present(scene, artifact.spec)
-        self._artifact, self._closed, self._room = artifact, artifact.closed_form, scene.room_type
-        self._context = self._closed.context(
+        self._artifact, self._room = artifact, scene.room_type
+        context = artifact.closed_form.context(
             *(self.present.classes, self.present.presence, self.present.log_counts),
             scene.room_type,
             given_relations(scene, self.present, artifact.spec.A),
             pull_of(scene, artifact.calibration.evidence),
         )
-
-    @property
-    def unit_count(self) -> int:
-        """Number of observed relation units; the cost of judging one class grows with it."""
-        return len(self._context.slopes)
+        super().__init__(artifact.closed_form, context)
 
     def absent_log_odds(self, absent: Places) -> Floats:
         """Log-odds of presence of absent classes, with their relations unobserved, (N,)."""
-        found: Floats = self._closed.b + self._artifact.scorer.gain(self._context.object_y)
+        gain = self._artifact.scorer.gain(self.context.object_y)
+        found: Floats = self._closed.b + gain
         return found[absent]
 
     def absent_posterior(self, absent: Places, coverage: float) -> Floats:
         """Log-odds that absent classes are present but unlisted, given the coverage, (N,)."""
         return with_unlisted(
-            *(self._artifact, self.absent_log_odds(absent), absent, self._context.object_y),
+            *(self._artifact, self.absent_log_odds(absent), absent, self.context.object_y),
             *(self.present, self._room, coverage),
         )
-
-    def relation_log_odds(self) -> Floats:
-        """Log-odds of every relation between the classes of the scene, (A, n, n).
-
-        Each relation is judged as if it were unobserved itself.
-        """
-        return self._closed.relation_log_odds(self._context, self._between)
-
-    def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
-        """Log-odds of E relations, each judged as if it were unobserved itself, (E,).
-
-        Args:
-            relation: (E,) canonical relations.
-            subject, object_: (E,) indices into `present.classes`.
-        """
-        return self._closed.unit_log_odds(self._context, relation, subject, object_)
-
-    def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
-        """Log-odds of all relations of P pairs, judged as if no relation of the pair were observed.
-
-        Args:
-            one, other: (P,) indices of the two classes in `present.classes`.
-
-        Returns:
-            (A, P) from `one` to `other`, and (A, P) from `other` to `one`.
-        """
-        forward, backward = self._closed.units.log_odds_apart(
-            self._context, self._between, one, other
-        )
-        return forward, backward
-
-    def placement_log_odds(self, candidates: Places, anchors: Places) -> tuple[Floats, Floats]:
-        """Log-odds of all relations of absent classes to anchors, if these classes were present.
-
-        The effect of the observed relations on a candidate's relations is left out.
-
-        Args:
-            candidates: (N,) absent classes.
-            anchors: (m,) indices into `present.classes`.
-
-        Returns:
-            (N, A, m) from the candidates to the anchors, and (N, A, m) from the anchors back.
-        """
-        return self._closed.units.placement_log_odds(self._context, candidates, anchors)
-
-    def placed_log_p(
-        self, candidates: Places, relation: int, anchor: int, *, outgoing: bool
-    ) -> Floats:
-        """log p(relation between candidate and anchor | candidate is present, evidence), (N,).
-
-        Args:
-            candidates: (N,) absent classes.
-            relation: canonical relation.
-            anchor: index into `present.classes`.
-            outgoing: whether the candidate is the relation's subject; otherwise the anchor is.
-        """
-        log_odds = self._closed.placed_log_odds(
-            self._context, candidates, relation, anchor, outgoing
-        )
-        return -np.logaddexp(np.float32(0.0), -log_odds)
-
-    def log_odds_given_rest(self) -> Floats:
-        """Leave-one-out log-odds of each class: given the scene without it, (n,).
-
-        The relations of the class are left out, too.
-        """
-        found: Floats = self._closed.b[self.present.classes] + self._gains
-        return found
-
-    def reasons(self, rows: Places) -> Floats:
-        """How much each class of the scene changes the leave-one-out log-odds of others, (N, n).
-
-        An entry is the log-odds with the changing class, minus the log-odds without this class and
-        its relations. The entry of a class for itself is 0.
-
-        Args:
-            rows: (N,) indices of the explained classes in `present.classes`.
-        """
-        return self._closed.reasons(self._context, self._shares, self._gains, rows)
-
-    def reasons_for_absent(self, candidates: Places) -> Floats:
-        """How much each class of the scene changes the log-odds of absent classes, (N, n).
-
-        An entry is the log-odds with the class, minus the log-odds without it and its relations.
-        """
-        return self._closed.reasons_for_absent(self._context, self._shares, candidates)
-
-    @cached_property
-    def _between(self) -> Between:
-        return self._closed.units.between(self._context)
-
-    @cached_property
-    def _shares(self) -> NDArray[np.float32]:
-        return self._closed.shares(self._context)
-
-    @cached_property
-    def _gains(self) -> NDArray[np.float32]:
-        return self._closed.gains_given_rest(self._context, self._shares)
 
 
 def posterior(artifact: Artifact, scene: Scene) -> Posterior:

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from app.inference import MachineSpec, Weights
 from app.inference.chains import SceneChains
+from app.inference.completions import Completions
 from app.inference.objects import ContextScorer
-from app.inference.posterior import ClosedForm, Completions
+from app.inference.posterior import ClosedForm
 from app.inference.weights import layout
 from app.registry.card import render_card
 from app.registry.description import Calibration, Description

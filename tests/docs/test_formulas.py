@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from app.inference.elementary import sigmoid
-from app.inference.posterior import ClosedForm
+from app.inference.posterior import ClosedForm, ScenePosterior
 from app.questions.calibration import (
     exclusive,
     false_log_odds,
@@ -454,7 +454,7 @@ def normal_logits() -> None:
     closed = ClosedForm(weights_of(machine))
     classes = np.arange(3)
     context = closed.context(classes, np.ones(3, np.float32), np.zeros(3, np.float32))
-    found = closed.relation_log_odds(context)
+    found = ScenePosterior(closed, context).relation_log_odds()
     w = Weights(machine, machine.edges(torch.arange(4).unsqueeze(0)))
     v = np.array([1.0, 1.0, 1.0, 0.0])
     m = np.array([sigma(x) for x in w.c1 + v @ w.W])

@@ -10,8 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from app.inference.completions import Completions
 from app.inference.objects import ContextScorer
-from app.inference.posterior import Completions
 from tests.enumeration.small_machines import binary
 from training.machines import MachineSpec, build
 from training.machines.arrays import weights_of

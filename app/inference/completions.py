@@ -1,0 +1,204 @@
+"""Completions of a scene: the probability of classes that are present but unlisted.
+
+The machine must have the local form and stored chain samples. `posterior` defines v, h1, y and b.
+Each present class is listed with probability c, the coverage. So, for the listed classes L,
+
+    p(v, h | L) ∝ p(v, h) (1 - c)^{|v \\ L|}   for v ⊇ L
+
+This is the same machine with log(1 - c) added to the biases of unlisted classes. Its posterior is
+estimated from the chain samples v_f that the machine stores (`fantasies`). σ is the logistic
+function.
+
+ 1. Each sample has a context h_f ~ p(h1 | v_f), drawn once, and logits l = b + W h_f. Its
+    importance weight for a scene is
+
+        log w_f = sum_{i in L} log σ(l_i) + sum_{i not in L} log(1 - c σ(l_i)) + room
+
+    Both sums exclude structure (walls …). `room` is 0 without a room type.
+ 2. Systematic resampling with offsets (m + 1/2) / M selects M samples.
+ 3. Each selected sample m becomes a completion of the scene. It adds each unlisted class j, except
+    structure, for which l_j + log(1 - c) > logit u_mj. The numbers u are fixed: one in each of M
+    equal strata of [0, 1) for each class.
+ 4. Given a completion, the context is summed out in closed form. Class i is first subtracted from
+    y:
+
+        log-odds_mi = b_i + log(1 - c) + sum_k [softplus(y_k + W_ik) - softplus(y_k)]
+
+    The answer is the log-odds of the mean of σ(log-odds_mi) over the completions.
+
+All requests use the same random numbers, so the same scene always gets the same answer.
+
+The chain samples may have different room types. Then they follow a mixture over these types, in
+which n_s samples have type s. For a scene of room type t,
+
+    room = Q[t]·h_f - log sum_s n_s exp(Q[s]·h_f) / Z_s
+
+with Z_s from the multistate Bennett acceptance ratio. A scene without a room type uses the mixture
+itself.
+
+Sources: self-normalised importance sampling with resampling and one Rao–Blackwellised Gibbs step;
+Shirts and Chodera, "Statistically optimal analysis of samples from multiple equilibrium states"
+(2008).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.inference import objects
+from app.inference.elementary import sigmoid
+from app.inference.objects import ContextScorer, group_size
+from app.inference.weights import Weights
+
+Floats = NDArray[np.float32]
+Places = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+COMPLETIONS = 16
+SEED = 20180521
+"""Seed of the contexts h_f and the numbers u."""
+
+# For smaller logits l, e^-l would overflow float32.
+_LEAST_LOGIT = np.float32(-80.0)
+# Number of coverage values whose weights of an empty scene are cached, 4 N bytes each.
+_KEPT = 32
+# Products of _FACTORS factors of at least _LEAST stay within the range of float32.
+_FACTORS, _LEAST = 4, np.float32(1e-7)
+_ROOM_SWEEPS = 100
+_SETTLED = 1e-7
+# Smallest log p of a sample relative to its best room: products of two stay within float64.
+_LEAST_PULL = -300.0
+
+
+class Completions:
+    """Posterior of unlisted classes, for a machine with fixed weights.
+
+    Args:
+        weights: weights and stored samples of the machine.
+        structure: (V,) which classes are structure; completions ignore these classes.
+        scorer: scorer of the same machine.
+        count: M, number of completions of a scene.
+
+    Raises:
+        ValueError: the machine has no stored samples, or its weights are too large; see `fits`.
+    """
+
+    def __init__(
+        self,
+        weights: Weights,
+        structure: Mask,
+        scorer: ContextScorer,
+        count: int = COMPLETIONS,
+    ) -> None:
+        if not self.fits(weights):
+            raise ValueError("completions require stored samples and bounded float32 weights")
+        self._scorer, self._structure = scorer, structure
+        self._W, self._b = weights["W"], weights["b"]
+        generator = np.random.Generator(np.random.Philox(SEED))
+        contexts = _contexts(weights, generator)
+        logits = self._b + contexts @ self._W.T
+        # Shapes (V, N) for samples and (V, M) for completions: each class is contiguous in memory.
+        self._odds_against = np.exp(-np.maximum(logits, _LEAST_LOGIT)).T.copy()
+        self._noise = np.exp(-_stratified_logits(count, len(self._b), generator)).T.copy()
+        self._rooms = _room_weights(weights, contexts)
+        # Each instance has its own cache: a cache of the method would keep every instance alive.
+        self._empty = lru_cache(maxsize=_KEPT)(self._unlisted_evidence)
+
+    @staticmethod
+    def fits(weights: Weights) -> bool:
+        """Whether the machine stores samples, and its weights are small enough for float32."""
+        return weights.spec.N > 0 and group_size(weights["W"]) > 0
+
+    def log_odds(
+        self,
+        y: Floats,
+        classes: Places,
+        presence: Floats,
+        coverage: float,
+        room: int | None = None,
+    ) -> Floats:
+        """Log-odds that each class is present but unlisted, (V,).
+
+        Entries of listed classes have no meaning.
+
+        Args:
+            y: (H1,) logits of h1 given the evidence, with unlisted classes absent.
+            classes: (n,) the listed classes.
+            presence: (n,) probability that each listed class is present.
+            coverage: c, below 1.
+            room: index of the room type; None if unknown.
+        """
+        base = self._empty(coverage)
+        if room is not None and len(self._rooms):
+            base = base + self._rooms[room]
+        unlisted = np.float32(math.log1p(-coverage))
+        telling = ~self._structure[classes]
+        picked = objects.resampled(
+            *(base, self._odds_against, classes[telling], presence[telling]),
+            *(np.float32(1 - coverage), self._noise.shape[1]),
+        )
+        usable = ~self._structure
+        usable[classes] = False
+        found: Floats = objects.completed_log_odds(
+            *(y, picked, self._odds_against, np.exp(unlisted) * self._noise, usable),
+            *(self._b + unlisted, self._W, self._scorer.exp_w, self._scorer.group),
+        )
+        return found
+
+    def _unlisted_evidence(self, coverage: float) -> Floats:
+        """Sum of log(1 - c σ(l_i)) over all classes i except structure, for each sample, (N,)."""
+        chance = 1 / (1 + self._odds_against[~self._structure])
+        total = np.zeros(chance.shape[1], np.float32)
+        for start in range(0, len(chance), _FACTORS):
+            factors = 1 - np.float32(coverage) * chance[start : start + _FACTORS]
+            total += np.log(np.maximum(factors, _LEAST).prod(0))
+        return total
+
+
+def _contexts(weights: Weights, generator: np.random.Generator) -> Floats:
+    """Draw h_f ~ p(h1 | v_f), (N, H1), with a second layer fixed at its mean field."""
+    base = weights["c1"] + weights.scenes @ weights["W"]
+    if weights.spec.C:
+        rooms = weights["fantasy_rooms"]
+        base += np.where((rooms >= 0)[:, None], weights["Q"][rooms.clip(min=0)], 0)
+    y, _ = weights.with_second_layer(base)
+    on: Floats = (generator.random(y.shape) < sigmoid(y)).astype(np.float32)
+    return on
+
+
+def _stratified_logits(count: int, classes: int, generator: np.random.Generator) -> Floats:
+    """Logits of uniform numbers, (M, V), one in each of M equal strata for each class."""
+    strata = generator.random((count, classes)).argsort(0)
+    uniform = (strata + generator.random((count, classes))) / count
+    uniform = uniform.clip(1e-12, 1 - 1e-12)
+    return (np.log(uniform) - np.log1p(-uniform)).astype(np.float32)
+
+
+def _room_weights(weights: Weights, contexts: Floats) -> Floats:
+    """The term `room` of log w for each room type and sample, (C, N)."""
+    spec = weights.spec
+    if not spec.C:
+        return np.zeros((0, 0), dtype=np.float32)
+    pull = contexts.astype(np.float64) @ weights["Q"].T.astype(np.float64)
+    # The last state is "no room type".
+    pull = np.concatenate([pull, np.zeros((len(pull), 1))], 1)
+    rooms = weights["fantasy_rooms"]
+    drawn, sizes = np.unique(np.where(rooms < 0, spec.C, rooms), return_counts=True)
+    # p(sample | room) up to a factor per sample, so that both sums of the iteration are matrix
+    # products. The lower bound keeps every entry, and so every sum, above 0.
+    top = pull[:, drawn].max(1)
+    share = np.exp(np.maximum(pull[:, drawn] - top[:, None], _LEAST_PULL))
+    log_z = np.zeros(len(drawn))
+    mixture = np.ones(len(pull))
+    for _ in range(_ROOM_SWEEPS):
+        mixture = share @ (sizes * np.exp(-log_z))
+        before, log_z = log_z, np.log((1 / mixture) @ share)
+        log_z -= log_z[0]
+        if np.abs(log_z - before).max() < _SETTLED:
+            break
+    log_mixture = top + np.log(mixture)
+    return np.ascontiguousarray((pull[:, : spec.C] - log_mixture[:, None]).T.astype(np.float32))
