@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Build and start the image without a container engine, by replaying the Dockerfile itself.
+"""Build and start the image without a container engine: execute the Dockerfile's instructions.
 
-    python3 deploy/by_hand.py                    build, start, wait until healthy, stop
-    python3 deploy/by_hand.py --stay             the same, serving until interrupted
+    python3 deploy/by_hand.py                    build, start, wait for the health check, stop
+    python3 deploy/by_hand.py --stay             the same, but serve until Ctrl-C
     python3 deploy/by_hand.py --target train     build the training stage and run its command
 
-Each stage gets a folder of its own that stands for its root: the paths the Dockerfile makes
-(WORKDIR, destinations of COPY, /tmp) are moved under it, everything else is the machine's. COPY
-obeys .dockerignore, and the service counts as ready when the image's HEALTHCHECK says so. What
-this does not show: the base image (the machine's Python stands in for it), and the confinement of
-a container.
+Each stage has its own folder in place of its root directory. The paths that the Dockerfile creates
+(WORKDIR, destinations of COPY, /tmp) are moved into this folder. All other paths are those of this
+machine. COPY obeys .dockerignore. The service is ready when the image's HEALTHCHECK succeeds. The
+script does not test the base image, because it uses the machine's Python, or the isolation of a
+container.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-# What a build has from outside: the package installer's settings, proxies and certificates.
+# Variables that a build inherits: settings of pip, proxies, certificates and the language.
 PASSED_ON = re.compile(r"^(PIP_.*|SSL_CERT_.*|https?_proxy|no_proxy|LANG)$", re.IGNORECASE)
 KNOWN = {
     *("FROM", "ARG", "ENV", "WORKDIR", "COPY", "RUN", "USER"),
@@ -40,12 +40,12 @@ KNOWN = {
 
 
 class ReplayError(Exception):
-    """The Dockerfile cannot be replayed, or what it built does not work."""
+    """The Dockerfile cannot be executed, or the built stage does not work."""
 
 
 @dataclass(frozen=True, slots=True)
 class Instruction:
-    """One instruction: `COPY --from=a b c` is COPY, {"from": "a"}, "b c"."""
+    """One instruction: `COPY --from=a b c` has the fields COPY, {"from": "a"} and "b c"."""
 
     keyword: str
     flags: dict[str, str]
@@ -53,7 +53,11 @@ class Instruction:
 
 
 def parse(text: str) -> list[Instruction]:
-    """Split a Dockerfile into instructions; refuse those that this replay would not honour."""
+    """Split a Dockerfile into instructions.
+
+    Raises:
+        ReplayError: this script does not support an instruction.
+    """
     lines = (line for line in text.splitlines() if not line.lstrip().startswith("#"))
     instructions = []
     for line in re.sub(r"\\[ \t]*\n", " ", "\n".join(lines)).splitlines():
@@ -62,7 +66,7 @@ def parse(text: str) -> list[Instruction]:
         keyword, _, rest = line.strip().partition(" ")
         keyword, rest = keyword.upper(), rest.strip()
         if keyword not in KNOWN:
-            raise ReplayError(f"{keyword} is not an instruction that this replay knows")
+            raise ReplayError(f"{keyword} is an instruction that this script does not support")
         flags = {}
         while match := re.match(r"--([\w-]+)=(\S+)\s*", rest):
             flags[match[1]] = match[2]
@@ -72,20 +76,20 @@ def parse(text: str) -> list[Instruction]:
 
 
 def split_stages(instructions: list[Instruction]) -> dict[str, list[Instruction]]:
-    """Stage name → its instructions, FROM first, in the order of the file."""
+    """Return the instructions of each stage by stage name, in the order of the file."""
     stages: dict[str, list[Instruction]] = {}
     for instruction in instructions:
         if instruction.keyword == "FROM":
             _, _, name = instruction.argument.partition(" AS ")
             current = stages.setdefault(name.strip() or str(len(stages)), [])
         elif not stages:
-            raise ReplayError(f"{instruction.keyword} stands before the first FROM")
+            raise ReplayError(f"{instruction.keyword} is before the first FROM")
         current.append(instruction)
     return stages
 
 
 def ignore_rules(text: str) -> list[tuple[bool, re.Pattern[str]]]:
-    """The lines of a .dockerignore as (is an exception, pattern over a path), in order."""
+    """Return the lines of a .dockerignore as pairs (is an exception, path pattern), in order."""
     rules = []
     for line in text.splitlines():
         pattern = line.strip()
@@ -98,14 +102,14 @@ def ignore_rules(text: str) -> list[tuple[bool, re.Pattern[str]]]:
 
 
 def is_ignored(path: str, rules: list[tuple[bool, re.Pattern[str]]]) -> bool:
-    """Whether the build context leaves `path` out: the last rule that matches it decides."""
+    """Return whether the last rule that matches `path` excludes it from the build context."""
     verdicts = [not excepted for excepted, pattern in rules if pattern.fullmatch(path)]
     return bool(verdicts) and verdicts[-1]
 
 
 @dataclass
 class Stage:
-    """A stage as built so far: the folder that stands for its root, and its settings."""
+    """A stage during its build: its folder in place of a root directory, and its settings."""
 
     root: Path
     environment: dict[str, str]
@@ -139,15 +143,17 @@ class Replay:
         )
 
     def inside(self, stage: Stage, text: str) -> str:
-        """`text` with the paths that the Dockerfile makes moved under the stage's root."""
+        """Return `text` with the paths of the Dockerfile moved into the stage's folder."""
         return self.made_paths.sub(lambda match: f"{stage.root}{match[1]}", text)
 
     def build(self, name: str) -> Stage:
-        """Replay a stage, after the stages it starts from or copies from."""
+        """Build a stage, after the stages that it starts from or copies from."""
         if name in self.built:
             return self.built[name]
         if name not in self.stages:
-            raise ReplayError(f"no stage {name!r}; there are {', '.join(self.stages)}")
+            raise ReplayError(
+                f"the Dockerfile has no stage {name!r}; its stages are {', '.join(self.stages)}"
+            )
         first, *rest = self.stages[name]
         base = first.argument.partition(" AS ")[0].strip()
         stage = self.derived(name, self.build(base)) if base in self.stages else self.fresh(name)
@@ -159,7 +165,7 @@ class Replay:
         return stage
 
     def fresh(self, name: str) -> Stage:
-        """A stage from the base image, for which the machine's Python stands in."""
+        """Return an empty stage with the machine's Python in place of the base image."""
         root = self.work / name
         programs = root / "base-image" / "bin"
         programs.mkdir(parents=True)
@@ -171,7 +177,7 @@ class Replay:
         return Stage(root, environment)
 
     def derived(self, name: str, base: Stage) -> Stage:
-        """A stage that starts where another one ended."""
+        """Return a stage that starts with a copy of another stage."""
         root = self.work / name
         shutil.copytree(base.root, root, symlinks=True, copy_function=os.link)
         environment = {
@@ -181,7 +187,7 @@ class Replay:
         return Stage(root, environment, base.workdir, base.user)
 
     def apply(self, stage: Stage, instruction: Instruction) -> None:
-        """Carry out one instruction."""
+        """Execute one instruction."""
         argument = instruction.argument
         match instruction.keyword:
             case "ARG":
@@ -210,18 +216,18 @@ class Replay:
                 stage.command = json.loads(argument)
 
     def directory(self, stage: Stage) -> Path:
-        """The stage's working directory on this machine."""
+        """Return the stage's working directory on this machine."""
         return stage.root / stage.workdir.lstrip("/")
 
     def copy(self, stage: Stage, instruction: Instruction) -> None:
-        """COPY, from the build context or from another stage."""
+        """Execute COPY from the build context or from another stage."""
         *sources, target = shlex.split(instruction.argument)
         destination = stage.root / str(Path(stage.workdir, target)).lstrip("/")
         into = target.endswith("/") or len(sources) > 1
         if "from" in instruction.flags:
             origin = self.build(instruction.flags["from"]).root
             for source in sources:
-                # Hard links: nothing changes a file of an environment in place.
+                # Hard links are safe, because no instruction changes these files in place.
                 shutil.copytree(
                     origin / source.lstrip("/"),
                     destination / Path(source).name if into else destination,
@@ -232,7 +238,7 @@ class Replay:
         for source in sources:
             copied = 0
             for path in self.context_files(self.context / source):
-                if path == self.context / source:  # a file; of a folder, the contents are copied
+                if path == self.context / source:  # a file; COPY of a folder copies its contents
                     place = destination / path.name if into else destination
                 else:
                     place = destination / path.relative_to(self.context / source)
@@ -240,14 +246,16 @@ class Replay:
                 shutil.copy2(path, place)
                 copied += 1
             if not copied:
-                raise ReplayError(f"COPY {source}: not there, or left out by .dockerignore")
+                raise ReplayError(
+                    f"COPY {source}: the file does not exist, or .dockerignore excludes it"
+                )
         if "chown" in instruction.flags and os.geteuid() == 0:
             user, _, group = instruction.flags["chown"].partition(":")
             for path in (destination, *destination.rglob("*")):
                 os.chown(path, int(user), int(group or user))
 
     def context_files(self, source: Path) -> Iterator[Path]:
-        """The files at or under `source` that the build context holds."""
+        """Iterate over the files at or below `source` in the build context."""
         candidates = [source] if source.is_file() else sorted(source.rglob("*"))
         for path in candidates:
             if path.is_file() and not is_ignored(
@@ -256,7 +264,11 @@ class Replay:
                 yield path
 
     def execute(self, stage: Stage, command: list[str]) -> None:
-        """Run a command in the stage, or say which one failed."""
+        """Run a command in the stage.
+
+        Raises:
+            ReplayError: the command failed.
+        """
         done = subprocess.run(
             command, cwd=self.directory(stage), env=stage.environment, check=False
         )
@@ -265,14 +277,14 @@ class Replay:
 
 
 def identity(stage: Stage) -> tuple[int, int] | None:
-    """The user and group that the image runs as, where this machine lets us become them."""
+    """Return user and group of the image, or None if this process cannot change to them."""
     if not stage.user:
         return None
     user, _, group = stage.user.partition(":")
     wanted = int(user), int(group or user)
     if os.geteuid() == 0:
         try:
-            # The interpreter itself may lie in a folder that is closed to other users.
+            # Other users may have no access to the folder of the interpreter.
             subprocess.run(
                 ["python", "-c", ""],
                 env=stage.environment,
@@ -285,12 +297,12 @@ def identity(stage: Stage) -> tuple[int, int] | None:
             pass
         else:
             return wanted
-    print(f"note: USER {stage.user} is not applied here; this runs as uid {os.geteuid()}")
+    print(f"note: USER {stage.user} is not applied; the service runs as uid {os.geteuid()}")
     return None
 
 
 def snapshot(root: Path) -> dict[str, tuple[int, int]]:
-    """Path → (size, modification time) of every file outside the stage's /tmp."""
+    """Return (size, modification time) of every file outside the stage's /tmp, by path."""
     return {
         str(path.relative_to(root)): (path.stat().st_size, path.stat().st_mtime_ns)
         for path in root.rglob("*")
@@ -299,7 +311,11 @@ def snapshot(root: Path) -> dict[str, tuple[int, int]]:
 
 
 def serve(replay: Replay, stage: Stage, port: int, patience: float, stay: bool) -> None:
-    """Start the stage's command, wait for its HEALTHCHECK, stop it; it may write nothing."""
+    """Start the stage's command, wait for its HEALTHCHECK, and stop it.
+
+    Raises:
+        ReplayError: the service failed, or wrote a file outside /tmp.
+    """
     environment = stage.environment | {"SCENE_HOST": "127.0.0.1", "SCENE_PORT": str(port)}
     user, group = identity(stage) or (None, None)
     before = snapshot(stage.root)
@@ -339,23 +355,25 @@ def serve(replay: Replay, stage: Stage, port: int, patience: float, stay: bool) 
     if written := sorted(
         name for name in after.keys() | before if after.get(name) != before.get(name)
     ):
-        raise ReplayError(f"under a read-only root these could not be written: {written[:10]}")
+        raise ReplayError(
+            f"with a read-only root, these files could not be written: {written[:10]}"
+        )
 
 
 def free_port() -> int:
-    """A port that nothing listens on."""
+    """Return a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def main() -> int:
-    """Parse the command line and replay."""
+    """Parse the command line and build the target stage."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--target", help="stage to build; the last one unless given")
-    parser.add_argument("--port", type=int, help="port to serve on; a free one unless given")
+    parser.add_argument("--target", help="stage to build; default: the last stage")
+    parser.add_argument("--port", type=int, help="port of the service; default: any free port")
     parser.add_argument("--wait", type=float, default=60, help="seconds to wait until healthy")
-    parser.add_argument("--stay", action="store_true", help="serve until interrupted")
+    parser.add_argument("--stay", action="store_true", help="serve until Ctrl-C")
     options = parser.parse_args()
 
     context = Path(__file__).resolve().parent.parent
