@@ -106,11 +106,11 @@ def calibrate_objects(
     """Return the artifact's calibration with every entry about objects fitted.
 
     Args:
-            validation: scenes that were not used in training.
-            train: scenes that give the popularity of classes and the signatures of room types.
-            structure: (V,) bool, true for structure classes.
-            chosen: a calibration with values chosen on other validation scenes: coverage and its
-                weight, weights of evidence, alpha. Without it, these values are chosen here.
+        validation: scenes that were not used in training.
+        train: scenes that give the popularity of classes and the signatures of room types.
+        structure: (V,) bool, true for structure classes.
+        chosen: a calibration with values chosen on other validation scenes: coverage and its
+            weight, weights of evidence, alpha. Without it, these values are chosen here.
     """
     scenes = complete_scenes(validation, seed)
     if not len(scenes):

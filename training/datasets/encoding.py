@@ -218,7 +218,7 @@ def _from_lists(
     for relations, array in ((listed, holds), (scene.false_relations, denied)):
         for subject, relation, anchor in relations:
             array[canonicalise(subject, relation, anchor)] = True
-        # Contradictory annotations are unobserved: both directions listed, or listed and denied.
+    # Contradictory annotations are unobserved: both directions listed, or listed and denied.
     contradicted = (holds & holds.swapaxes(1, 2)) | (holds & denied)
     related = holds.any(0)
     masks = {
