@@ -70,7 +70,7 @@ _LEAST_SLOPE = 0.05
 _STIFFNESS = 2.0
 # Truth value of a relation whose truth is unknown.
 _UNKNOWN = -1.0
-# Number of placement cases drawn from each scene. With one case, the fit depends too much on chance.
+# Number of placement cases from each scene. With one case, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
 
 

@@ -39,7 +39,7 @@ class Contender:
         density: density, computed at its first use.
         alarm: alarm of T3.
         artifact: model for Calibration and for all questions to the service.
-        objects_in_rooms: score of T2 with the room type given.
+        objects_in_rooms: score of T2 with the room type as evidence.
         machine: machine for the seed protocol.
         parameters: number of trained weights, or None if this number is not meaningful.
     """
@@ -91,7 +91,7 @@ class Setting:
         return some_scenes(scenes, most, self.seed)
 
     def at(self, index: Tensor) -> Setting:
-        """Return the setting with only the scenes at the given positions."""
+        """Return the setting with only the scenes at the given indices."""
         return replace(self, scenes=subset(self.scenes, index))
 
     @cached_property

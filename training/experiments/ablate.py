@@ -170,7 +170,10 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
 def _costs(
     folder: Path, configs: Sequence[Config], seeds: int
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Return trained weights by row, without weights fixed at zero, and mean training seconds."""
+    """Return, by row, the number of trained weights and the mean training time in seconds.
+
+    Weights fixed at zero do not count as trained.
+    """
     weights, seconds = {}, {}
     for config in configs:
         places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]
