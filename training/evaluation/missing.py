@@ -329,7 +329,7 @@ def removed_places(
 def leave_one_out_at(
     scenes: SceneTensors, structure: Tensor, score: PlacedScore, *, seed: int = 0
 ) -> tuple[Ranking, Ints]:
-    """Rank every removed class among the absent classes; also return the relation (N,) of each place.
+    """Return the rank of every removed class among the absent classes, and its relation (N,).
 
     Raises:
         LeakError: the score depends on more than the shown evidence.

@@ -316,7 +316,7 @@ def verdict(artifact: Artifact, sensitivity: Sensitivity, scene: Scene) -> Float
 
 
 def share_of_first(values: Floats, target: int) -> float:
-    """Return 1 if the value at `target` is the highest, else 0; with m equal highest values, 1/m."""
+    """Return 1 if the value at `target` is the highest, else 0; 1/m for m equal highest values."""
     best = values == values.max()
     return float(best[target] / best.sum())
 

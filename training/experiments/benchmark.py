@@ -68,7 +68,7 @@ YARDSTICKS = {
     "T2 partial": ("popularity", "MRR, 50 %"),
     "T3 signature": ("popularity", "hit@1"),
 }
-"""For each task on shuffled scenes: the baseline that no other row should exceed, and the metric."""
+"""By task on shuffled scenes: the baseline that no other row should exceed, and the metric."""
 
 _RELATION_TASKS = ("T1a relations", "T1 pairs")
 # Tasks that a quick run leaves out: annealing for log Z is slow for any number of scenes.
@@ -358,7 +358,9 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
     if not plan.material.related:
         asked = tuple(task for task in asked if task not in _RELATION_TASKS)
         if not asked:
-            raise ValueError(f"the scenes of {domain.name} contain no relations to shuffle")
+            raise ValueError(
+                f"the selected tasks need relations, but the scenes of {domain.name} contain none"
+            )
         plan = replace(plan, tasks=asked)
     rows = [machine_row(config, calibrated=False) for config in options.configs(domain, 0)]
     # One fit of a baseline serves all its tasks.
