@@ -103,7 +103,7 @@ def presence_log_odds(
 
     over weighted draws of h1. G_i = log E_q[exp(W_i·h1)] has a closed form under the proposal q of
     the draws. The last term estimates G_i from the unweighted draws. It is a control variate that
-    cancels the common error of the second expectation.
+    cancels the error that both estimates share.
 
     Args:
         candidates: (B or 1, N) int64.

@@ -356,7 +356,7 @@ class BoltzmannMachine(nn.Module, ABC):
             ValueError: there is no closed form.
         """
         if self.spec.H2 and h2 is None:
-            raise ValueError("the free energy of a machine with a second layer needs h2")
+            raise ValueError("the free energy has no closed form over a second layer: pass h2")
         if not self.relations_act:
             if r is not None:
                 raise ValueError(

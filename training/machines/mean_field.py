@@ -60,7 +60,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class MeanField:
-    """The fixed point: logits y of h1, logits x of h1 without relations, and means of h2."""
+    """The fixed point: logits of h1 with (y) and without relations (x), and means of h2."""
 
     y: Tensor
     x: Tensor
