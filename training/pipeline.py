@@ -131,7 +131,7 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
                 path = extra
             if not path.is_file():
                 raise ConfigError(
-                    f"{path.parent} contains no {path.name}: name its folder with --data"
+                    f"there is no {path.name} in {path.parent}: name its folder with --data"
                 )
             found = [replace(scene, source=name) for scene in read_scenes(path)]
         scenes[name] = found[: data.limit]
