@@ -56,7 +56,7 @@ class SceneTensors:
         v: (N, V) presence of each class.
         room: (N,) room types.
         source: (N,) int64 index into annotated_classes and source_names.
-        annotated_classes: (sources, V) bool.
+        annotated_classes: (sources, V) bool, True for the classes that a source annotates.
         source_names: sorted names of the sources.
         weight: (N,) weight of each scene in object learning.
         complete: (N,) bool; true if the object list covers nearly the whole scene.

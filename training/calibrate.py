@@ -202,7 +202,7 @@ def fit_placements(
 
 
 def _examples(blocks: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return all examples except those of relations without a unit, which have no log-odds."""
+    """Return the examples of relations with a unit; other relations have no log-odds."""
     every = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     return every[every[:, _LOGIT] > NO_UNIT]
 

@@ -151,7 +151,7 @@ def popularity(train: SceneTensors) -> Floats:
 def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
     """Return the 10 % quantile of the class counts of each room type and of all scenes, (C + 1,).
 
-    A room type with fewer than 20 scenes gets the value of all scenes.
+    For a room type with fewer than 20 scenes, the quantile over all scenes is used.
     """
     sizes = ((train.v > 0) & ~structure).sum(1).numpy()
     every = int(np.quantile(sizes, _SMALL))
@@ -186,7 +186,7 @@ class _Shown:
         listed: number of listed classes.
         share: share of shown classes as text, such as "75 %".
         source: index of the scene's source.
-        weight: number of scenes of its source that the scene represents.
+        weight: weight of the scene: the number of scenes for which it stands.
     """
 
     closed: Floats

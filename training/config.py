@@ -75,7 +75,10 @@ class DataConfig(_Section):
 
 
 class MachineConfig(_Section):
-    """The shape of the machine; V, A, C and T follow from the data."""
+    """The shape of the machine.
+
+    The numbers of classes V, relations A, room types C and triples T follow from the data.
+    """
 
     variant: Variant
     H1: int = Field(default=200, ge=1)
@@ -190,24 +193,26 @@ class Config(_Section):
         if self.machine.G and not (local and kind.implications):
             raise ValueError("machine.G is defined for the local form of the Triway only")
         if self.machine.N and not local:
-            raise ValueError("machine.N is defined for the local form only")
+            raise ValueError("machine.N is defined for the local form only: it must be 0")
         if "rooms" in self.data.sources and not self.data.rooms:
             raise ValueError("data.rooms must be at least 1, because `rooms` is a source")
         if self.objective.generative_weight and not local:
-            raise ValueError("objective.generative_weight is defined for the local form only")
+            raise ValueError(
+                "objective.generative_weight is defined for the local form only: it must be 0"
+            )
         if self.objects.epochs and not local:
-            raise ValueError("objects.epochs is defined for the local form only")
+            raise ValueError("objects.epochs is defined for the local form only: it must be 0")
         if self.objective.name == "relations" and not self.objects.epochs:
             raise ValueError(
                 "objects.epochs must be at least 1: the objective `relations` trains no objects"
             )
         if self.polish.updates and not local:
-            raise ValueError("polish.updates is defined for the local form only")
+            raise ValueError("polish.updates is defined for the local form only: it must be 0")
         return self
 
     @property
     def digest(self) -> str:
-        """sha256 of the configuration; a checkpoint resumes only with the same digest."""
+        """The sha256 of the configuration. A checkpoint resumes only with the same sha256."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 

@@ -264,7 +264,7 @@ def log_likelihood(
 
 
 def _fit(pairs: Pairs, V: int) -> _Fit:
-    """Fit hyperparameters and effects of one relation in alternation."""
+    """Fit the hyperparameters and class effects of one relation, in alternation."""
     nothing = np.zeros((V, 3))
     start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
     fit = _Fit(
@@ -293,7 +293,7 @@ def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
 
 def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
     """Fit mu, u and v in alternation. Each is a weighted mean of residuals; u and v are shrunk."""
-    # Weight of a pair's own mean for the effects, relative to s / kappa.
+    # Precision of a pair's mean offset as a measurement of the effects, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
 
     below_u = _sums(pairs.subject, weight, V) + LAMBDA

@@ -185,7 +185,7 @@ def _counts(
 def _relations(
     scene: AnnotatedScene, meaning: Meaning
 ) -> tuple[PoseRelations, NDArray[np.float64] | None]:
-    """Derive the relations between all instances from the best annotation of the scene.
+    """Derive the relations between all instances of a scene, see `encode`.
 
     Returns:
         The relations, and the positions (n, 3) used to derive them; None without positions.

@@ -48,7 +48,7 @@ class Proposal:
         covered: maps each minimum to the number of classes and the covered share of the mentions.
         vocabulary: the vocabulary; merged lookalikes are aliases.
         dropped: (name, mentions, reason) of each name without a class.
-        values: the configuration by section.
+        values: entries of the configuration, by section.
         reasons: reason for each value, by "section.entry".
         parts: number of scenes in each part of the proposed split.
     """

@@ -186,7 +186,7 @@ def ask_outliers(
     rng: np.random.Generator,
     intruders: Mapping[tuple[str, str], Ints] | None = None,
 ) -> Answered | None:
-    """Ask for outliers; half of the scenes get an intruder.
+    """Ask for outliers; half of the scenes contain an added intruder.
 
     Args:
         intruders: candidate intruders by source and scene id, see `kinds_of_intruders`. None means

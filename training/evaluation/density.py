@@ -63,7 +63,7 @@ class DensitySettings:
     draws: int = 256
 
     def betas(self) -> list[float]:
-        """Return inverse temperatures from 0 to 1; they are denser near 1, where p changes most."""
+        """Return inverse temperatures from 0 to 1, denser near 1, where p(v) changes most."""
         return [float(x) for x in 1 - np.linspace(1.0, 0.0, self.temperatures) ** 2]
 
 
@@ -124,8 +124,8 @@ def machine_density(
     """Return the density of a machine of the local form.
 
     Args:
-        train: training scenes. Annealing starts at independent classes of their frequencies, and
-            the reverse run starts its Gibbs chains at these scenes.
+        train: training scenes. Annealing starts at independent classes with the frequencies of
+            these scenes. The reverse run starts its Gibbs chains at these scenes.
 
     Raises:
         ValueError: the machine has the seed form, in which relations affect p(v).

@@ -52,8 +52,9 @@ class Contradictions:
     """Contradictory relations in B scenes, between different classes.
 
     Attributes:
-        related: (B,) number of unordered pairs × canonical relations with at least one direction.
-        mirrored: (B,) number of these pairs with both directions.
+        related: (B,) number of pairs with a canonical relation in at least one direction, summed
+            over the relations.
+        mirrored: (B,) number of pairs with the relation in both directions, summed likewise.
         stacked: (B,) bool, the scene has an on-top relation.
         cyclic: (B,) bool, the scene has an on-top cycle.
     """

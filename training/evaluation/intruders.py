@@ -5,7 +5,7 @@
     room        uniform over the classes seen in training in the same room type
     signature   a class typical of another room type
 
-Scenes with fewer than three classes get no intruder.
+Scenes with fewer than three classes are skipped.
 
 The lift of a class in a room type is p(class | room type) / p(class), over training scenes with a
 known room type. The signature of a room type has at most ten classes, those with the highest lift.

@@ -13,9 +13,9 @@ Precision@5 is the share of hidden classes among the first five absent classes. 
 hidden classes, precision@5 cannot reach 1. For ties, a metric is the expectation under random
 order.
 
-Structure classes are neither hidden nor candidates. Scenes with fewer than two other classes are
-skipped. T2-at excludes relations between equal classes and relations with structure. In T2 all
-relations are unobserved, so that they reveal nothing about the removed object.
+Structure classes are never hidden and never candidates. Scenes with fewer than two other classes
+are skipped. T2-at excludes relations between equal classes and relations with structure. In T2 all
+relations are unobserved, because relations could reveal the removed object.
 """
 
 from __future__ import annotations
@@ -155,11 +155,11 @@ def leave_one_out(
     *,
     told_room: bool = False,
 ) -> Ranking:
-    """Rank every class when it is removed from its scene.
+    """Remove each class of each scene in turn, and rank the removed class.
 
     Args:
         structure: (V,) bool.
-        score: higher means more likely missing.
+        score: a higher score of a class means that the class is more likely missing.
         told_room: pass the room type of each scene to the score.
 
     Raises:

@@ -35,7 +35,7 @@ RARE = 10
 
 VERTICAL = (CANONICAL.index("on-top"), CANONICAL.index("above"))
 
-# Lower bound of a share, so that the log-loss of a pair is at most about 21 nats.
+# Lower bound of the listed relations' share, so that the log-loss of a pair is at most 21 nats.
 _LEAST = 1e-9
 
 Floats = NDArray[np.float64]

@@ -172,7 +172,7 @@ def switch_on_probability(
     for v, sign in ((there, 1.0), (absent, -1.0)):
         logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
         logit = logit + sign * machine.relation_term(logits, gate, r, observed).sum(-1)
-    # A relation that is on and requires i forces i on.
+    # If a relation is on and its gate would be closed without object i, object i must be present.
     held = (observed * r > machine.gate(edges, absent)).any(-1)
     return torch.where(held, torch.inf, logit).sigmoid()
 

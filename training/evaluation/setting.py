@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """One row of the tables: a callable per task; None if the row does not support the task.
+    """One row of the tables.
+
+    The attribute of a task is None if the row does not support the task.
 
     Attributes:
         objects: score of T2 and T3.

@@ -120,7 +120,8 @@ def _configs(
     """Return the full model and the selected rows, with the given limits.
 
     Raises:
-        ConfigError: invalid rows, see `load_rows`; no shipped rows; an unknown row.
+        ConfigError: the rows are invalid (see `load_rows`), the configuration has no shipped rows,
+            or a selected row is unknown.
     """
     full = load_config(reference)
     if limit is not None:

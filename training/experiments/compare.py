@@ -64,7 +64,7 @@ console = Console()
 
 @dataclass(frozen=True)
 class Example:
-    """One removed object of one scene.
+    """An example question: a scene with one removed object, and the answers of both models.
 
     Attributes:
         scene: scene id.

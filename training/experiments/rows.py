@@ -110,7 +110,7 @@ def baseline_rows(
         whole: add an alarm and place scores to object baselines.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: a name is not in `BASELINES`.
     """
     if unknown := sorted(set(names or ()) - set(BASELINES)):
         raise ValueError(f"unknown baselines {unknown}: must be among {list(BASELINES)}")

@@ -214,7 +214,7 @@ def _kept(
 ) -> tuple[Kept, str, bool]:
     """Return a filter for held-out scenes of a side, a note, and whether the filter is certain."""
     if side.artifact is None:
-        return _all, "", True  # fitted on the training scenes of the first model
+        return _all, "", True  # the baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(some) for name, some in sources.items()}
     shared = {
         name

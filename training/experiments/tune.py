@@ -152,7 +152,7 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not TOML: {error}") from error
     if not values:
-        raise ConfigError(f"{path.name} contains no settings")
+        raise ConfigError(f"the search space {path.name} contains no settings")
     found = {}
     for name, entry in values.items():
         if name.startswith(_FIXED):

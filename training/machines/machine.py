@@ -209,7 +209,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return values (B, E) of units as a table (B, A, n, n) over classes; -inf without a unit.
 
         Args:
-            classes: (B, n) int64, -1 where padded; `edges` are their units.
+            classes: (B, n) int64, -1 where padded; `edges` has the units between these classes.
         """
 
     @property

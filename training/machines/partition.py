@@ -1,4 +1,4 @@
-"""log Z by annealed importance sampling (AIS): a lower and an upper estimate.
+"""Lower and upper estimates of log Z by annealed importance sampling (AIS).
 
 The path runs over machines of the same family (`BoltzmannMachine.scaled`). It starts at beta = 0
 with independent objects, whose log Z is exact, and ends at the machine itself at beta = 1. Forward

@@ -327,7 +327,7 @@ class Triway(BoltzmannMachine):
         return _pairs(edges).unflatten(gate).sum((-1, -2)) @ self.kappa
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return the values in the layout of the units."""
+        """Return the values as a table over the classes, which is the layout of the units."""
         return _pairs(edges).unflatten(values)
 
     def acting_units(self, v: Tensor) -> Edges | None:

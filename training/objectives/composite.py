@@ -15,8 +15,9 @@ For scenes with annotated relations:
 
 This term approximates the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)) by
 the mean of h1. Unannotated relations are summed out. Scenes without annotated relations train the
-object part only. A machine with implications is trained on the same scenes with a random share of
-their relations given, by log p(r_e | r_given, v, E[h1 | v]) of the other relations.
+object part only. For a machine with implications, the loss has a second relation term: a random
+share of the relations of each scene is given, and the term is the sum of
+- log p(r_e | r_given, v, E[h1 | v]) over the other relations.
 
 A class that a source never mentions counts as absent from the scenes of the source. The reason is
 that a request has no source, and the service has to rank all classes.
@@ -132,7 +133,7 @@ class ObjectChains:
 
 
 class CompositeLikelihood(Objective):
-    """Ranking + presence_weight · presence + relation_weight · relations.
+    """The loss ranking + presence_weight · presence + relation_weight · relations.
 
     With a generative_weight (local form), the weighted persistent-chain gradient is added
     (`ObjectChains`). Conditionals alone give a joint distribution whose samples differ from the

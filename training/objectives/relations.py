@@ -19,8 +19,9 @@ A robot seldom sees a whole scene. In training, the context h1 therefore depends
 of the objects; the share is drawn uniformly for each scene. Otherwise the context would learn
 relations that hold in complete scenes of one source, and would not predict them in other scenes.
 
-A machine with implications is trained on the same scenes with a random share of their relations
-given, by log p(r_e | r_given, v, E[h1 | v]) of the other relations. The object part is unchanged.
+For a machine with implications, the loss has a second term: a random share of the relations of each
+scene is given, and the term is the sum of - log p(r_e | r_given, v, E[h1 | v]) over the other
+relations. The object part of the machine is not trained.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Salakhutdinov,
 "Probabilistic matrix factorization" (2007), for normal priors on factors.
