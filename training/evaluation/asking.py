@@ -47,7 +47,7 @@ def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floa
     """
     answers = [ask(case) for case in cases]
     if any(np.isnan(answer).any() for answer in answers):
-        raise FloatingPointError("an answer is NaN")
+        raise FloatingPointError("the score of a case is NaN")
     for k in np.random.default_rng(0).permutation(len(cases))[:_PROBED_CASES].tolist():
         if not np.allclose(ask(cases[k]), answers[k], rtol=1e-3, atol=1e-9):
             raise LeakError(_LEAK)

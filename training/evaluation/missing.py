@@ -105,7 +105,7 @@ class Ranking:
             FloatingPointError: a score is NaN.
         """
         if bool(values.isnan().any()):
-            raise FloatingPointError("a score is NaN")
+            raise FloatingPointError("the score of a class is NaN")
         chosen = values.gather(1, target.unsqueeze(1))
         above, ties = (values > chosen).sum(1), (values == chosen).sum(1) - 1
         return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes, skipped)

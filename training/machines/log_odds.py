@@ -201,10 +201,10 @@ def relation_log_odds_observed(machine: BoltzmannMachine, evidence: Evidence) ->
         ValueError: the machine has the local form, or a unit is unobserved.
     """
     if not machine.relations_act:
-        raise ValueError("the closed form exists only for a machine of the seed form")
+        raise ValueError("relation log-odds have a closed form only in a machine of the seed form")
     relations = evidence.relations(machine)
     if relations is None or not bool(relations[2].all()):
-        raise ValueError("the closed form needs evidence in which every relation unit is observed")
+        raise ValueError("the closed form of relation log-odds needs every relation unit observed")
     edges, r, _ = relations
     field = mean_field(machine, evidence)
     context = machine.relation_context(edges)
