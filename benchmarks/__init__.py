@@ -1,1 +1,1 @@
-"""Benchmarks: each compares with a yardstick measured in the same run. See docs/benchmarks.md."""
+"""Benchmarks: each compares our code with a yardstick in the same run. See docs/benchmarks.md."""

@@ -39,7 +39,7 @@ def log_odds(
         return object_log_odds(machine, Evidence(v))
 
     def two_copies() -> Any:
-        """Score each class as present against absent; valid for all classes."""
+        """Compare each scene with the class present and absent; valid for all classes."""
         present = np.repeat(v.numpy(), V, axis=0)
         absent = present.copy()
         np.fill_diagonal(present, 1)
@@ -47,7 +47,7 @@ def log_odds(
         return rbm._free_energy(absent) - rbm._free_energy(present)
 
     def one_copy() -> Any:
-        """Score each class as present against the unchanged scene; valid for absent classes."""
+        """Compare the scene with the class added and unchanged; valid for absent classes."""
         present = np.repeat(v.numpy(), V, axis=0)
         np.fill_diagonal(present, 1)
         return rbm._free_energy(v.numpy()) - rbm._free_energy(present)

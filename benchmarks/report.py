@@ -31,7 +31,7 @@ class Result:
         subject: name of our contender.
         timings: timings of all contenders.
         work, unit: amount of work of one call and its unit; without a unit, only times are shown.
-        targets: minimum speed ratio that we aim at, by yardstick.
+        targets: target of the speed ratio (minimum), by yardstick.
         facts: further results.
     """
 
@@ -63,7 +63,10 @@ class Result:
         }
 
     def table(self) -> Group:
-        """Return a table by contender; the ratio is our speed over theirs, with quartiles."""
+        """Return a table with one row per contender.
+
+        The ratio is our speed divided by the contender's speed, with quartiles.
+        """
         table = Table(title=self.title, title_justify="left")
         table.add_column("")
         table.add_column("a call", justify="right")

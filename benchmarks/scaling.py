@@ -1,9 +1,9 @@
 """Cost of larger vocabularies: memory of the loaded model, and latency of every question.
 
 The weights are random, with the sizes and standard deviations of the shipped default model and the
-same number of objects per scene. Latency depends on these, not on the learnt values. Random
-relation weights have a higher rank than trained ones, so `/relations` takes longer here. The
-benchmark serves to compare vocabulary sizes.
+same number of objects per scene. Latency depends on these properties, not on the learnt values.
+Random relation weights have a higher rank than trained weights, so `/relations` takes longer here.
+The benchmark therefore only compares vocabulary sizes.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def _machine(spec: MachineSpec, objects: int) -> BoltzmannMachine:
         parameter = machine.get_parameter(name)
         parameter.copy_(torch.randn(parameter.shape, generator=generator) * spread)
     machine.d.fill_(-2.0)
-    # Random rules at full strength would turn on hundreds of relations.
+    # Random implication weights at full strength would turn on hundreds of relations.
     machine.get_parameter("gamma").mul_(0.2)
     # Distinct sorted triples (a, i, j), evenly spread over all triples.
     units = spec.A * spec.V**2

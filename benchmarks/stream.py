@@ -1,10 +1,10 @@
 """``python -m benchmarks.stream``: updates over a stream, compared with requests of whole scenes.
 
-At each tick one object of a room with poses moves, and all three questions are asked. Blocks of
-ticks alternate between the stream and requests, so that both see the same machine. Without the
-stream, a tick takes three requests on a keep-alive connection. A ping between two updates measures
-the round-trip time.
-Latency runs from the scheduled time of a tick, so it includes delays of the client.
+At each tick one object of a room with poses moves, and the client asks all three questions. Blocks
+of ticks alternate between the stream and requests, so that both run under the same conditions.
+Without the stream, a tick takes three requests on a keep-alive connection. A ping between two
+updates measures the round-trip time. Latency runs from the scheduled time of a tick, so it includes
+delays of the client.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ async def measure(port: int, *, updates: int, rate: float, objects: int) -> Meas
 
 
 class _Run:
-    """A stream and a connection, used alternately."""
+    """One run, which alternates between a stream and a connection for requests."""
 
     def __init__(
         self,

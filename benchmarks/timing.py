@@ -1,4 +1,4 @@
-"""Interleaved timing: contenders take turns, so that all see the same state of the machine.
+"""Interleaved timing: contenders take turns, so that all run under the same conditions.
 
 The speed of a shared machine varies within seconds. Contenders run alternately in short slices, and
 the first contender changes from round to round. The speed ratio is computed within each round. The

@@ -1,4 +1,4 @@
-"""One step of contrastive divergence: active pairs with shared weights against a dense machine."""
+"""Time of a contrastive-divergence step: active pairs with shared weights, and a dense machine."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def agreement(scenes: list[EncodedScene], structure: np.ndarray, seed: int = 0) 
 def _relations(
     scan: EncodedScene, other: EncodedScene, structure: np.ndarray
 ) -> tuple[float, float, float]:
-    """Return (expected hits, annotated triples, hits of random order) over a scan's candidates."""
+    """Return (expected hits, annotated triples, expected hits in random order) of one scan."""
     ours, theirs = scan.evidence, other.evidence
     usable = ~structure[ours.classes]
     pair = usable[:, None] & usable[None, :] & ~np.eye(len(usable), dtype=np.bool_)

@@ -83,7 +83,7 @@ class Scenes:
         return found[:24]
 
     def scene(self) -> dict[str, Json]:
-        """Return the fields common to all questions."""
+        """Return random values for the fields that all questions share."""
         rng, labels = self.rng, self.classes()
         body: dict[str, Json] = {"objects": labels}
         form = rng.random()
@@ -139,7 +139,7 @@ class Scenes:
         ]
 
     def options(self, question: str, body: dict[str, Json]) -> dict[str, Json]:
-        """Return the fields of one question."""
+        """Return random values for the fields that only this question has."""
         rng = self.rng
         names = [o if isinstance(o, str) else o.get("id", o["label"]) for o in body["objects"]]
         found: dict[str, Json] = {}

@@ -1,10 +1,9 @@
 """`python -m scripts.estimators`: errors of the closed form and of 64 samples.
 
-The reference uses many more samples (by default 4,096). The model is a shipped one with a closed
-form.
-Its own scenes are used in three forms: labels only, with 20 random relations, or with random poses,
-which determine hundreds of relations. Errors of objects are in nats of log-odds; errors of
-relations and placements are in probability.
+The reference uses many more samples (by default 4,096). The model is a shipped model whose answers
+have a closed form. The scenes are samples of the model in three forms: labels only, with 20 random
+relations, or with random poses, which determine hundreds of relations. Errors of objects are in
+nats of log-odds. Errors of relations and placements are in probability.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Write requirements*.lock from both pyproject.toml: exact versions that are tested together.
+"""Write requirements*.lock from both pyproject.toml files: exact versions, tested together.
 
 pip resolves the development set first, without installation. The smaller sets are then resolved
 within these pins, so that all files agree.

@@ -1,8 +1,8 @@
 """``python -m scripts.request_path``: files and functions of this project that a request uses.
 
-The script counts Python functions of `app` and `scene_client`, and the compiled loops that they
-call, during one warm request in process. Generated methods and comprehensions count as part of
-their function.
+The script sends one warm request to an application in this process. It counts the Python functions
+of `app` and `scene_client` and the compiled loops that the request calls. Generated methods and
+comprehensions count as part of their function.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def excerpt(module: str, name: str) -> Excerpt:
     """Return the source of a function, method or class of the repository.
 
     Raises:
-        PluginError: the name does not exist.
+        PluginError: the module or the name in it does not exist.
     """
     path = module_path(module)
     text = (REPOSITORY / path).read_text(encoding="utf-8")

@@ -24,11 +24,11 @@ class Batch:
 
     Attributes:
         v: (B, V) presence.
-            classes: (B, n) int64 class indices; padding is -1.
-            counts: (B, n) int64 instances of each class; 0 means that the source gives no count.
-            holds, observed: (B, A, n, n) relations between those classes.
-            room: (B,) int64 room type; -1 means unknown.
-            source: (B,) int64 index into the source names of the scene tensors.
+        classes: (B, n) int64 class indices; padding is -1.
+        counts: (B, n) int64 instances of each class; 0 means that the source gives no count.
+        holds, observed: (B, A, n, n) relations between those classes.
+        room: (B,) int64 room type; -1 means unknown.
+        source: (B,) int64 index into the source names of the scene tensors.
     """
 
     v: Tensor
@@ -52,14 +52,14 @@ class SceneTensors:
     """A set of N scenes; `batch` returns some of them.
 
     Attributes:
-            scenes: the encoded scenes.
-            v: (N, V) presence of each class.
-            room: (N,) room types.
-            source: (N,) int64 index into annotated_classes and source_names.
-            annotated_classes: (sources, V) bool.
-            source_names: sorted names of the sources.
-            weight: (N,) weight of each scene in object learning.
-            complete: (N,) bool; true if the object list covers nearly the whole scene.
+        scenes: the encoded scenes.
+        v: (N, V) presence of each class.
+        room: (N,) room types.
+        source: (N,) int64 index into annotated_classes and source_names.
+        annotated_classes: (sources, V) bool, True for the classes that a source annotates.
+        source_names: sorted names of the sources.
+        weight: (N,) weight of each scene in object learning.
+        complete: (N,) bool; true if the object list covers nearly the whole scene.
     """
 
     scenes: Sequence[EncodedScene]
@@ -81,7 +81,7 @@ class SceneTensors:
         return len(self.scenes)
 
     def batch(self, index: Tensor) -> Batch:
-        """Return the scenes at the given positions as one batch."""
+        """Return the scenes at the given indices as one batch."""
         chosen = [self.scenes[k].evidence for k in index.tolist()]
         n = max((len(e.classes) for e in chosen), default=0)
         relations = chosen[0].holds.shape[0] if chosen else 0
@@ -110,11 +110,11 @@ def scene_tensors(
     """Return encoded scenes as tensors.
 
     Args:
-            annotated: for each source, (V,) bool of the classes that the source mentions.
-            size: number of classes V.
+        annotated: for each source, (V,) bool of the classes that the source mentions.
+        size: number of classes V.
 
-        Raises:
-            ValueError: `annotated` has no entry for the source of a scene.
+    Raises:
+        ValueError: `annotated` has no entry for the source of a scene.
     """
     names = sorted(annotated)
     if missing := {scene.source for scene in scenes} - set(names):
@@ -133,7 +133,7 @@ def scene_tensors(
 
 
 def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
-    """Return the scenes at the given positions."""
+    """Return the scenes at the given indices."""
     return replace(
         scenes,
         scenes=[scenes.scenes[k] for k in index.tolist()],
@@ -144,7 +144,7 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
 
 
 def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
-    """Return (edges, r, observed) of a batch in the layout of the machine."""
+    """Return the relation units of a batch, (edges, r, observed), as the machine arranges them."""
     return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 

@@ -3,10 +3,10 @@
 All fits use validation scenes. The entries are:
 
     missing, outlier   see `training.calibrate_objects`
-    relation   the relation holds between this pair of instances; fitted once for scenes without
-               observed relations, and once for scenes where half of the pairs are observed
-    placement  the same for a pair whose subject or object was removed from the scene
-    misplaced  the relation is false; one triple was altered in half of the scenes
+    relation   p(the relation holds between two instances). One fit uses scenes without observed
+               relations; another fit uses scenes where half of the pairs are observed
+    placement  p(the relation holds), where the subject or the object was removed from the scene
+    misplaced  p(the relation is false), fitted to scenes of which half have one altered triple
 
 All fits are logistic regressions (Platt scaling) on relations that a source states as true or
 false. Unstated relations are left out. One procedural source has more examples than all other
@@ -50,7 +50,8 @@ from training.evaluation.outliers import kept_in_each_source
 from training.oracle.units import NO_UNIT
 
 _SCENES = 2500
-# A machine without a closed form samples its answers, which takes a hundred times longer.
+# Number of scenes for a machine without a closed form: it samples its answers, which takes a
+# hundred times longer.
 _SCENES_OF_DRAWS = 300
 # An answer lists the best 20 relations by default.
 _LISTED = 20
@@ -67,9 +68,9 @@ _POWER = 0.5
 _BENDS = 7
 _LEAST_SLOPE = 0.05
 _STIFFNESS = 2.0
-# The truth value of a relation that the source does not state.
+# Truth value of a relation whose truth is unknown.
 _UNKNOWN = -1.0
-# Cases drawn from each scene. With one case a scene, the fit depends too much on chance.
+# Number of placement cases from each scene. With one case, the fit depends too much on chance.
 _PLACEMENT_CASES = 4
 
 
@@ -83,10 +84,10 @@ def calibrate(
     """Fit every entry of the calibration.
 
     Args:
-            artifact: the artifact with the neutral calibration.
-            scenes: validation scenes.
-            train: training scenes, which give the popularity of classes.
-            chosen: see `calibrate_objects`.
+        artifact: the artifact with the neutral calibration.
+        scenes: validation scenes.
+        train: training scenes, which give the popularity of classes.
+        chosen: see `calibrate_objects`.
     """
     structure = torch.from_numpy(artifact.vocabulary.structure.copy())
     objects = calibrate_objects(artifact, scenes, train, structure, seed, chosen)
@@ -111,7 +112,10 @@ def calibrate(
 
 
 def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[PairSlope, ...]:
-    """Fit the relations of instance pairs to class-level log-odds, without observed relations."""
+    """Fit p(a relation holds between two instances) to the log-odds of their classes.
+
+    The fit uses scenes without observed relations.
+    """
     examples = _examples(_asked_pairs(artifact, scenes))
     return _fit_listed(examples, artifact.spec.A, _LISTED)
 
@@ -119,11 +123,11 @@ def fit_relations(artifact: Artifact, scenes: Sequence[EncodedScene]) -> tuple[P
 def fit_given(
     artifact: Artifact, scenes: Sequence[EncodedScene], alone: tuple[PairSlope, ...], seed: int = 0
 ) -> tuple[PairSlope, ...]:
-    """Fit the relations where half of the pairs of a scene are observed; the other half is asked.
+    """Fit the relations of one half of the pairs of a scene, given the other half as observed.
 
-    The ranking of relations stays the one fitted without observed relations. Separate slopes would
-    be fitted to the few sources that list many relations. For other sources, observed relations
-    then made answers worse.
+    The ranking of relations comes from `alone`, the fit without observed relations. Separate slopes
+    would depend on the few sources that list many relations. With separate slopes, observed
+    relations made the answers for other sources worse.
     """
     blocks = _asked_pairs(artifact, scenes, np.random.default_rng(seed))
     return _as_often_as_it_holds(_examples(blocks), alone, _LISTED)
@@ -198,13 +202,16 @@ def fit_placements(
 
 
 def _examples(blocks: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return all examples except those of relations without a unit, which have no log-odds."""
+    """Return the examples of relations with a unit; other relations have no log-odds."""
     every = np.concatenate(blocks or [np.zeros((0, _SOURCE + 1))])
     return every[every[:, _LOGIT] > NO_UNIT]
 
 
 def _told(examples: NDArray[np.float64], sources: Sequence[str]) -> NDArray[np.float64]:
-    """Keep examples from sources that state which relations are false; all if no source does so."""
+    """Return the examples from sources that state where the relation is false.
+
+    If no source states this for a relation, return all examples of the relation.
+    """
     telling = np.array([[how != "unobserved" for how in meaning_of(s).unlisted] for s in sources])
     relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
     told = telling[source, relation]
@@ -217,9 +224,9 @@ def _fit_listed(
 ) -> tuple[PairSlope, ...]:
     """Fit all relations, mainly to the best `listed` examples of each scene, which an answer lists.
 
-    A listed example was selected for its high log-odds, so its relation holds less often than other
-    pairs with equal log-odds suggest. Unlisted examples have a small weight. Unknown examples take
-    part in the ranking and have no weight in the fit.
+    A listed example was selected for its high log-odds. Its relation therefore holds less often
+    than other pairs with equal log-odds suggest. Examples that an answer would not list have a
+    small weight. Examples with unknown truth take part in the ranking but not in the fit.
     """
     known = examples[:, _TRUTH] != _UNKNOWN
     slopes = _fit_each(examples[known], relations, np.ones(known.sum()))
@@ -235,8 +242,8 @@ def _as_often_as_it_holds(
 ) -> tuple[PairSlope, ...]:
     """Fit one rising curve over the logits of all relations to the listed examples.
 
-    The curve makes the probabilities right on average over all sources. It keeps the ranking of
-    relations from the fit that gives all sources a similar weight.
+    With the curve, the average probability over all sources equals the share of true relations.
+    The curve keeps the ranking of relations, which comes from a fit with similar source weights.
     """
     best = _among_best(examples, slopes, listed) & (examples[:, _TRUTH] != _UNKNOWN)
     examples = examples[best]
@@ -258,7 +265,7 @@ def _as_often_as_it_holds(
 def rising_curve(
     logits: NDArray[np.float64], truth: NDArray[np.bool_]
 ) -> tuple[float, float, tuple[tuple[float, float], ...]]:
-    """Fit the log-odds of a truth as a rising, piecewise linear function of logits, both (n,).
+    """Fit the log-odds of the truth values (n,) as a rising, piecewise linear function of logits.
 
     A penalty on changes of slope stabilises the curve where there are few examples.
 
@@ -301,7 +308,10 @@ def _logits(examples: NDArray[np.float64], slopes: tuple[PairSlope, ...]) -> NDA
 
 
 def _source_weights(examples: NDArray[np.float64], best: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return (N,) weights: the number of listed examples of the source and relation to a power."""
+    """Return the weights of the examples, (N,).
+
+    A weight is the number of listed examples with the same source and relation, to a power.
+    """
     relation, source = examples[:, _RELATION].astype(int), examples[:, _SOURCE].astype(int)
     key = relation * (source.max(initial=0) + 1) + source
     counts = np.bincount(key[best], minlength=int(key.max(initial=-1)) + 1)
@@ -344,8 +354,8 @@ def _instance_pairs(
     """Return the examples of a scene, (examples, 7).
 
     The columns are: scene, relation, class log-odds, log n_i + log n_j, log of the number of
-    classes, whether the relation holds, and the source. Of unknown relations, only the best that an
-    answer may list are included.
+    classes, whether the relation holds, and the source. The examples with unknown truth are only
+    those with log-odds high enough for an answer to list them.
     """
     evidence = scene.evidence
     place = np.searchsorted(evidence.classes, scene.instance_classes)
@@ -384,8 +394,8 @@ def fit_misplaced(
 ) -> tuple[Slope, Thresholds]:
     """Fit the log-odds that a relation is false to its log-odds given the rest of the scene.
 
-    The thresholds are fitted to unaltered scenes. Each threshold is reached in the share of scenes
-    given by `ALARMS`, in the hardest source, by the relation that is most likely to be false.
+    The thresholds are fitted to unaltered scenes of the hardest source. In the share of scenes
+    given by `ALARMS`, the relation that is most likely to be false reaches the threshold.
     """
     rng = np.random.default_rng(seed)
     rows: list[tuple[float, bool]] = []

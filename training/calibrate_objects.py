@@ -2,10 +2,10 @@
 
     coverage   the default coverage and the weight of the partial posterior, chosen by the rank of
                hidden classes
-    missing    p(present | not listed), fitted to scenes of which 25 %, 50 %, 75 % or all but one
-               class are shown; the weight of a source is its number of scenes, where
-               near-duplicates count by their weight
-    outlier    p(intruder) and its thresholds; half of the scenes are clean
+    missing    p(present | not listed), fitted to scenes that show 25 %, 50 %, 75 % or all but one
+               of their classes. The weight of a source is the sum of its scene weights, so
+               near-duplicates count less
+    outlier    p(intruder) and its thresholds; half of the scenes have no intruder
     evidence   the weight of relations and poses in answers about objects
 
 The prior of an intruder is proportional to popularity^alpha. Alpha and the logistic regression are
@@ -61,18 +61,20 @@ _SHORT_LIST_SCENES = 30
 _NEVER = Thresholds(low=1.0, medium=1.0, high=1.0)
 # Number of scenes used from each source.
 _PARTIAL_SCENES = 120
-# Number of draws of the hidden class where all but one class are shown.
+# Number of draws of the hidden class, for scenes that show all but one class.
 _DRAWS_OF_ONE = 4
-# Generated scenes below this quantile of the sizes of real rooms are too small. `_UNSUITED` is the
-# same for the fit to a room type. A room type needs `_ROOM_SCENES` scenes for its own limits.
+# Quantiles of real rooms. A generated scene is too small if its size is below quantile `_SMALL`. It
+# does not suit its room type if its `room_fit` is below quantile `_UNSUITED`. A room type needs
+# `_ROOM_SCENES` scenes for its own limits.
 _SMALL = 0.1
 _UNSUITED = 0.15
 _ROOM_SCENES = 20
 _EVIDENCE_SCENES = 400
-# A machine without a closed form samples its answers, which takes a hundred times longer.
+# Number of scenes for a machine without a closed form: it samples its answers, which takes a
+# hundred times longer.
 _EVIDENCE_SCENES_OF_DRAWS = 100
-# Losses that are accepted for gains elsewhere: hit@1 and detected share of uniform intruders, and
-# MRR of nearly complete lists.
+# Accepted losses: of hit@1 and of the detected share for uniform intruders, and of MRR for nearly
+# complete lists.
 _UNIFORM_LOSS = np.array([0.04, 0.06])
 _COMPLETE_LOSS = 0.002
 _NEARLY_COMPLETE = ("75 %", "all but one")
@@ -89,7 +91,7 @@ def complete_scenes(scenes: SceneTensors, seed: int = 0) -> SceneTensors:
     """
     rng = np.random.default_rng(seed)
     complete = scenes.complete.numpy()
-    # A model of photographs alone has no complete scenes for its calibration.
+    # A model trained on photographs only has no complete scenes. Its calibration uses all scenes.
     complete = complete if complete.any() else ~complete
     kept = complete & (rng.random(len(scenes)) < scenes.weight.numpy())
     return subset(scenes, torch.from_numpy(np.flatnonzero(kept)))
@@ -106,11 +108,11 @@ def calibrate_objects(
     """Return the artifact's calibration with every entry about objects fitted.
 
     Args:
-            validation: scenes that were not used in training.
-            train: scenes that give the popularity of classes and the signatures of room types.
-            structure: (V,) bool, true for structure classes.
-            chosen: a calibration with values chosen on other validation scenes: coverage and its
-                weight, weights of evidence, alpha. Without it, these values are chosen here.
+        validation: scenes that were not used in training.
+        train: scenes that give the popularity of classes and the signatures of room types.
+        structure: (V,) bool, true for structure classes.
+        chosen: a calibration with values chosen on other validation scenes: coverage and its
+            weight, weights of evidence, alpha. Without it, these values are chosen here.
     """
     scenes = complete_scenes(validation, seed)
     if not len(scenes):
@@ -149,7 +151,7 @@ def popularity(train: SceneTensors) -> Floats:
 def smallest_scenes(train: SceneTensors, structure: Tensor, rooms: int) -> tuple[int, ...]:
     """Return the 10 % quantile of the class counts of each room type and of all scenes, (C + 1,).
 
-    A room type with fewer than 20 scenes gets the value of all scenes.
+    For a room type with fewer than 20 scenes, the quantile over all scenes is used.
     """
     sizes = ((train.v > 0) & ~structure).sum(1).numpy()
     every = int(np.quantile(sizes, _SMALL))
@@ -175,16 +177,16 @@ def room_limits(artifact: Artifact, train: SceneTensors) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """One scene of which a part is shown.
+    """A scene that shows some of its classes and hides the others.
 
     Attributes:
         closed: (n,) log-odds of the unlisted classes in closed form.
-        partial: their log-odds (n,) in the partial posterior, by coverage.
-        hidden: (n,) bool, the hidden ones among the unlisted classes.
+        partial: log-odds (n,) of the unlisted classes in the partial posterior, by coverage.
+        hidden: (n,) bool, True where an unlisted class is in the scene but hidden.
         listed: number of listed classes.
-        share: name of the share of shown classes.
+        share: share of shown classes as text, such as "75 %".
         source: index of the scene's source.
-        weight: number of scenes of its source that the scene represents.
+        weight: weight of the scene: the number of scenes for which it stands.
     """
 
     closed: Floats
@@ -224,7 +226,10 @@ def fit_coverage(
 
 
 def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
-    """Choose coverage and weight by MRR; nearly complete lists lose `_COMPLETE_LOSS` at most."""
+    """Return the coverage and weight with the best MRR.
+
+    Their MRR on nearly complete lists may be at most `_COMPLETE_LOSS` below the best one.
+    """
     nearly = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
     least = [_mrr(some, 0.5, 0.0) - _COMPLETE_LOSS for some in nearly]
     allowed = [(0.5, 0.0)] + [
@@ -288,7 +293,7 @@ def _mixed(case: _Shown, coverage: float, weight: float) -> Floats:
 
 
 def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
-    """Return the mean of 1 / rank of hidden classes among other classes; sources count equally."""
+    """Return the mean of 1 / rank of hidden classes; all sources have the same weight."""
     found: dict[int, list[Floats]] = {}
     for case in cases:
         z = _mixed(case, coverage, weight)
@@ -299,7 +304,7 @@ def _mrr(cases: Sequence[_Shown], coverage: float, weight: float) -> float:
 
 
 def _rows(case: _Shown, coverage: float, weight: float) -> Floats:
-    """Return (n, 3) of the best classes: log-odds, log of the listed classes, hidden or not."""
+    """Return rows (n, 3) of the best classes: log-odds, log of the list's length, 1 if hidden."""
     z = _mixed(case, coverage, weight)
     first = np.argsort(-z, kind="stable")[:_LISTED]
     size = np.full(len(first), np.log(case.listed))
@@ -319,10 +324,11 @@ def fit_outliers(
 ) -> dict[str, Any]:
     """Fit `popularity_weight`, `outlier`, `outlier_thresholds` and `short_list_thresholds`.
 
-    At the start of a tour, a robot has listed few classes. The probability is fitted to whole
-    scenes and is too high for short lists. For example, a stove alone is rare in a procedural room.
-    Short lists therefore have their own thresholds, fitted by the same rule to parts of the same
-    scenes. They are at least the thresholds of whole scenes and at most those of shorter lists.
+    At the start of a tour, a robot lists few classes. The probability is fitted to whole scenes and
+    is too high for short lists. For example, a stove alone is rare in a procedural room. Short
+    lists therefore have their own thresholds, fitted by the same rule to parts of the same scenes.
+    A threshold for short lists is at least the threshold for whole scenes. It is at most the
+    threshold for shorter lists.
     """
     score = MachineScore(machine_of(artifact.weights))
     prior = np.array(artifact.calibration.popularity)
@@ -373,9 +379,10 @@ def fit_outliers(
 def listing(
     scenes: SceneTensors, structure: Tensor, listed: int, rng: np.random.Generator
 ) -> tuple[SceneTensors, Tensor]:
-    """Return scenes with more than `listed` classes, and presence (N, V) of `listed` of them each.
+    """Return the scenes with more than `listed` classes, and their shortened lists (N, V).
 
-    Structure classes stay listed and are not counted.
+    A shortened list contains `listed` classes of the scene, drawn at random. It also contains the
+    structure classes of the scene, which are not counted.
     """
     plain = (scenes.v > 0) & ~structure
     large = (plain.sum(1) > listed).nonzero().squeeze(1)
@@ -406,7 +413,7 @@ def _between(low: Thresholds, found: Thresholds, high: Thresholds) -> Thresholds
 
 
 def choose_alpha(kinds: dict[str, IntruderScores], prior: Floats) -> float:
-    """Choose the alpha with the best mean of hit@1 and detected share over the kinds of intruders.
+    """Return the alpha with the best mean of hit@1 and detected share over all intruder kinds.
 
     Uniform intruders may lose at most .04 of hit@1 and .06 of the detected share compared with
     alpha 0.
@@ -460,7 +467,7 @@ def fit_evidence(
 
 
 def least_of_the_best(scores: dict[float, float]) -> float:
-    """Return the least weight that counts as equal to the best; a needless weight may do harm."""
+    """Return the least weight whose score is within `_AS_GOOD` of the best score."""
     enough = max(scores.values()) - _AS_GOOD
     return min(pull for pull, score in scores.items() if score >= enough)
 

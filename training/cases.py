@@ -1,8 +1,8 @@
-"""Scenes as questions: their stated, hidden and altered parts.
+"""Turn scenes into test questions: choose the parts of a scene to state, hide or alter.
 
 The random choices for a scene depend only on the seed and the scene's name. They do not depend on
-the model, the other scenes or the batches. So every model is asked the same questions, for one
-source or for all sources together.
+the model, the other scenes or the batches. So every model gets the same questions, whether the
+evaluation uses one source or all sources.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def scene_rng(scene: EncodedScene, seed: int) -> np.random.Generator:
 
 
 def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> SceneTensors:
-    """Return at most `limit` scenes in their order; every model gets the same scenes."""
+    """Return at most `limit` random scenes in their original order, the same for every model."""
     if limit is None or len(scenes) <= limit:
         return scenes
     place = [crc32(f"{seed} {scene.source} {scene.scene_id}".encode()) for scene in scenes.scenes]
@@ -40,7 +40,7 @@ def some_scenes(scenes: SceneTensors, limit: int | None, seed: int = 0) -> Scene
 
 
 def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Triple]) -> Scene:
-    """Return the instances at the given positions as a scene, like that of a request."""
+    """Return the instances at the indices `kept` as a scene, in the form of a request."""
     objects = tuple(
         SceneObject(id=str(k), label=str(c), class_index=int(c))
         for k, c in enumerate(encoded.instance_classes[list(kept)])
@@ -50,11 +50,11 @@ def scene_of(encoded: EncodedScene, kept: Sequence[int], triples: Sequence[Tripl
 
 
 def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
-    """Return (A, N, N) bool: the truth of a relation is known, and an annotator did not choose it.
+    """Return (A, N, N) bool: True for relations with known truth, without selection bias.
 
     Some sources list left and front occasionally and never state that they do not hold. Such
-    sources do not tell how often the relations hold. For them, only pairs with one object on or
-    above the other are kept, because left and front do not hold there unless listed.
+    sources do not show how often these relations hold. For such sources, the mask contains only
+    pairs with one object on or above the other. On these pairs, an unlisted left or front is false.
     """
     unlisted = meaning_of(encoded.source).unlisted
     known, holds = encoded.instance_observed.copy(), encoded.instance_holds
@@ -72,7 +72,11 @@ def known_relations(encoded: EncodedScene) -> NDArray[np.bool_]:
 def taken_away(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[int, list[int]] | None:
-    """Draw a class that may be missing; return it with the instances of all other classes."""
+    """Draw a class to remove; return the class and the indices of all other instances.
+
+    Structure classes stay in the scene. The result is None for a scene with fewer than two classes
+    to draw from.
+    """
     classes = encoded.evidence.classes
     removable = classes[~structure[classes]]
     if len(removable) < 2:
@@ -90,7 +94,7 @@ def told_pairs(
     without an observed relation would have fewer relations than other pairs.
 
     Returns:
-        (N, N) bool of the pairs left to ask, and the observed triples.
+        (N, N) bool, True for the unobserved pairs; and the observed triples.
     """
     size = len(encoded.instance_classes)
     half = np.triu(rng.random((size, size)) < 0.5, 1)
@@ -115,7 +119,8 @@ def occupied_place(
         shown: (n,) instances.
 
     Returns:
-        The canonical relation and the instance that is its object; None without such a place.
+        The canonical relation of the place, and the index of the shown object, which is the object
+        of the relation. None if the scene has no such place.
     """
     usable = ~structure[encoded.instance_classes]
     stands = encoded.instance_holds & known_relations(encoded) & usable[:, None] & (usable & shown)
@@ -129,7 +134,11 @@ def occupied_place(
 def altered_case(
     encoded: EncodedScene, structure: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[Scene, tuple[int, int, int] | None] | None:
-    """Return a scene with its triples; in half of the cases a false triple replaces one of them."""
+    """Return a scene with its triples, and the altered triple.
+
+    In half of the cases, a false triple replaces one of the triples. In the other half, all triples
+    are true and the altered triple is None.
+    """
     usable = ~structure[encoded.instance_classes]
     holds = encoded.instance_holds & usable[:, None] & usable[None, :]
     triples = [(int(a), int(i), int(j)) for a, i, j in np.argwhere(holds)]

@@ -79,8 +79,8 @@ def train(
         bool,
         typer.Option(
             "--final",
-            help="learn from 90 % of all scenes and calibrate on the rest; --publish then takes "
-            "its figures from the run without --final, which must be finished",
+            help="train on 90 % of all scenes and calibrate on the rest; --publish then copies "
+            "the test results of the run without --final, which must be finished",
         ),
     ] = False,
     tensorboard: Annotated[
@@ -124,7 +124,8 @@ def publish(
         bool,
         typer.Option(
             "--promote",
-            help="move `default`, or --alias, unless the version is worse than the served one",
+            help="point `default` (or --alias) at the version, unless it is worse than the served "
+            "version",
         ),
     ] = False,
     margin: Annotated[
@@ -140,10 +141,10 @@ def publish(
     """Calibrate, evaluate and publish a finished run.
 
     With --promote, the run is first compared with the version that the alias serves. The comparison
-    uses test scenes that neither version has learnt from. The run is refused if a primary metric is
-    worse by more than the margin (the whole 95 % interval of the paired difference). It is also
-    refused if it has no measurements of relations and the served version has them. A refused run is
-    not published, and the exit code is 3.
+    uses test scenes that neither version was trained on. The run is refused if a primary metric is
+    worse by more than the margin (the whole 95 % interval of the paired difference). The run is
+    also refused if only the served version has results for relations. A refused run is not
+    published, and the exit code is 3.
     """
     try:
         run = load_run(folder)
@@ -172,9 +173,9 @@ def evaluate_command(
     part: Annotated[str, typer.Option(help="train, validation or test")] = "test",
     output: Annotated[Path | None, typer.Option("--json", help="write the figures here")] = None,
 ) -> None:
-    """Evaluate stored models on the split of their training: the figures of a model card.
+    """Evaluate stored models on the split of their training, as for the model card.
 
-    `benchmark` measures the baselines.
+    The command `benchmark` evaluates the baselines.
     """
     try:
         tables: dict[str, list[Row]] = {}
@@ -193,7 +194,9 @@ def evaluate_command(
                 raise ConfigError(f"part must be one of {', '.join(some)}, not {part!r}")
             index = [k for k, scene in enumerate(some[part].scenes) if scene.source in wanted]
             if not index:
-                raise ConfigError(f"{reference} has no {part} scenes of these sources")
+                raise ConfigError(
+                    f"{reference}: the {part} part contains no scenes of {', '.join(wanted)}"
+                )
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:
                 tables[reference] = evaluate(
@@ -333,7 +336,7 @@ def _promote(
     if before.note:
         console.print(before.note, soft_wrap=True)
     _published(artifact)
-    # Fails if the alias has moved since the comparison, which used the earlier version.
+    # This fails if another process changed the alias during the comparison.
     target = AliasTarget(name=artifact.manifest.name, version=version)
     store.set_alias(gate.alias, target, expected=before.target)
     was = f", before {before.target}" if before.target is not None else ""

@@ -15,11 +15,11 @@ from app.inference.variants import VARIANTS, Form, Variant
 from training.machines import MachineSpec, build
 
 DATA = Path("../shared/data")
-"""Folder in which the named sources are looked up."""
+"""Default folder of the named sources."""
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used; the message gives the entry and the reason."""
+    """A configuration is invalid; the message gives the entry and the reason."""
 
 
 def is_file(source: str) -> bool:
@@ -51,7 +51,7 @@ class DataConfig(_Section):
     split: Literal["group", "stable", "random", "final"] = "group"
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
-    limit: int | None = Field(default=None, ge=10, description="most scenes from each source")
+    limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")
     words: str = Field(
         default="", description="file of word vectors in the data folder; empty: no vectors"
     )
@@ -75,7 +75,10 @@ class DataConfig(_Section):
 
 
 class MachineConfig(_Section):
-    """The shape of the machine; V, A, C and T follow from the data."""
+    """The shape of the machine.
+
+    The numbers of classes V, relations A, room types C and triples T follow from the data.
+    """
 
     variant: Variant
     H1: int = Field(default=200, ge=1)
@@ -190,22 +193,26 @@ class Config(_Section):
         if self.machine.G and not (local and kind.implications):
             raise ValueError("machine.G is defined for the local form of the Triway only")
         if self.machine.N and not local:
-            raise ValueError("machine.N is defined for the local form only")
+            raise ValueError("machine.N is defined for the local form only: it must be 0")
         if "rooms" in self.data.sources and not self.data.rooms:
-            raise ValueError("data.rooms must say how many rooms to generate")
+            raise ValueError("data.rooms must be at least 1, because `rooms` is a source")
         if self.objective.generative_weight and not local:
-            raise ValueError("objective.generative_weight is defined for the local form only")
+            raise ValueError(
+                "objective.generative_weight is defined for the local form only: it must be 0"
+            )
         if self.objects.epochs and not local:
-            raise ValueError("objects.epochs is defined for the local form only")
+            raise ValueError("objects.epochs is defined for the local form only: it must be 0")
         if self.objective.name == "relations" and not self.objects.epochs:
-            raise ValueError("the objective relations needs objects.epochs: it trains no objects")
+            raise ValueError(
+                "objects.epochs must be at least 1: the objective `relations` trains no objects"
+            )
         if self.polish.updates and not local:
-            raise ValueError("polish.updates is defined for the local form only")
+            raise ValueError("polish.updates is defined for the local form only: it must be 0")
         return self
 
     @property
     def digest(self) -> str:
-        """sha256 of the configuration; a checkpoint resumes only with the same digest."""
+        """The sha256 of the configuration. A checkpoint resumes only with the same sha256."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
@@ -216,7 +223,7 @@ def shipped_configs() -> dict[str, Path]:
 
 
 def config_path(reference: str) -> Path:
-    """Return the file of a shipped configuration, of a path, or of a folder with that file."""
+    """Return the configuration file for the name of a shipped configuration, a file or a folder."""
     path = shipped_configs().get(reference, Path(reference))
     return path / f"{path.resolve().name}.toml" if path.is_dir() else path
 
@@ -266,7 +273,7 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(f"{dict(settings)} do not fit: {_first_error(error)}") from error
+        raise ConfigError(f"invalid settings {dict(settings)}: {_first_error(error)}") from error
 
 
 def config_toml(config: Config) -> str:

@@ -94,8 +94,8 @@ def scores(epoch: Epoch) -> str:
 
 
 def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
-    """Return a function that logs every epoch at its number of updates for TensorBoard."""
-    # Imported here, because the import takes longer than a small run.
+    """Return a TensorBoard logger of (epoch, number of updates)."""
+    # TensorBoard is imported only if used, because its import takes longer than a small run.
     from torch.utils.tensorboard import SummaryWriter
 
     writer = SummaryWriter(str(folder / config.name / f"seed-{config.training.seed}"))
@@ -114,14 +114,17 @@ def tensorboard(folder: Path, config: Config) -> Callable[[Epoch, int], None]:
         for name, attribute in names.items():
             if not math.isnan(value := getattr(epoch, attribute)):
                 writer.add_scalar(name, value, updates)
-        # Flushed at once, so that an interrupted run keeps its curve.
+        # Flush after each epoch, so that an interrupted run keeps its curve.
         writer.flush()
 
     return log
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Return the values as a line of blocks, scaled from lowest to highest; many are averaged."""
+    """Return the values as a line of block characters, scaled from lowest to highest.
+
+    If there are more values than `width`, each block shows an average.
+    """
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return ""
@@ -164,7 +167,7 @@ def summarise(result: TrainingResult, trainer: Trainer, folder: Path, console: C
 
 
 def _advice(result: TrainingResult) -> str:
-    """Return advice drawn from the position of the best epoch."""
+    """Return advice on the settings, based on which epoch was the best."""
     total, best = len(result.epochs), result.best_epoch + 1
     if total >= 10 and best == total:
         return "the last epoch was the best: more epochs may help (training.epochs)"

@@ -1,6 +1,6 @@
 """Train the object part of a machine by maximum likelihood with persistent chains.
 
-In the local form the relations sum to one, so that log p(v) has its own gradient:
+In the local form, the relations sum to one, so the gradient of log p(v) does not depend on them:
 
     d log p(v) / dW = v' E[h1 | v] - E_model[v' h1]
 
@@ -10,11 +10,12 @@ learning rate falls linearly to 0, so that the weights hardly change at the end 
 follow. The weights are averaged over the last part of the run.
 
 The weights Q of room types are trained afterwards, with all other weights fixed. Q[t] follows the
-gradient of log p(v | t), with a few chains for each type. In joint training, the few chains of a
-type could not follow the weights.
+gradient of log p(v | t), with a few chains for each type. In joint training, these few chains could
+not follow the changing weights.
 
-Scenes count by their weight. Only scenes with a nearly complete object list take part. `fine_tune`
-is a shorter version for use after an objective that trained objects and relations together.
+Scenes are drawn in proportion to their weight. Only scenes with a nearly complete object list are
+used. `fine_tune` is a shorter version for use after an objective that trains objects and relations
+together.
 
 Sources: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008);
 Salakhutdinov and Hinton, "Deep Boltzmann machines" (2009), for two layers.
@@ -37,12 +38,12 @@ from training.machines.gibbs import Clamp, State, initial_state, run
 from training.machines.mean_field import Evidence, mean_field
 
 OBJECT_WEIGHTS = ("b", "c1", "c2", "W", "J", "Q")
-# The weights of this last share of the run are averaged. Later weights count at least
-# `_FORGETTING`.
+# The weights are averaged over this last share of the run. Each new weight enters the average with
+# at least the factor `_FORGETTING`.
 _AVERAGED = 0.3
 _FORGETTING = 0.002
-# The phase of the room types: chains and scenes of each type in an update, number of updates,
-# learning rate, and precision of the prior of the weights (in scenes).
+# Training of the room types: number of chains and scenes of each type in an update, number of
+# updates, learning rate, and precision of the weights' prior (in scenes).
 _PER_ROOM = 12
 _ROOM_UPDATES = 1500
 _ROOM_RATE = 0.2
@@ -51,7 +52,7 @@ _ROOM_PRIOR = 0.5
 _SWEEPS = 200
 # Updates between two calls of `progress`.
 _REPORTED = 100
-# Fine tuning: its weights, the decay of their average, and the sweeps before samples are stored.
+# Fine tuning: trained weights, decay of their average, and number of sweeps before storing samples.
 _FINE_TUNED = ("b", "c1", "c2", "W", "Q")
 _FINE_TUNED_AVERAGING = 0.98
 _FINE_TUNED_SWEEPS = 50
@@ -150,7 +151,7 @@ def store_samples(
     """Store the final states of N long chains that start at scenes.
 
     Each sample keeps the room type of its scene. A share `room_dropout` of the chains runs without
-    it.
+    a room type.
     """
     if not machine.spec.N:
         return
@@ -190,7 +191,7 @@ class _Scenes:
         return self.v[index], self.room[index]
 
     def _shuffle(self) -> None:
-        """Begin a pass in random order; each scene occurs as often as its weight states."""
+        """Start a pass in random order, in which the number of draws of a scene is its weight."""
         times = self.weight.floor()
         extra = torch.rand(len(times), generator=self._generator) < self.weight - times
         index = torch.arange(len(times)).repeat_interleave(times.long() + extra)
@@ -221,7 +222,7 @@ def _update(
 
 
 def _sweep(machine: BoltzmannMachine, chains: _Chains, generator: torch.Generator) -> Tensor:
-    """Run the chains for one sweep; return the mean (B, H1) from which h1 was sampled last."""
+    """Run the chains for one sweep; return the mean of h1 (B, H1) that the sweep sampled from."""
     chains.v = bernoulli(machine.object_logits(chains.h1).sigmoid(), generator)
     if machine.spec.H2:
         h2 = machine.second_layer_logits(chains.h1).sigmoid()
@@ -260,7 +261,7 @@ def fine_tune(
     its first scene.
 
     Args:
-        config: number of updates and chains; with 0 updates and N = 0, nothing happens.
+        config: number of updates and chains. With 0 updates and N = 0, the machine is unchanged.
         room_dropout: share of chains and scenes with a hidden room type.
     """
     if not config.updates and not machine.spec.N:

@@ -1,15 +1,16 @@
 """Fit the offsets between placed objects to scenes with poses.
 
-Take a canonical relation and an axis. The offset of an object of class i from an object of class j
-is normal, with a mean m and a variance s for each pair of classes:
+Each canonical relation and each axis have their own model. In it, the offset of an object of class
+i from an object of class j is normal, with a mean m and a variance s for each pair of classes:
 
     s ~ inverse-gamma(alpha, beta)    m given s ~ normal(mu + u_i + v_j, s / kappa)
     u_i and v_j given s ~ normal(0, s / (kappa lambda))
 
-mu, kappa, alpha and beta belong to the relation and the axis. They maximise the likelihood of all
-pairs, in alternation with the class effects u and v. Given these values, the offset of a pair has a
-closed form. For frequent pairs the data of the pair dominate; for rare pairs the classes and the
-relation dominate. `docs/decisions/offsets.md` describes the alternatives.
+mu, kappa, alpha and beta are shared by all pairs of classes. Training maximises the likelihood of
+all pairs over these parameters, in alternation with the class effects u and v. Given these values,
+the distribution of a pair's offset has a closed form. It depends mainly on the pair's own data if
+the pair is frequent, and on its classes and relation if the pair is rare.
+`docs/decisions/offsets.md` describes the alternatives.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from training.datasets import EncodedScene
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Shrinks the effect of a class like `LAMBDA` additional pairs without an effect.
+# Shrinkage of a class effect, equivalent to `LAMBDA` additional pairs with effect 0.
 LAMBDA: Final = 4.0
 # At alpha <= 1 the variance of an unseen pair is not finite.
 _LEAST_ALPHA: Final = 1.5
-# Sources with fewer scenes than this do not lower the weights of larger sources.
+# Sources with fewer scenes do not lower the weights of larger sources.
 _FEW: Final = 100
 _ROUNDS, _SWEEPS = 4, 10
-# Resolution of an annotated box centre in metres; without it, equal heights would have variance 0.
+# Resolution of annotated box centres in metres. It keeps the variance of equal heights above 0.
 _RESOLUTION: Final = 0.005
 
 
@@ -49,8 +50,8 @@ class Seen:
         offset: (N, 3) metres from the relation's object to its subject, in viewer axes.
         relation: (N,) canonical relation.
         subject, other: (N,) classes of the relation's subject and object.
-        scene: (N,) position of the scene.
-        source: (N,) index of its source.
+        scene: (N,) index of the scene.
+        source: (N,) index of the scene's source.
     """
 
     offset: Floats
@@ -66,7 +67,7 @@ class Seen:
 
 
 def seen_offsets(scenes: Sequence[EncodedScene]) -> Seen:
-    """Return the offsets between all related objects of scenes with poses."""
+    """Return the offsets between all pairs of related objects, over all scenes with poses."""
     sources = sorted({scene.source for scene in scenes})
     offsets, rows = [np.zeros((0, 3))], [np.zeros((0, 5), dtype=np.int64)]
     for place, scene in enumerate(scenes):
@@ -85,8 +86,8 @@ def seen_offsets(scenes: Sequence[EncodedScene]) -> Seen:
 def fit_offsets(scenes: Sequence[EncodedScene], V: int) -> Offsets | None:
     """Fit the offsets of V classes; return None if no scene has poses.
 
-    Instances of one pair of classes in a scene are dependent, so together they weigh as one. Every
-    source has the same total weight, because boxes of one source resemble each other.
+    All instances of a pair of classes in one scene have a total weight of 1, because they are
+    dependent. All sources have the same total weight, because boxes of one source are similar.
     """
     seen = seen_offsets(scenes)
     if not len(seen.offset):
@@ -137,7 +138,7 @@ def _pairs(seen: Seen) -> Pairs:
     classes = np.stack([seen.subject, seen.other], axis=1)
     found, pair = np.unique(classes, axis=0, return_inverse=True)
     pair = pair.reshape(-1)
-    # Instances of the same pair of classes in one scene.
+    # Group the instances of the same pair of classes in one scene.
     _, first, group, size = np.unique(
         np.stack([pair, seen.scene]),
         axis=1,
@@ -204,9 +205,10 @@ class _Fit:
         )
 
     def tables(self) -> tuple[Floats, Floats, Floats]:
-        """Return mean and variance of unseen pairs: (6,) of unknown classes, (V, 6) of each class.
+        """Return mean and variance of unseen pairs as a sum over the two classes of a pair.
 
-        The result equals `predict` for a pair without data, as a sum over the two classes.
+        The first array (6,) is for unknown classes. The other two arrays (V, 6) have the
+        contribution of each class. The sum equals `predict` for a pair without data.
         """
         spread = self.beta / (self.alpha - 1)
         unknown = 1 / LAMBDA
@@ -248,7 +250,10 @@ def log_likelihood(
     mean: Floats,
     scatter: Floats,
 ) -> Floats:
-    """Return the log-likelihood of the draws, mean and variance integrated out; see `posterior`."""
+    """Return the log-likelihood of the draws, with mean and variance integrated out.
+
+    The arguments are those of `posterior`.
+    """
     after, shape = kappa + n, alpha + n / 2
     rate = beta + scatter / 2 + kappa * n * np.square(mean - expected) / (2 * after)
     found: Floats = (
@@ -259,7 +264,7 @@ def log_likelihood(
 
 
 def _fit(pairs: Pairs, V: int) -> _Fit:
-    """Fit hyperparameters and effects of one relation in alternation."""
+    """Fit the hyperparameters and class effects of one relation, in alternation."""
     nothing = np.zeros((V, 3))
     start = (pairs.n * pairs.mean).sum(axis=0) / pairs.n.sum()
     fit = _Fit(
@@ -287,8 +292,8 @@ def _hyperparameters(pairs: Pairs, axis: int, expected: Floats) -> Floats:
 
 
 def _effects(fit: _Fit, pairs: Pairs, V: int) -> None:
-    """Fit mu, u and v in alternation: each is the shrunk weighted mean of the residuals."""
-    # Weight of a pair's own mean for the effects, relative to s / kappa.
+    """Fit mu, u and v in alternation. Each is a weighted mean of residuals; u and v are shrunk."""
+    # Precision of a pair's mean offset as a measurement of the effects, in units of kappa / s.
     weight = pairs.n / (pairs.n + fit.kappa)
 
     below_u = _sums(pairs.subject, weight, V) + LAMBDA

@@ -56,9 +56,9 @@ class SplitScenes:
 
     @property
     def digest(self) -> str:
-        """sha256 of the training input: contents, vocabulary, split and shuffling.
+        """The sha256 of the training input: contents, vocabulary, split and shuffling.
 
-        The names of the files are not enough, because a corrected file keeps its name.
+        It covers the contents of the files, because a corrected file keeps its name.
         """
         decisive = {
             "data": self.data.model_dump(mode="json"),
@@ -79,7 +79,7 @@ class SplitScenes:
         annotated = annotated_classes(self.parts["train"], self.vocabulary)
         every = {scene.source for scenes in self.parts.values() for scene in scenes}
         for source in every - set(annotated):
-            raise ConfigError(f"source {source!r} has no scene in the training part")
+            raise ConfigError(f"the training part contains no scene of the source {source!r}")
         tensors: dict[str, SceneTensors] = {
             part: scene_tensors(scenes, annotated, len(self.vocabulary))
             for part, scenes in self.parts.items()
@@ -154,8 +154,8 @@ def build_vocabulary(data: DataConfig, scenes: list[AnnotatedScene], root: Path)
         vocabulary = _read_vocabulary(root / data.vocabulary)
     else:
         raise ConfigError(
-            f"unknown vocabulary {data.vocabulary!r}: indoor, source, rooms, or a file that ends "
-            "in .json"
+            f"unknown vocabulary {data.vocabulary!r}: must be indoor, source, rooms, or the name "
+            "of a .json file"
         )
     return with_typical_sizes(vocabulary, scenes)
 
@@ -176,7 +176,7 @@ def split_and_encode(
     """Split all sources together, because they share groups, and encode each part.
 
     Args:
-        vocabulary: vocabulary of a published model; default: that of the configuration.
+        vocabulary: vocabulary of a published model; default: the vocabulary of the configuration.
         root: folder of the configuration's vocabulary file.
 
     Raises:

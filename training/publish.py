@@ -50,17 +50,18 @@ def publish_run(
     judge: Callable[[Artifact], None] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Artifact:
-    """Calibrate on validation scenes, learn offsets from training scenes, evaluate, and publish.
+    """Calibrate on validation scenes, fit offsets to training scenes, evaluate, and publish.
 
     Weights are stored in half precision. Calibration and evaluation use the stored precision.
 
     Args:
-        measured: a run of the same configuration that kept test scenes back, and its scenes. Its
-            figures and its chosen values are published, because `run` has learnt from all scenes.
+        measured: a run of the same configuration that did not use test scenes, and its scenes. The
+            test results and chosen values of this run are published, because the weights of `run`
+            are trained on all scenes.
         judge: called with the calibrated model; an exception from it stops the publication.
 
     Raises:
-        RunError: the run learnt from other scenes.
+        RunError: the run was trained on other scenes.
         StoreError, ArtifactError: see `Store.publish`.
     """
     run.require(scenes.digest)
@@ -139,7 +140,7 @@ def draft_artifact(
     calibration: Calibration | None = None,
     offsets: Offsets | None = None,
 ) -> Artifact:
-    """Return an artifact in memory only; the default calibration is the neutral one."""
+    """Return an artifact that exists in memory only; its default calibration is neutral."""
     return Artifact(
         manifest=None,  # type: ignore[arg-type]  # questions never read it
         weights=weights_of(machine),
@@ -154,7 +155,7 @@ def draft_artifact(
 
 
 def _measure(artifact: Artifact, data: TrainingData, progress: Callable[[str], None]) -> list[Row]:
-    """Return figures on the test part; empty without test scenes."""
+    """Return the metrics on the test part; an empty list without test scenes."""
     if not len(data.test):
         return []
     return evaluate(
@@ -190,7 +191,7 @@ def data_sources(scenes: SplitScenes) -> tuple[DataSource, ...]:
 
 
 def metrics(rows: list[Row]) -> tuple[Metric, ...]:
-    """Return the rows of the evaluation in the form of the manifest."""
+    """Convert the rows of the evaluation to the metrics of the manifest."""
     return tuple(
         Metric(
             task=row.task,

@@ -30,7 +30,7 @@ class RunError(RuntimeError):
 
 @dataclass(frozen=True)
 class Epoch:
-    """One row of the curve; errors are those of `evaluation.reconstruction`."""
+    """One row of the curve; `evaluation.reconstruction` defines the errors."""
 
     epoch: int
     loss: float
@@ -71,10 +71,10 @@ class FinishedRun:
     scenes: str = ""
 
     def require(self, scenes: str) -> None:
-        """Check that the run learnt from the scenes with the given digest.
+        """Check that the run was trained on the scenes with the given digest.
 
         Raises:
-            RunError: the run learnt from other scenes.
+            RunError: the run was trained on other scenes.
         """
         if self.scenes and self.scenes != scenes:
             raise RunError(
@@ -135,7 +135,7 @@ def load_run(folder: Path) -> FinishedRun:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write to a temporary file, fsync, rename; after a crash the old checkpoint remains."""
+    """Write a checkpoint atomically; after a crash the old checkpoint remains."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     with temporary.open("wb") as file:

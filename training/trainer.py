@@ -1,6 +1,6 @@
 """The trainer of every machine and objective: updates, early stopping, checkpoints, curves.
 
-With one thread, two runs with the same seed give bit-identical weights. This also holds if a run is
+With one thread, two runs with the same seed give bit-identical weights, even if a run is
 interrupted and resumed after an epoch.
 """
 
@@ -40,7 +40,8 @@ _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
 # Called during the training of the objects, with the finished share.
 ObjectProgress = Callable[[float], None]
-# Weights with the full learning rate. At that rate, relation weights overfit within an epoch.
+# Weights with the full learning rate. The setting `relation_rate` can lower the rate of all other
+# weights, because relation weights may overfit within an epoch.
 _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
 # Called after every update with (epoch, finished share of the epoch, mean loss so far).
@@ -51,11 +52,11 @@ Ended = Callable[[Epoch], None]
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Tensors of the three parts, and the data that fixes the machine's shape.
+    """Tensors of the three parts, and the data that determines the machine's shape.
 
     Attributes:
-        digest: digest of the scenes, their vocabulary and split; a run resumes only with the same
-            one.
+        digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
+            is unchanged.
         words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
     """
 
@@ -90,8 +91,8 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
     with torch.no_grad():
         annotated = data.train.annotated_classes[data.train.source].sum(0)
-        # A class that no source annotates must start as rare, because even odds would be far too
-        # high.
+        # A class that no source annotates must start as rare. The formula alone would give even
+        # odds.
         annotated = torch.where(annotated > 0, annotated, len(data.train))
         machine.b.copy_(log_odds_of(data.train.v.sum(0), annotated))
         machine.c1.fill_(shape.initial_c1)
@@ -103,7 +104,7 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
-    """Return the log-odds of a frequency, smoothed by 1/2 on both sides."""
+    """Return the log-odds of a frequency; 1/2 is added to both counts for smoothing."""
     return ((count + 0.5) / (total - count + 0.5)).log()
 
 
@@ -233,8 +234,8 @@ class Trainer:
     ) -> TrainingResult:
         """Train the objects if they have their own phase, then the epochs.
 
-        Training ends after the last epoch or when patience runs out. KeyboardInterrupt is passed
-        on; the checkpoint of the last finished epoch is then on disk.
+        Training ends after the last epoch, or earlier if the validation score stops improving
+        (patience). On KeyboardInterrupt, the checkpoint of the last finished epoch is on disk.
         """
         if not self.objects_trained:
             began = time.perf_counter()
@@ -303,7 +304,7 @@ class Trainer:
         self.updates += 1
         decay = self.config.training.averaging
         if decay:
-            # With few updates, the average forgets its start faster (bias correction).
+            # Bias correction: during the first updates, old weights count less.
             weight = 1 - min(decay, self.updates / (self.updates + 10))
             for name, parameter in self.machine.named_parameters():
                 self.average[name].lerp_(parameter.detach(), weight)
@@ -385,7 +386,7 @@ class Trainer:
         if not self.epochs:
             return
         write_csv(self.folder / "curve.csv", self.epochs)
-        # With few scenes, a plot takes longer than an epoch.
+        # Limit the number of plots: with few scenes, a plot takes longer than an epoch.
         if time.perf_counter() - self._drawn > _DRAWN_EVERY:
             self._draw()
 

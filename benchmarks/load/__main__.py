@@ -25,7 +25,7 @@ from benchmarks.report import describe_machine
 _MANY = 32
 _DRAWN = 8
 _QUANTILES = (0.5, 0.9, 0.99, 0.999)
-# Fraction of the service's rate at 32 connections: below saturation.
+# Offered rate as a fraction of the service's rate at 32 connections, so below saturation.
 _SHARE = 0.5
 
 

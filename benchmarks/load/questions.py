@@ -12,7 +12,7 @@ from benchmarks.load.connections import prepared
 ROUTES = ("/missing", "/relations", "/outliers")
 KINDS = ("12 labels", "12 poses", "20 relations")
 SCENES = 64
-"""More scenes than connections, so that all pending requests differ."""
+"""Number of scenes of a kind: more than connections, so that all pending requests differ."""
 
 _OBJECTS, _RELATIONS = 12, 20
 

@@ -44,7 +44,7 @@ class Server:
 
 
 def cores() -> tuple[set[int], set[int]]:
-    """Return the cores of servers and of the client: disjoint if there are at least two."""
+    """Return the cores for servers and for the client; disjoint if two cores are available."""
     every = sorted(os.sched_getaffinity(0))
     return ({every[0]}, set(every[1:])) if len(every) > 1 else (set(every), set(every))
 

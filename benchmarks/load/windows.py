@@ -1,7 +1,7 @@
 """Windows of load: a number of connections without pauses, or a number of requests per second.
 
 At a fixed rate, the latency of a request runs from its scheduled time, not from its sending time.
-So a stalled server is charged for all delayed requests (no coordinated omission).
+So the delays that a stalled server causes count as latency (no coordinated omission).
 """
 
 from __future__ import annotations

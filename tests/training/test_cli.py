@@ -128,7 +128,7 @@ def test_from_rooms_to_answers(tmp_path, variant):
         (("publish", "nowhere", "1.0.0"), "no finished run"),
         (("evaluate", "nowhere", "--store", "nowhere"), "error"),
         (("compare", "nowhere"), "must be a finished run or a model"),
-        (("compare", "baselines"), "use a model or run"),
+        (("compare", "baselines"), "first model must be trained"),
     ],
 )
 def test_errors_are_one_clear_line(arguments, message):

@@ -55,7 +55,7 @@ def test_the_object_phase_needs_the_local_form() -> None:
 
 def test_the_relation_objective_needs_the_object_phase() -> None:
     assert Config.model_validate(phases("composite", epochs=0)).objects.epochs == 0
-    with pytest.raises(ValueError, match="it trains no objects"):
+    with pytest.raises(ValueError, match="trains no objects"):
         Config.model_validate(phases(epochs=0))
 
 

@@ -1,9 +1,9 @@
-"""Baselines that an evaluation trains in the same run, on the same scenes.
+"""Baselines that the benchmark trains on the same scenes as the models.
 
-A class that a source never mentions counts as absent from its scenes, as in our own objective. A
-score does not know the source and has to rank all classes. Leaving such classes out lowers the
-validation MRR of baselines: EASE .398 to .381, denoising autoencoder .397 to .335, popularity .152
-to .145.
+The baselines treat a class that a source never mentions as absent from the scenes of this source.
+Our training objective does the same. If such classes are left out of the fit, the validation MRR of
+the baselines falls: EASE .398 to .381, denoising autoencoder .397 to .335, popularity .152 to .145.
+The reason is that a score does not know the source and has to rank all classes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from training.baselines.fitting import Baseline, Fitted, Trial
 from training.evaluation.missing import PlacedScore
 
 RELATIONS: Final = ("relations", "placement")
-"""Fields of `Contender` filled by a relation score without evidence."""
+"""Fields of `Contender` that hold a relation score without observed relations."""
 
 _EVERY: tuple[Baseline[Any], ...] = (
     Baseline("popularity", objects.popularity),
@@ -67,7 +67,7 @@ PLACED: Final = BASELINES["frequency table p(i | a, j)"]
 
 
 def placed_product(name: str, score: Any, table: Any) -> Baseline[PlacedScore]:
-    """Return the T2-at baseline: a fitted object score times the fitted table of `PLACED`."""
+    """Return a baseline of task T2-at: an object score times the table of `PLACED`, both fitted."""
     propose = relations.times(score, table)
     return Baseline(f"{PLACED.name} × {name}", propose, fitting.placed_mrr, ("placed",))
 

@@ -1,9 +1,9 @@
 """Common interface of all baselines: fit on training scenes, select on validation scenes.
 
 A baseline is a generator. It fits on the training part and yields (parameters, score) for each
-point of its grid; an epoch of a run is also a point. `Baseline.fit` evaluates each score on the
-validation part by the primary metric of its task, pooled over sources. The generator never sees the
-validation part. All trials are kept.
+point of its hyperparameter grid. A network also yields a grid point for each candidate epoch.
+`Baseline.fit` evaluates each score on the validation part by the primary metric of its task, pooled
+over sources. The generator never sees the validation part. `Fitted` keeps all trials.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Trial:
     Attributes:
         parameters: the grid point.
         validation: metric on the validation part.
-        seconds: wall time of fitting and evaluation, without work shared with earlier points.
+        seconds: wall time of fit and evaluation. Work done for earlier grid points is not included.
     """
 
     parameters: Parameters
@@ -50,7 +50,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Fitted(Generic[Score]):
-    """The score of the best trial, and all trials in order; on a tie the first trial wins."""
+    """The score of the best trial, and all trials in order. On a tie, the first trial is best."""
 
     score: Score
     trials: tuple[Trial, ...]
@@ -92,9 +92,9 @@ class Baseline(Generic[Score]):
 
     Attributes:
         name: name of the row.
-        propose: function of training scenes, structure classes (V,) bool and a seed; yields the
-            trials.
-        judge: function of validation scenes, structure classes and a score; returns the metric,
+        propose: generator function of (training scenes, structure classes (V,) bool, seed). It
+            yields (parameters, score) for each trial.
+        judge: function of (validation scenes, structure classes, score). It returns the metric;
             higher is better.
         scores: fields of `Contender` that the score fills.
         stochastic: True if the fit depends on the seed.

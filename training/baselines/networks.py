@@ -40,7 +40,7 @@ class Course:
         learning_rate: peak learning rate of the cycle.
         weight_decay: weight decay of AdamW.
         noise: maximum probability of hiding a class that is not the target.
-        offers: epochs that are candidates, as shares of all epochs.
+        offers: candidate epochs, as shares of the number of epochs.
     """
 
     epochs: int
@@ -53,7 +53,7 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class NetworkScore:
-    """log p(i) under the softmax over absent classes without structure classes.
+    """The score log p(i): a softmax over all absent classes except structure classes.
 
     Attributes:
         network: maps presence (B, V) to logits (B, V).
@@ -85,11 +85,11 @@ def train_network(
         v: (N, V) presence; scenes with structure classes only are left out.
 
     Raises:
-        ValueError: all scenes are left out.
+        ValueError: every scene consists of structure classes only.
     """
     v = v[(v * ~structure).any(1)]
     if not len(v):
-        raise ValueError("all scenes lack a class that could be removed")
+        raise ValueError("every scene consists of structure classes only: no class can be removed")
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=course.learning_rate, weight_decay=course.weight_decay
     )
@@ -100,7 +100,7 @@ def train_network(
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(_AVERAGING))
     offers = {max(1, round(share * course.epochs)) for share in course.offers}
     for epoch in range(1, course.epochs + 1):
-        # Dropout uses the global generator; the fork keeps other random numbers unchanged.
+        # Dropout uses the global generator. The fork restores the generator's state afterwards.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed * 1_000_003 + epoch)
             network.train()
@@ -115,7 +115,10 @@ def train_network(
 
 
 def removal_loss(network: nn.Module, v: Tensor, structure: Tensor, noise: float) -> Tensor:
-    """Return the mean cross-entropy of one removed class per scene; uses the global generator."""
+    """Return the mean cross-entropy of one removed class per scene.
+
+    The global random generator draws the removed and the hidden classes.
+    """
     target = torch.multinomial(v * ~structure, 1)
     left = v.scatter(1, target, 0.0)
     hidden = torch.rand(v.shape) < noise * torch.rand(len(v), 1)
@@ -137,7 +140,7 @@ _HEAVY = replace(_AUTOENCODER, noise=1.0)
 
 
 def build_autoencoder(v: Tensor, width: int, dropout: float, seed: int) -> nn.Sequential:
-    """Build layers V -> width -> width -> V; the output bias starts at class frequencies."""
+    """Build layers V -> width -> width -> V; log class frequencies initialise the output bias."""
     V = v.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -165,7 +168,7 @@ def autoencoder(
 def autoencoder_for_parts(
     train: SceneTensors, structure: Tensor, seed: int
 ) -> Proposals[ObjectScore]:
-    """Yield autoencoder scores after heavy masking: up to all other classes are hidden."""
+    """Yield scores of autoencoders trained with up to all other classes hidden."""
     return autoencoder(train, structure, seed, _HEAVY)
 
 
@@ -186,7 +189,7 @@ class SetTransformer(nn.Module):
     """Transformer: presence (B, V) -> unnormalised log-probabilities (B, V) of the removed class.
 
     Args:
-        popularity: (V,) share of scenes with each class, the start of the output bias.
+        popularity: (V,) share of scenes with each class; its log initialises the output bias.
         width, heads, layers: sizes of the encoder; its feed-forward part is twice as wide.
         dropout: dropout rate of the encoder.
     """

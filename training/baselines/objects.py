@@ -21,7 +21,7 @@ from training.machines import BoltzmannMachine, MachineSpec, build
 
 @dataclass(frozen=True, eq=False)
 class LinearScore:
-    """Linear score bias + v · weights; the weight from a class to itself is zero.
+    """The linear score bias + v · weights.
 
     Attributes:
         bias: (V,).
@@ -55,7 +55,10 @@ class LinearScore:
 
 
 def frequency(v: Tensor) -> Tensor:
-    """Return the share of scenes with each class (V,), smoothed by half a scene on both sides."""
+    """Return the share of scenes with each class (V,).
+
+    The share is smoothed: half a scene with the class and half a scene without it are added.
+    """
     return (v.sum(0) + 0.5) / (len(v) + 1.0)
 
 
@@ -69,8 +72,8 @@ def popularity(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals
 #
 #     log-odds of i = logit p(i) + t · sum_{j present} log p(j | i) / p(j | not i)
 #
-# Only present classes are evidence, because most absent classes were merely not mentioned. Classes
-# that occur together count as evidence several times; the exponent t < 1 corrects for that.
+# Only present classes are evidence, because annotators do not mention every object. The formula
+# counts classes that occur together as independent evidence. The exponent t < 1 corrects this.
 
 
 _SMOOTHING = (10.0, 100.0, 300.0)
@@ -81,7 +84,7 @@ def evidence(v: Tensor, smoothing: float) -> Tensor:
     """Return log p(j | i) / p(j | not i) as (V, V) [j, i], with a zero diagonal.
 
     Args:
-        smoothing: number of average scenes added to the scenes with i and to those without i.
+        smoothing: number of average scenes added to the scenes with i, and to the scenes without i.
     """
     both, count, scenes = v.T @ v, v.sum(0), len(v)
     average = frequency(v).unsqueeze(1) * smoothing
@@ -188,7 +191,8 @@ def ease(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[Objec
 
 _PAIRWISE_L2 = (30.0, 10.0, 3.0)
 _ITERATIONS = 40
-# Gibbs sweeps over single classes are slow. These settings estimate log Z to about 0.01 nats.
+# A Gibbs sweep that updates one class at a time is slow, so these settings use fewer temperatures
+# than the default. They estimate log Z to about 0.01 nats.
 _EFFORT = DensitySettings(chains=128, temperatures=1500, burn_in=500)
 
 
@@ -229,7 +233,7 @@ def fit_pairwise(
 
 
 def pairwise(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[LinearScore]:
-    """Yield a score for each L2 penalty, decreasing; each fit starts at the previous solution."""
+    """Yield a score for each L2 penalty, largest first; each fit starts at the last solution."""
     score = None
     for l2 in _PAIRWISE_L2:
         score = fit_pairwise(train.v, l2, start=score)
@@ -241,9 +245,9 @@ def pairwise_densities(
 ) -> Proposals[ObjectDensity]:
     """Yield the joint distributions of the pairwise models.
 
-    Their best penalty differs from that of the conditionals. With a weak penalty, pseudo-likelihood
-    leaves a second mode of scenes with very many classes. Conditionals of real scenes do not show
-    this mode.
+    The best penalty for the joint distribution is not the best penalty for the conditionals. With a
+    weak penalty, pseudo-likelihood gives the joint distribution a second mode: scenes with very
+    many classes. The conditionals of real scenes do not show this mode.
     """
     for parameters, score in pairwise(train, structure, seed):
         yield parameters, ising_density(score.bias, score.weights, train, _EFFORT, seed)
@@ -251,12 +255,12 @@ def pairwise_densities(
 
 # `BernoulliRBM` of scikit-learn on objects only, scored by its exact log-odds.
 #
-# The trained weights are copied into our own machine without relation units. Both have the same
-# energy, so the same code scores both models.
+# The trained weights are copied into our own machine without relation units. Both models have the
+# same energy, so our code computes the log-odds.
 
 
 _HIDDEN = 200
-# At higher rates persistent CD degrades to class frequencies without an error.
+# With higher learning rates, persistent CD learns only the class frequencies and raises no error.
 _LEARNING_RATES = (0.1, 0.2, 0.4)
 _EPOCHS = 60
 _BATCH = 32

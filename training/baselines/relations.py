@@ -32,7 +32,7 @@ class TripleCounts:
     together: Tensor
 
     def overall(self) -> Tensor:
-        """Return p(r) of a pair of classes, (A,), smoothed by one case on both sides."""
+        """Return p(r) over all pairs of classes, (A,), with add-one (Laplace) smoothing."""
         return (self.held.sum((1, 2)) + 1.0) / (self.together.sum() + 2.0)
 
 
@@ -65,10 +65,10 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
 class TripleTable:
     """A relation score from a table: table[a, i, j] + g · log(n_i n_j).
 
-    It uses the classes and counts of a batch and ignores the relations.
+    The score uses the classes and instance counts of a batch. It ignores the relations.
 
     Attributes:
-        log_odds: (A, V, V).
+        log_odds: (A, V, V), by relation, subject class and object class.
         multiplicity: g, weight of the instance counts; 0 ignores counts.
     """
 
@@ -97,11 +97,11 @@ def relation_popularity(
     yield {}, TripleTable(overall.expand_as(counts.held))
 
 
-# Smoothed frequency table p(r | i, j): the strong baseline for relations.
+# Smoothed frequency table p(r | i, j): a strong baseline for relations.
 #
-# R. Zellers et al., "Neural Motifs: Scene Graph Parsing with Global Context", CVPR 2018: the labels
-# of the two ends predict most relations. A rare pair backs off to its two classes, and a rare class
-# backs off to p(r):
+# R. Zellers et al., "Neural Motifs: Scene Graph Parsing with Global Context", CVPR 2018, show that
+# the labels of subject and object predict most relations. A rare pair backs off to its two classes,
+# and a rare class backs off to p(r):
 #
 #     p(r | i, j) = (held + s · [p(r | i as subject) + p(r | j as object)] / 2) / (together + s)
 #     p(r | i)    = (held with i + m · p(r)) / (pairs with i + m), likewise p(r | j)
@@ -117,7 +117,7 @@ def smoothed_log_odds(counts: TripleCounts, pair: float, end: float) -> Tensor:
 
     Args:
         pair: s > 0, number of back-off cases added to a pair of classes.
-        end: m > 0, number of cases of p(r) added to a class.
+        end: m > 0, number of back-off cases, distributed as p(r), added to a class.
     """
     overall = counts.overall()[:, None]
     subject = (counts.held.sum(2) + end * overall) / (counts.together.sum(1) + end)
@@ -140,12 +140,12 @@ def frequency_table(train: SceneTensors, structure: Tensor, _seed: int) -> Propo
                 yield parameters, TripleTable(table, weight)
 
 
-# ComplEx: class embeddings with complex numbers, because left(i, j) differs from left(j, i).
+# ComplEx: complex class embeddings, which can give left(i, j) and left(j, i) different scores.
 #
 # T. Trouillon et al., "Complex Embeddings for Simple Link Prediction", ICML 2016, equation 11:
 # logit p(a, i, j) = d_a + Re sum_k S[i,k] R[a,k] conj(S[j,k]). The model is fitted to all pairs of
-# classes that occur together, as binomials (held of together). The penalty is the nuclear 3-norm of
-# T. Lacroix et al., ICML 2018.
+# classes that occur together. Each triple is a binomial: `held` successes in `together` trials. The
+# penalty is the nuclear 3-norm of T. Lacroix et al., ICML 2018.
 
 
 _RANKS = (16, 64)
@@ -194,7 +194,7 @@ def fit_complex(
 def complex_logits(bias: Tensor, relations: Tensor, classes: Tensor) -> Tensor:
     """Return d_a + Re <S_i, R_a, conj S_j>; bias (A,), relations (A, K), classes (V, K)."""
     turned = classes * relations[:, None]
-    # Re(x conj(y)) = Re x Re y + Im x Im y: real products are faster.
+    # Re(x conj(y)) = Re x Re y + Im x Im y. Two real products are faster than a complex one.
     real = turned.real @ classes.real.T + turned.imag @ classes.imag.T
     return bias[:, None, None] + real
 
@@ -212,15 +212,16 @@ def complex_embedding(
                 yield parameters, TripleTable(table, weight)
 
 
-# Completion by logic: the frequency table, changed by the consequences of the given relations.
+# Completion by logic: the frequency table, adjusted by consequences of the observed relations.
 #
-# A relation that follows from given a(i, j) and a(j, k) by transitivity gets a bonus. The reverse
-# a(k, i) of a given or following relation gets a penalty. The canonical relations already treat
-# right as left with exchanged ends (inverse closure). Bonus and penalty are soft for two reasons:
-# classes may have several instances, and annotated on-top is not always transitive.
+# The score adds a bonus to a relation a(i, k) that follows by transitivity from observed a(i, j)
+# and a(j, k). It subtracts a penalty from the reverse a(k, i) of each observed or implied relation.
+# The canonical relations store right as left with exchanged ends (inverse closure). Bonus and
+# penalty are finite for two reasons: classes may have several instances, and annotated on-top is
+# not always transitive.
 #
-# The score reads the observed entries of `holds` as given relations. So its batch must mark only
-# the given relations as observed, as T1b does, not the full annotation of a scene.
+# Task T1b marks only the evidence of a scene as observed, not the full annotation. This score
+# needs such batches.
 
 
 _CLOSURE_PAIR = (3.0, 10.0, 30.0)
@@ -232,7 +233,7 @@ _PENALTY = (0.0, 1.0, 3.0)
 
 @dataclass(frozen=True, eq=False)
 class ClosureScore:
-    """table + bonus · [follows] - penalty · [reverse of a given or following relation].
+    """table + bonus · [implied relation] - penalty · [reverse of an observed or implied relation].
 
     Attributes:
         table: log-odds without evidence.
@@ -266,13 +267,13 @@ def frequency_table_with_closure(
                     yield parameters | {"penalty": penalty}, ClosureScore(table, bonus, penalty)
 
 
-# Object at a place (a, j), such as "on-top of the desk": the frequency table p(i | a, j), alone and
-# times an object score.
+# Baselines for an object i at a place (a, j), such as "on-top of the desk": the frequency table
+# p(i | a, j), and the product of this table and an object score.
 #
 #     p(i | a, j) = (held + s · p(i | a)) / (held by any + s)
 #
-# p(i | a) is smoothed likewise towards p(i) with m. There are separate tables for i as subject and
-# i as object. The product adds the log-odds given the other objects of the scene,
+# p(i | a) is smoothed in the same way towards p(i), with weight m. There are separate tables for i
+# as subject and i as object. The product adds the log-odds given the other objects of the scene,
 #
 #     score(i | rest) + w · log p(i | a, j) - u · log p(i),
 #
@@ -287,7 +288,11 @@ _CORRECTIONS = (0.0, 0.5, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class PlacedTable:
-    """Score from a table: log_p (2, A, V, V), by outgoing, relation, anchor and removed class."""
+    """The score log p(i | a, j) from a table.
+
+    Attributes:
+        log_p: (2, A, V, V), by `Places.outgoing`, relation, anchor class and removed class.
+    """
 
     log_p: Tensor
 
@@ -322,7 +327,7 @@ def smoothed_log_p(
         place: s > 0, number of cases of p(i | a) added to each (a, j).
         relation: m > 0, number of cases of p(i) added to each a.
     """
-    # Index 1: the removed class is the subject, so `held` is transposed to put the anchor first.
+    # In the second table, the removed class is the subject. Its transpose puts the anchor first.
     held = torch.stack([counts.held, counts.held.mT])
     share = popularity / popularity.sum()
     any_anchor = held.sum(2)
@@ -344,7 +349,7 @@ def placed_table(train: SceneTensors, structure: Tensor, _seed: int) -> Proposal
 def times(
     objects: ObjectScore, table: PlacedTable
 ) -> Callable[[SceneTensors, Tensor, int], Proposals[PlacedScore]]:
-    """Return a baseline that multiplies a fitted object score and a fitted table."""
+    """Return a baseline: the product of a fitted object score and a fitted table."""
 
     def placed_table(train: SceneTensors, _structure: Tensor, _seed: int) -> Proposals[PlacedScore]:
         log_popularity = frequency(train.v).log()

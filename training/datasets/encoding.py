@@ -70,15 +70,15 @@ class EncodedScene:
 def encode(scenes: Iterable[AnnotatedScene], vocabulary: Vocabulary) -> list[EncodedScene]:
     """Encode scenes with a vocabulary.
 
-    An observed relation is known to hold or known not to hold. The best annotation of a scene
-    gives the relations:
+    An observed relation is known to hold or known not to hold. The relations come from the first of
+    these annotations that the scene has:
 
     - Listed relations. A relation listed in both directions is unobserved.
     - Positions, by the rules of `app.scene.geometry`. `room_viewpoint` supplies the viewpoint if
       the positions are not in viewer axes. A support link means on-top, and all other relations of
       the pair are false.
     - Boxes in an image, by the rule of `scene_client.image_plane`: left and above.
-    - Otherwise support links only.
+    - Support links only.
 
     `training.datasets.sources` defines which relations are false if a scene does not list them. It
     also defines which labels of a source are ignored.
@@ -96,10 +96,10 @@ def annotated_classes(
 ) -> dict[str, NDArray[np.bool_]]:
     """Return, per source, a (V,) mask of the classes that the source annotates.
 
-    If an annotated class is missing from a scene, the object is absent. A source annotates the
-    classes that it mentions at least once; a source of open vocabulary annotates all classes.
-    Labels in `Source.left_out` are excluded. Initial biases are frequencies over the sources
-    that annotate a class. Generated scenes are compared in the annotated classes.
+    If a scene does not list an annotated class, the class is absent. A source annotates the classes
+    that it mentions at least once. A source with an open vocabulary annotates all classes. Labels
+    in `Source.left_out` are excluded. The initial bias of a class is its frequency over the sources
+    that annotate it. Only annotated classes count in the evaluation of generated scenes.
     """
     annotated: dict[str, NDArray[np.bool_]] = {}
     for scene in scenes:
@@ -134,7 +134,7 @@ class _Encoder:
         holds = relations.holds[:, kept][:, :, kept]
         observed = relations.observed[:, kept][:, :, kept]
         instance_classes = np.array([classes[i] for i in kept], dtype=np.int64)
-        # Relations of structure carry no information: every room has walls on all sides.
+        # Relations of structure classes carry no information: every room has walls on all sides.
         structure = self.vocabulary.structure[instance_classes]
         for array in (holds, observed):
             array[:, structure] = False
@@ -185,7 +185,7 @@ def _counts(
 def _relations(
     scene: AnnotatedScene, meaning: Meaning
 ) -> tuple[PoseRelations, NDArray[np.float64] | None]:
-    """Derive the relations between all instances from the best annotation of the scene.
+    """Derive the relations between all instances of a scene, see `encode`.
 
     Returns:
         The relations, and the positions (n, 3) used to derive them; None without positions.
@@ -218,7 +218,7 @@ def _from_lists(
     for relations, array in ((listed, holds), (scene.false_relations, denied)):
         for subject, relation, anchor in relations:
             array[canonicalise(subject, relation, anchor)] = True
-        # Contradictory annotations are unobserved: both directions listed, or listed and denied.
+    # Contradictory annotations are unobserved: both directions listed, or listed and denied.
     contradicted = (holds & holds.swapaxes(1, 2)) | (holds & denied)
     related = holds.any(0)
     masks = {

@@ -1,4 +1,4 @@
-"""Read data files with size limits and with errors that name the position."""
+"""Read data files with size limits. Each error names the file and the position in it."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def read_jsonl(path: Path) -> list[AnnotatedScene]:
 
 
 def scan_jsonl(path: Path) -> Iterator[AnnotatedScene | DatasetError]:
-    """Iterate over the lines of a file: a scene, or the error of the line. Skip blank lines.
+    """Yield a scene for each valid line, and an error for each invalid line. Skip blank lines.
 
     Raises:
         DatasetError: the file cannot be read.

@@ -15,12 +15,12 @@ NAMES_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "names.to
 
 @dataclass(frozen=True)
 class Names:
-    """Content of `vocabularies/names.toml`, by key.
+    """The content of `vocabularies/names.toml`; each attribute is a table or list of the file.
 
     Attributes:
         base: classes of every indoor vocabulary.
-        household: further classes of every indoor vocabulary, for rare household objects.
-        structure: classes that the service accepts as input and never proposes.
+        household: rare household objects, which are also classes of every indoor vocabulary.
+        structure: classes that the service accepts in requests but never proposes.
         not_objects: labels that never become a class.
         surroundings: outdoor structure; excluded from indoor vocabularies.
         outdoor: outdoor objects; excluded from indoor vocabularies.

@@ -1,4 +1,4 @@
-"""Placing priors: a table of object pairs with their relation, without scenes.
+"""Read placing priors: a table that gives the usual relation of two objects, without scenes.
 
 The table has tab-separated columns and may be gzipped. Its first line names the columns:
 ``source``, ``subject``, ``relation``, ``object``, ``count``, ``room`` (empty = any room).
@@ -39,7 +39,7 @@ def read_prior_scenes(path: Path, *, sources: Collection[str] = PLACES) -> list[
 
     Args:
         path: the table.
-        sources: the sources to read; by default the lists of placements.
+        sources: the sources to read; by default the sources that list placements.
 
     Raises:
         DatasetError: the file is missing, malformed or too large.

@@ -118,14 +118,17 @@ class AnnotatedScene:
             raise ValueError(f"scene {self.scene_id!r} has two objects with the same id")
         for thing in self.objects:
             if thing.supported_by is not None and thing.supported_by not in ids:
-                raise ValueError(f"{thing.id!r} has the unknown support {thing.supported_by!r}")
+                raise ValueError(
+                    f"supported_by of {thing.id!r} is {thing.supported_by!r}, which is no object"
+                )
         for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:
                 raise ValueError(f"unknown relation {relation!r}")
             for end in (subject, anchor):
                 if not 0 <= end < len(self.objects):
                     raise ValueError(
-                        f"a relation names object {end}, but there are {len(self.objects)} objects"
+                        f"a relation has object index {end}, "
+                        f"but the scene has {len(self.objects)} objects"
                     )
 
 

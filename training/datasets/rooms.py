@@ -2,8 +2,9 @@
 
 The tables of `vocabularies/rooms.toml` define the rooms. Furniture stands at walls without overlap,
 and small objects stand on the furniture. The relations follow from the boxes by the rules of
-`app.scene.geometry`. Each room gives one to three views from different sides. A view omits 10 % of
-the small objects at random. The views of a room share a group, like the frames of one real place.
+`app.scene.geometry`. The generator creates one to three views of each room from different sides. A
+view omits 10 % of the small objects at random. The views of a room share a group, like the frames
+of one real place.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class Small:
 
 @dataclass(frozen=True, slots=True)
 class Beside:
-    """A piece that belongs to another one: a chair in front of a desk, a nightstand left of a bed.
+    """A piece of furniture beside a main piece, such as a nightstand left of a bed.
 
     Attributes:
         piece: the adjacent piece with the objects on it; its ``chance`` applies to each side.
@@ -74,7 +75,7 @@ class Piece:
         label: class of the piece.
         size: mean extents.
         chance: probability of adding the piece to the room, in each of ``most`` attempts.
-        where: at a wall, in the centre, hung on a wall or under the ceiling.
+        where: place of the piece: at a wall, in the centre, hung on a wall, or under the ceiling.
         most: maximum number of these pieces.
         carries: small objects on the piece.
         beside: adjacent pieces.
@@ -94,7 +95,7 @@ Rooms = Mapping[str, tuple[Piece, ...]]
 
 
 class _Tables:
-    """The rooms of each domain; an entry is a table or the name of an earlier table."""
+    """The rooms of each domain. An entry of the file is a table or the name of an earlier table."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.smalls: dict[str, Small] = {}
@@ -152,7 +153,8 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
     """Generate ``count`` scenes; the same seed gives the same scenes.
 
     Args:
-        rooms: the pieces that each room type may contain; another mapping is another domain.
+        rooms: maps each room type to the pieces it may contain. Pass an entry of `DOMAINS` to
+            generate scenes of another domain.
 
     Positions are in viewer axes. Boxes have sizes and yaws. An object on furniture names the
     furniture as its support. ``relations`` is None, because encoding derives the relations.
@@ -175,7 +177,7 @@ def generate_rooms(count: int, seed: int, rooms: Rooms = ROOMS) -> list[Annotate
 
 
 def rooms_vocabulary() -> Vocabulary:
-    """Return the vocabulary of the generator: all classes of its tables."""
+    """Return the vocabulary of the generator: all classes in its tables of rooms."""
     labels = sorted({label for pieces in ROOMS.values() for label in _labels(pieces)})
     things = tuple(AnnotatedObject(str(i), label) for i, label in enumerate(labels))
     scenes = [AnnotatedScene(room, SOURCE, room, room, things) for room in ROOMS]
@@ -191,7 +193,7 @@ def _labels(pieces: tuple[Piece, ...]) -> list[str]:
 
 
 class _Layout:
-    """One furnished room in room axes: one corner is the origin, walls run along x and y."""
+    """One furnished room. The origin is a corner of the room, and the walls run along x and y."""
 
     def __init__(self, rng: np.random.Generator, room_type: str, pieces: tuple[Piece, ...]) -> None:
         self.rng = rng
@@ -204,7 +206,7 @@ class _Layout:
                     self._furnish(piece)
 
     def seen(self, group: str, view: int) -> AnnotatedScene:
-        """Return one view of the room, from the middle of a random wall."""
+        """Return the room as seen from the middle of a random wall."""
         viewpoint = (
             Viewpoint(0.0, self.depth / 2, 0.0),
             Viewpoint(self.width / 2, 0.0, math.pi / 2),
@@ -256,7 +258,7 @@ class _Layout:
                 return
 
     def _propose(self, piece: Piece, size: Size) -> _Box | None:
-        """Return a random place for a piece, or None if the room is too small."""
+        """Return a piece's box at a random place, or None if the room is too small."""
         if piece.where in ("centre", "ceiling"):
             margin = math.hypot(size[0], size[1]) / 2
             if 2 * margin > min(self.width, self.depth):

@@ -1,10 +1,10 @@
 """Permute objects between scenes; a model trained on the result learns class frequencies only.
 
-The classes of a scene occupy slots. A slot keeps its count and its relations, and the classes move
-between slots. Two random slots exchange their classes unless a scene would get a class twice. The
-exchange preserves both margins exactly: the number of classes per scene, and the number of scenes
-per class. An exchange is as likely as its reversal, so all tables with these margins become equally
-likely. A rejected exchange must count as a step for this property.
+Each class of a scene occupies a slot. A step exchanges the classes of two random slots, unless a
+scene would then contain a class twice. Counts and relations stay with their slots. The exchange
+preserves the number of classes per scene and the number of scenes per class. An exchange is as
+likely as its reversal, so all tables with these two margins become equally likely. This holds only
+if a rejected exchange also counts as a step.
 
 Source: Gionis, Mannila, Mielikäinen and Tsaparas, "Assessing data mining results via swap
 randomization" (ACM TKDD, 2007).
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from app.scene import ClassEvidence
 from training.datasets.encoding import EncodedScene
 
-# Attempted exchanges per mention. Each involves two slots, so a slot is drawn about 20 times.
+# Attempted exchanges per slot. Each exchange draws two slots, so a slot is drawn about 20 times.
 _STEPS_PER_MENTION: Final = 10
 
 
@@ -45,7 +45,7 @@ def shuffle_objects(
     for scene in scenes:
         if len(scene.evidence.classes) and scene.evidence.classes[-1] >= len(structure):
             raise ValueError(
-                f"{scene.scene_id} has a class index above the {len(structure)} classes"
+                f"scene {scene.scene_id} has a class index of {len(structure)} or more"
             )
     rng = np.random.default_rng(seed)
     sizes = [len(scene.evidence.classes) for scene in scenes]
@@ -66,7 +66,11 @@ def shuffle_objects(
 def _exchange(
     owner: NDArray[np.int64], classes: NDArray[np.int64], rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Return the classes (n,) of n slots after random exchanges; owner (n,): scene of each slot."""
+    """Return the classes (n,) of n slots after random exchanges.
+
+    Args:
+        owner: (n,) index of the scene of each slot.
+    """
     if not len(classes):
         return classes
     label, scene = classes.tolist(), owner.tolist()
@@ -74,7 +78,7 @@ def _exchange(
     for s, c in zip(scene, label, strict=True):
         there.setdefault(s, set()).add(c)
     drawn = rng.integers(len(label), size=(2, _STEPS_PER_MENTION * len(label)))
-    # Each step depends on the earlier ones, so array operations are slower than lists and sets.
+    # Each step depends on the earlier steps. Lists and sets are faster than array operations here.
     for i, j in zip(*drawn.tolist(), strict=True):
         c, d = label[i], label[j]
         first, second = there[scene[i]], there[scene[j]]

@@ -1,7 +1,7 @@
 """Known data sets: terms of use, predicates, and the meaning of relations that a scene omits.
 
-A listed relation holds. An unlisted relation is missing from the scene's list. It is false ("off"),
-false only between neighbours ("off for neighbours"), or unobserved:
+A listed relation holds. For relations that a scene does not list, the source decides: they are
+false ("off"), false only between neighbours ("off for neighbours"), or unobserved:
 
 | source | on-top | above | left, front |
 |---|---|---|---|
@@ -15,10 +15,10 @@ Two rules hold in every source. First, a listed on-top or above makes all other 
 pair false, in both directions, unless they are listed too. (1 to 10 % of the pairs with a listed
 on-top or above also have a left or front.) Second, a relation that an annotator denied is false.
 
-With poses, neighbours are pairs that are near by the rule of `app.scene.geometry`. Without poses,
-neighbours are the pairs with at least one listed relation. 3DSSG compares heights only within a
-class, so above stays unobserved there. It lists left and front only between objects on the same
-support, so these relations of far pairs stay unobserved.
+With poses, neighbours are two objects that are near each other by the rule of `app.scene.geometry`.
+Without poses, neighbours are two objects with at least one listed relation. 3DSSG compares heights
+only within a class, so an unlisted above is unobserved. 3DSSG lists left and front only between
+objects on the same support, so left and front of distant pairs are unobserved.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Meaning:
     """The meaning of an unlisted relation in a source.
 
     Attributes:
-        on_top, above, lateral: state of an unlisted relation; lateral covers left and front.
+        on_top, above, lateral: state of an unlisted relation; lateral means left and front.
         complete_objects: True if the object list covers nearly the whole scene. Then absent
             objects are evidence in object learning.
         scenes_per_group: maximum total weight of a group in object learning, in scenes. None if
@@ -61,7 +61,7 @@ LISTS: Final = Meaning()
 """Relations that a user listed: an unlisted relation is false."""
 
 BOXES: Final = Meaning(lateral="off for neighbours")
-"""Relations derived from positions; the vertical relations need sizes, else they are unobserved."""
+"""Relations derived from boxes. Without sizes, on-top and above are unobserved."""
 
 _CENTRES: Final = Meaning(on_top="unobserved", above="unobserved")
 _MENTIONS: Final = Meaning(
@@ -103,13 +103,14 @@ class Source:
     Attributes:
         terms: provenance and licence, for the model card.
         research_only: True if the licence excludes commercial use.
-        meaning: meaning of an unlisted relation. None if it depends on whether scenes list
-            relations.
-        predicates: relation of each predicate. The reader skips predicates outside this table,
-            such as "inside" and "wear". If the table is None, an unknown predicate is an error.
-        left_out: labels with annotations too incomplete to be used.
-        open_vocabulary: True if annotators used free words; an unmentioned class is then absent.
-            Otherwise annotators chose from a list, and a class outside the list is unobserved.
+        meaning: meaning of an unlisted relation. None selects `LISTS` for scenes that list
+            relations and `BOXES` for other scenes.
+        predicates: maps predicates to relations. The reader skips predicates outside this mapping,
+            such as "inside" and "wear". If the mapping is None, an unknown predicate is an error.
+        left_out: labels whose annotation is too incomplete for use.
+        open_vocabulary: True if annotators used free words. A class that a scene does not mention
+            is then absent. Otherwise annotators chose from a list, and a class outside the list is
+            unobserved.
     """
 
     terms: str
@@ -208,7 +209,11 @@ SOURCES: Final[dict[str, Source]] = {
 
 
 def meaning_of(source: str, *, listed: bool = True) -> Meaning:
-    """Return the meaning of a source; ``listed`` decides for an unknown source."""
+    """Return the meaning of unlisted relations in a source.
+
+    Args:
+        listed: whether the scene lists relations; used for sources without a fixed meaning.
+    """
     known = SOURCES.get(source)
     if known is not None and known.meaning is not None:
         return known.meaning

@@ -1,13 +1,13 @@
 """Split scenes into training, test and validation parts by one of four protocols.
 
 - ``group`` (75 / 15 / 10 %) keeps near-duplicates together: each group goes to one part. A group
-  may occur in several sources, such as a frame and the 3D boxes of the same frame. It then goes to
-  the same part in all of them.
+  may occur in several sources, such as a frame and the 3D boxes of the same frame. The group then
+  goes to the same part in all these sources.
 - ``stable`` (75 / 15 / 10 %) derives the part of a group from the seed and the group name only.
   When a data set grows, all groups keep their parts. So a later model version never trains on
   the test scenes of an earlier version. This protocol does not stratify.
-- ``final`` (90 / 0 / 10 %) works like ``group`` and keeps one tenth for calibration. The shipped
-  weights are trained on the other nine tenths.
+- ``final`` (90 / 0 / 10 %) works like ``group`` without a test part. The 10 % are for calibration.
+  The shipped weights are trained on the 90 %.
 - ``random`` (60 / 30 / 10 %) is the protocol of the seed paper and assigns each scene separately.
 
 All protocols except ``stable`` stratify by room type. Their parts depend on the seed and on the set
@@ -67,7 +67,7 @@ def split(
 
 
 def _unit(scene: AnnotatedScene, protocol: Protocol) -> str:
-    """Return the unit of a scene: all scenes of a unit go to the same part."""
+    """Return the name of a scene's unit. All scenes of a unit go to the same part."""
     return f"{scene.source}/{scene.scene_id}" if protocol == "random" else scene.group
 
 
@@ -86,8 +86,8 @@ def _families(
 ) -> list[dict[str, Counter[str]]]:
     """Count room types by unit, for each set of sources with common units.
 
-    A unit is counted in its largest source only. So a smaller source that shares its groups does
-    not change the parts of the larger source.
+    A unit is counted only in the largest source that contains it. So a small source with the same
+    groups does not change the parts of a large source.
     """
     sources_of: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter()
@@ -125,9 +125,9 @@ def _assign(
 ) -> dict[str, Part]:
     """Assign each unit to the part furthest below its target share, one stratum at a time.
 
-    The stratum of a unit is its most common room type. Large strata come first; a hash orders the
-    units within a stratum. The distance is the sum of two: within the stratum and over all scenes.
-    So units of small strata do not all go to training.
+    The stratum of a unit is its most common room type. Large strata come first, and a hash orders
+    the units within a stratum. The distance from the target is the sum of the distance within the
+    stratum and the distance over all scenes. So units of small strata do not all go to training.
     """
     strata: dict[str, list[str]] = defaultdict(list)
     for unit, rooms in rooms_of.items():
@@ -152,7 +152,7 @@ def _assign(
 
 
 def _lack(share: float, given: int, total: int) -> float:
-    """Return the number of scenes by which a part is below its target."""
+    """Return the number of scenes that a part lacks to reach its target share."""
     return share * total - given
 
 

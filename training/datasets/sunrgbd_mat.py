@@ -2,8 +2,8 @@
 
 The file holds a struct array ``SUNRGBDMeta`` with one element per frame. ``groundtruth3DBB`` is a
 struct array of boxes with the fields ``basis`` (rows are the box axes), ``coeffs`` (half extents
-along these axes), ``centroid`` and ``classname``. Axes in metres: x right, y away from the camera,
-z up. The data set already corrects the tilt of the camera.
+along these axes), ``centroid`` and ``classname``. Coordinates are in metres: x right, y away from
+the camera, z up. They are already corrected for the tilt of the camera.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from training.datasets.records import AnnotatedObject, AnnotatedScene, DatasetEr
 
 SOURCE = "sunrgbd-mat"
 
-# Frames are in the order of recording: consecutive frames often show one place.
+# Number of frames in a group. Consecutive frames in the file often show the same place.
 _BLOCK = 20
 
 
@@ -112,7 +112,7 @@ def _box(path: Path, where: str, number: int, struct: Any) -> AnnotatedObject:
         return AnnotatedObject(
             id=str(number),
             label=_text(path, where, struct, "classname"),
-            # The file has x right, y away; viewer axes have x away, y left.
+            # In the file, x points right and y away. In viewer axes, x points away and y left.
             position=(y, -x, z),
             size=(2 * float(half[ahead]), 2 * float(half[aside]), 2 * float(half[upright])),
             yaw=math.atan2(-float(basis[ahead, 0]), float(basis[ahead, 1])),

@@ -1,8 +1,8 @@
 """3DSSG scene graphs (Wald et al., CVPR 2020) in their official layout.
 
-The relationships file is ``relationships.json`` for the whole data set, with labels in
-``objects.json`` beside it. The subset has ``relationships_train.json`` and
-``relationships_validation.json``; these contain labels and splits of at most nine objects.
+The whole data set has ``relationships.json``, with the labels in ``objects.json`` in the same
+folder. The subset has ``relationships_train.json`` and ``relationships_validation.json``. The files
+of the subset include the labels and divide scans into splits of at most nine objects.
 ``3RScan.json`` in the same folder lists the scans of each room.
 """
 
@@ -21,7 +21,7 @@ SOURCE = "3dssg"
 def read_3dssg(path: Path) -> list[AnnotatedScene]:
     """Read the scans (or splits of scans) of a relationships file.
 
-    Rescans of a room share its group. The official files lack room types and poses.
+    All scans of a room are in one group. The official files contain no room types and no poses.
 
     Raises:
         DatasetError: a file is missing or does not follow the official layout.
@@ -96,7 +96,7 @@ def _labels(path: Path) -> dict[str, dict[str, str]]:
 
 
 def _rooms(path: Path) -> dict[str, str]:
-    """Read the reference scan of each scan's room from ``3RScan.json``, by scan id."""
+    """Return the reference scan of the same room for each scan id, from ``3RScan.json``."""
     rooms: dict[str, str] = {}
     entries = load_json(path)
     if not isinstance(entries, list):

@@ -16,7 +16,8 @@ from training.datasets.records import AnnotatedScene
 
 INDOOR_FILE = Path(__file__).resolve().parent.parent / "vocabularies" / "indoor.json"
 
-# Minimum mentions of a class in training. Indoor classes have word vectors, so fewer suffice.
+# Minimum number of mentions of a class in the training scenes. Indoor classes also have word
+# vectors, so a smaller minimum suffices for them.
 MINIMUM_MENTIONS = 8
 INDOOR_MINIMUM_MENTIONS = 5
 # Minimum number of boxes for a typical size.
@@ -44,7 +45,7 @@ def build_vocabulary(
         outdoor: include labels of ``outdoor`` and ``surroundings``.
 
     Raises:
-        ValueError: all classes have too few mentions.
+        ValueError: every class has fewer mentions than the minimum.
     """
     spellings: dict[str, Counter[str]] = {}
     rooms: Counter[str] = Counter()
@@ -134,8 +135,8 @@ def source_vocabulary(
 ) -> Vocabulary:
     """Build a vocabulary of the mentioned classes only, without the base classes.
 
-    It suits models trained on one source, such as ProcTHOR or VRD. Such a vocabulary has few
-    classes, so names of narrower kinds become aliases: "dining table" becomes an alias of "table".
+    The vocabulary is for models trained on one source, such as ProcTHOR or VRD. It has few classes,
+    so names of narrower kinds become aliases: "dining table" becomes an alias of "table".
     """
     names = curated_names()
     mentioned_only = Names(
@@ -151,22 +152,22 @@ def source_vocabulary(
 
 
 def _with_kinds(entry: ObjectClass, vocabulary: Vocabulary, names: Names) -> ObjectClass:
-    """Add the names of narrower kinds that the vocabulary does not know."""
+    """Add names of narrower kinds as aliases if the vocabulary does not contain them."""
     unknown = [kind for kind in names.kinds.get(entry.label, ()) if vocabulary.index(kind) is None]
     more = [name for kind in unknown for name in (kind, *names.aliases.get(kind, ()))]
     return replace(entry, aliases=(*entry.aliases, *more))
 
 
 def _reachable(names: Names) -> dict[str, tuple[str, ...]]:
-    """Return the aliases, with an entry for every curated class to keep its spelling."""
+    """Return the aliases by class; an entry for every curated class keeps the curated spelling."""
     return dict.fromkeys((*names.base, *names.household, *names.structure), ()) | names.aliases
 
 
 def with_typical_sizes(vocabulary: Vocabulary, scenes: Iterable[AnnotatedScene]) -> Vocabulary:
     """Add a typical size to each class: the median of its boxes.
 
-    The yaw of an object without a box is unknown, so its typical footprint is a square. The side is
-    the median of sqrt(dx * dy), which keeps the area.
+    The yaw of an object is unknown if only its typical size is used, so the typical footprint is a
+    square. Its side is the median of sqrt(dx * dy), which preserves the area.
 
     Args:
         vocabulary: the classes; a class with fewer than `MINIMUM_BOXES` boxes keeps its size.

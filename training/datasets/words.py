@@ -1,7 +1,7 @@
 """Word vectors for the classes of a vocabulary.
 
-The ``.npz`` file holds ``words`` (n,) strings, ``vectors`` (n, d) int8 and ``scale`` (). The vector
-of a word is its row times the scale.
+The ``.npz`` file contains ``words`` (n,) strings, ``vectors`` (n, d) int8 and the scalar ``scale``.
+The vector of a word is its row of ``vectors`` times ``scale``.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ MAX_WORDS: Final = 1_000_000
 MAX_BYTES: Final = 512 * 2**20
 
 _MEMBERS: Final = ("words", "vectors", "scale")
-# RuntimeError: an encrypted archive, or an unknown compression.
+# `zipfile` raises RuntimeError for an encrypted archive and for an unknown compression.
 _UNREADABLE: Final = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 _SEPARATORS: Final = re.compile(r"[\s_\-./]+")
-# Filler words: they do not describe the object.
+# Filler words, which do not describe the object.
 _FILLERS: Final = frozenset({"a", "an", "and", "for", "in", "no", "of", "on", "or", "the", "with"})
 
 Vectors = NDArray[np.float32]
@@ -76,9 +76,9 @@ class WordVectors:
 
 
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, NDArray[np.bool_]]:
-    """Vectors of the classes of a vocabulary.
+    """Return the word vectors of the classes of a vocabulary.
 
-    The vector comes from the label. If the label has none, it comes from the first alias with one.
+    The vector of a class comes from its label, or else from its first alias with a vector.
 
     Returns:
         Vectors (V, d) float32 of unit length, zero for a class without a vector.
@@ -121,7 +121,7 @@ def read_word_vectors(path: Path) -> WordVectors:
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Read one array without unpickling; check the declared size first."""
+    """Read one array without unpickling, after a check of its declared size."""
     if f"{name}.npy" not in archive.namelist():
         raise DatasetError(path, name, "is missing")
     with archive.open(f"{name}.npy") as file:

@@ -125,7 +125,10 @@ def _read(path: Path, format_: str | None) -> list[AnnotatedScene]:
 def _sources(
     folder: Path, found: dict[Path, list[AnnotatedScene]]
 ) -> tuple[list[str], dict[Path, list[AnnotatedScene]]]:
-    """Return paths relative to the folder, and copies of files whose names imply no format."""
+    """Return the source paths relative to the folder, and the scenes of each copy to write.
+
+    A file is copied if its name implies no format.
+    """
     sources: list[str] = []
     copies: dict[Path, list[AnnotatedScene]] = {}
     for file, scenes in found.items():
@@ -171,7 +174,7 @@ def _fail_lines(error: BadLinesError) -> NoReturn:
 
 
 def fail(error: Exception) -> NoReturn:
-    """Print the error and leave with exit code 1."""
+    """Print the error and exit with code 1."""
     console.print(f"[red]error:[/red] {error}", soft_wrap=True)
     raise typer.Exit(1) from None
 

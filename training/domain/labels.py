@@ -12,11 +12,12 @@ from rapidfuzz.distance import OSA
 from app.scene import label_key
 from training.datasets import AnnotatedScene, Names
 
-# Number of most frequent names that are compared with each other.
+# Only this number of the most frequent names are compared with each other.
 _COMPARED = 2000
-# Names of at least 5 letters may differ by one edit, names of at least 10 letters by two.
+# Lookalikes of at least 5 letters differ by one edit; of at least 10 letters, by at most two edits.
 _ONE_SLIP, _TWO_SLIPS = 5, 10
-# A merged name has at most two mentions or 10 % of the other name's, and at least 6 letters.
+# A merged name has at least 6 letters. It has at most two mentions, or at most 10 % of the mentions
+# of the other name.
 _RARE, _MERGED_LENGTH = 0.1, 6
 
 

@@ -45,11 +45,11 @@ class Proposal:
         name: name of the configuration and of the model.
         facts, labels, lookalikes: results of the analysis.
         minimum: minimum number of mentions of a class.
-        covered: number of classes and covered share of the mentions, by minimum.
+        covered: maps each minimum to the number of classes and the covered share of the mentions.
         vocabulary: the vocabulary; merged lookalikes are aliases.
-        dropped: names without a class: name, mentions and reason.
-        values: the configuration by section.
-        reasons: reason by "section.entry".
+        dropped: (name, mentions, reason) of each name without a class.
+        values: entries of the configuration, by section.
+        reasons: reason for each value, by "section.entry".
         parts: number of scenes in each part of the proposed split.
     """
 
@@ -203,7 +203,7 @@ def _dropped(
 
 
 def _split(scenes: Sequence[AnnotatedScene]) -> tuple[int, dict[str, int]]:
-    """Return the first seed with parts near their target shares, or the best seed tried."""
+    """Return a seed and its parts: the first with parts near their targets, or the best tried."""
     best: tuple[float, int, dict[str, int]] | None = None
     for seed in range(_SPLIT_SEEDS):
         found = split(scenes, seed=seed, protocol="stable")

@@ -1,18 +1,18 @@
-"""Calibration: the probabilities of the service against the truth.
+"""Calibration: compare the probabilities of the service with the truth.
 
-Each answer is compared with its meaning in the contract:
+An answer is true if:
 
-    relations    the relation holds between the two objects. Variants: half of the pairs are given,
-                 or the object was removed. Unknown relations are left out (see
-                 `training.cases.known_relations`)
+    relations    the relation holds between the two objects. Variants: the relations of half of the
+                 pairs are evidence, or one object was removed. Relations with unknown truth are
+                 left out (see `training.cases.known_relations`)
     missing      the class is in the scene and was hidden. Each scene shows 25, 50 or 75 % of its
                  classes, or all but one, at random
     at a place   the class is in the scene at the given place; one occupied place is drawn at random
     outliers     the object is an intruder; half of the scenes have one
     misplaced    the relation is false; one relation was altered in half of the scenes
 
-Hidden classes and intruders need scenes with complete object lists. Requests contain no room type
-and use all defaults, so only returned answers count.
+The questions about hidden classes and intruders use scenes with complete object lists. Requests
+contain no room type and use default parameters. Only the returned answers count.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from training.evaluation.metrics import Flags, Ints, Items, Metric
 from training.evaluation.missing import SHARES, shown_classes
 from training.evaluation.setting import Contender, Outcome, Setting
 
-# Number of removed objects per scene for placements. A scene has about 20 relations, but an object
-# has only 3 places; with one object per scene, chance alone gives an ECE of .02 to .03.
+# Number of removed objects per scene for placements. A removed object gives only 3 answers, while a
+# scene has about 20 relations. With one object per scene, chance alone gives an ECE of .02 to .03.
 _REMOVALS = 4
 # (probability, truth) of each answer about one scene.
 Answered = list[tuple[float, bool]]
@@ -52,7 +52,7 @@ Ask = Callable[[Artifact, EncodedScene, np.random.Generator], Answered | None]
 
 
 def uncalibrated(artifact: Artifact) -> Artifact:
-    """Return the artifact with uncalibrated log-odds; slopes of -1 only correct the sign."""
+    """Return the artifact without calibration; a slope of -1 only changes the sign of log-odds."""
     plain = Calibration.neutral(artifact.spec.A).model_copy(
         update={"outlier": CountSlope(slope=-1.0), "misplaced": Slope(slope=-1.0)}
     )
@@ -147,7 +147,10 @@ def ask_missing(
 def ask_placed(
     artifact: Artifact, encoded: EncodedScene, rng: np.random.Generator
 ) -> Answered | None:
-    """Ask for the hidden classes at one place; leave out classes with an unknown relation to it."""
+    """Ask for the hidden classes at one place.
+
+    Classes are left out if the truth of their relation to the place is unknown.
+    """
     hidden = _hidden(artifact, encoded, rng)
     if hidden is None:
         return None
@@ -183,11 +186,11 @@ def ask_outliers(
     rng: np.random.Generator,
     intruders: Mapping[tuple[str, str], Ints] | None = None,
 ) -> Answered | None:
-    """Ask for outliers; half of the scenes get an intruder.
+    """Ask for outliers; half of the scenes contain an added intruder.
 
     Args:
-        intruders: candidate intruders by scene, see `kinds_of_intruders`; None means any absent
-            class.
+        intruders: candidate intruders by source and scene id, see `kinds_of_intruders`. None means
+            any absent class.
     """
     structure = artifact.vocabulary.structure
     classes = encoded.evidence.classes

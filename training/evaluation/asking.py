@@ -1,8 +1,8 @@
-"""Query a score or `app.questions` as a robot would, and return the answers as columns.
+"""Query a score or `app.questions` with requests like those of a robot, and return arrays.
 
 Some cases are queried a second time in another order. If an answer changes with the order, the
-score uses more than the scene, and the evaluation stops. This check does not detect memorised
-scenes. Splits by group keep near-duplicates of test scenes out of training.
+score uses information outside the scene, and the evaluation stops. This check does not detect
+memorised scenes. Splits by group keep near-duplicates of test scenes out of training.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LEAK = "the answer for a scene depends on the order of the queries: the score l
 
 
 class LeakError(ValueError):
-    """A score uses information that it was not given."""
+    """A score uses information that is not part of the question."""
 
 
 def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floats]:
@@ -47,7 +47,7 @@ def ask_every(ask: Callable[[Case], Floats], cases: Sequence[Case]) -> list[Floa
     """
     answers = [ask(case) for case in cases]
     if any(np.isnan(answer).any() for answer in answers):
-        raise FloatingPointError("an answer is NaN")
+        raise FloatingPointError("the score of a case is NaN")
     for k in np.random.default_rng(0).permutation(len(cases))[:_PROBED_CASES].tolist():
         if not np.allclose(ask(cases[k]), answers[k], rtol=1e-3, atol=1e-9):
             raise LeakError(_LEAK)
@@ -82,13 +82,13 @@ def ask_rows(score: Callable[..., Tensor], *columns: Tensor, block: int = 256) -
 
 
 def labels_alone(encoded: EncodedScene, kept: Sequence[int] | None = None) -> Scene:
-    """Return a scene of the instances at the given positions, with labels only."""
+    """Return a scene of the instances at the indices `kept` (default: all), with labels only."""
     places = range(len(encoded.instance_classes)) if kept is None else kept
     return replace(scene_of(encoded, places, ()), room_type=None)
 
 
 def of_classes(classes: Sequence[int]) -> Scene:
-    """Return a scene with one object per entry."""
+    """Return a scene with one object for each entry of `classes`."""
     return Scene(tuple(SceneObject(str(k), str(c), c) for k, c in enumerate(classes)))
 
 
@@ -115,7 +115,7 @@ def missing_probabilities(
 
     Args:
         coverage: coverage of the request; None means the default of the model.
-        at: the place in question: a relation and the position of its anchor object.
+        at: the place in question: a relation and the index of its anchor object.
     """
     vocabulary = artifact.vocabulary
     found = np.full(len(vocabulary), -np.inf)
@@ -128,7 +128,7 @@ def missing_probabilities(
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Answers of `/outliers` about the n objects of a scene, by position.
+    """Answers of `/outliers` about the n objects of a scene, in the order of the objects.
 
     Attributes:
         probability, log_odds: (n,).
@@ -158,7 +158,7 @@ def relation_probabilities(
     """Return probabilities (A, n, n) of the canonical relations of n objects; 0 if not answered.
 
     Args:
-        pairs: ordered pairs of positions to query; all pairs by default.
+        pairs: ordered pairs of object indices to query; all pairs by default.
     """
     n = len(scene.objects)
     found = np.zeros((len(CANONICAL), n, n))

@@ -1,4 +1,4 @@
-"""Build contenders: a model with scores as the service computes them, and two reference rows."""
+"""Build contenders: a model with the scores of the service, and two reference rows."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def artifact_contender(
     """Build the contender of a model, published or in memory.
 
     Args:
-        train: training scenes, for annealing in the density task.
+        train: training scenes; annealing in the density task starts at their class frequencies.
         calibrated: include the calibrated probabilities and the alarm. Otherwise include only the
             scores of the machine.
     """
@@ -69,7 +69,7 @@ def relation_score(artifact: Artifact, *, given: bool) -> RelationScore:
     The evidence of a relation excludes the relation itself.
 
     Args:
-        given: use the relations that the batch observes as true as evidence; otherwise use none.
+        given: use the observed relations that hold as evidence; otherwise use no relations.
     """
 
     def score(batch: Batch) -> Tensor:
@@ -114,13 +114,13 @@ def placed_score(artifact: Artifact) -> PlacedScore:
 
 
 def _instances(classes: Tensor, counts: Tensor) -> tuple[Scene, Tensor]:
-    """Build a scene with the given instance counts, and return each class's first position."""
+    """Return a scene with the given instance counts, and the first object index of each class."""
     each = counts.clamp(min=1).long()
     return of_classes(classes.repeat_interleave(each).tolist()), each.cumsum(0) - each
 
 
 def floor_contender(setting: Setting) -> Contender:
-    """Return a contender with held-out scenes as samples, which estimates the best value of T4."""
+    """Return a contender whose samples are held-out scenes: it estimates the best value of T4."""
     _, second = held_out_halves(setting.complete)
     return Contender(sampler=scene_sampler(second)) if len(second) else Contender()
 

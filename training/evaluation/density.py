@@ -1,8 +1,9 @@
-"""Density: log-likelihood of the objects of a scene, with bounds of log Z by AIS.
+"""Density: log-likelihood of the objects of a scene.
 
-All classes of the vocabulary count, including structure. A class that a scene does not list is
-absent, as in training. The room type is not given. In the local form relations do not affect p(v),
-so the machine is annealed without them. With h1 drawn from its mean field q given the scene,
+Annealed importance sampling (AIS) bounds the log partition function, log Z. All classes of the
+vocabulary count, including structure. A class that a scene does not list is absent, as in training.
+The room type is unobserved. In the local form, relations do not affect p(v), so AIS uses the
+machine without relation units. With h1 drawn from its mean field q given the scene,
 
     log p(v) = log mean_h [ exp(b·v + h·(c1 + v'W)) prod_l (1 + exp(c2 + h'J)_l) / q(h) ] - log Z
 
@@ -11,9 +12,9 @@ log-likelihood further, so the result is conservative.
 
 The pairwise model is the fully visible Boltzmann machine (Ising model) of classes:
 p(v) = exp(b·v + v'Wv / 2) / Z with symmetric W and zero diagonal. The annealing path starts at
-beta = 0 with independent classes of log-odds a, where log Z is a sum. It ends at beta = 1 with the
-model. In between, the log-odds are (1 - beta) a + beta b, and the edges are beta W. One sweep
-updates each class once.
+beta = 0 with independent classes of log-odds a, where log Z has a closed form. The path ends at
+beta = 1 with the model. At other beta, the log-odds are (1 - beta) a + beta b, and the edges are
+beta W. One sweep updates each class once.
 
 Source: Neal, "Annealed importance sampling" (2001), run in both directions as in
 `training.machines.partition`.
@@ -62,7 +63,7 @@ class DensitySettings:
     draws: int = 256
 
     def betas(self) -> list[float]:
-        """Return inverse temperatures from 0 to 1; they are denser near 1, where p changes most."""
+        """Return inverse temperatures from 0 to 1, denser near 1, where p(v) changes most."""
         return [float(x) for x in 1 - np.linspace(1.0, 0.0, self.temperatures) ** 2]
 
 
@@ -123,11 +124,11 @@ def machine_density(
     """Return the density of a machine of the local form.
 
     Args:
-        train: training scenes. Annealing starts at independent classes of their frequencies, and
-            the reverse run starts its Gibbs chains at these scenes.
+        train: training scenes. Annealing starts at independent classes with the frequencies of
+            these scenes. The reverse run starts its Gibbs chains at these scenes.
 
     Raises:
-        ValueError: the machine is of the seed form, in which relations affect p(v).
+        ValueError: the machine has the seed form, in which relations affect p(v).
     """
     if machine.relations_act:
         raise ValueError("the density of objects needs a machine of the local form")
@@ -278,7 +279,10 @@ class Ising:
 
 
 class State:
-    """Chains (V, chains); the class axis comes first, so a class of all chains is contiguous."""
+    """The states of all chains, (V, chains).
+
+    The class axis comes first, so that the values of one class are contiguous in memory.
+    """
 
     def __init__(self, model: Ising, v: Floats) -> None:
         self.model = model
@@ -286,7 +290,7 @@ class State:
         self.field = model.W @ v
 
     def gain(self, a: Floats) -> Floats:
-        """Return the log density ratio of model and independent classes without Z, (chains,)."""
+        """Return log(density of the model / density of independent classes), unnormalised."""
         linear = (self.model.b - a) @ self.v
         return np.asarray(linear + (self.field * self.v).sum(0) / 2)
 

@@ -1,7 +1,7 @@
 """Everyday facts: questions with answers that people agree on, for acceptance tests only.
 
-People wrote the facts by hand before any model was evaluated. Training, tuning and special cases
-must never read them; no other module of this package does. The questions use the defaults of the
+People wrote the facts by hand before any model was evaluated. Training and tuning must never use
+the facts, so no other module of this package reads them. The questions use the defaults of the
 service and ignore labels outside the vocabulary.
 """
 
@@ -49,7 +49,7 @@ _LISTED = 5
 _DRAWN = 8
 _FEW = 3
 
-# By line: (hits, questions) of each fact.
+# Maps each name in `LINES` to a list of (hits, questions), one pair per fact.
 Lines = dict[str, list[tuple[int, int]]]
 
 
@@ -66,7 +66,7 @@ def facts_digest(folder: Path) -> str:
 
 
 def ask_everyday(artifact: Artifact, folder: Path = EVERYDAY) -> dict[str, tuple[int, int]]:
-    """Return (hits, questions) of each of the eleven lines.
+    """Return the total (hits, questions) for each of the eleven counts.
 
     Raises:
         FileNotFoundError: the folder contains no facts.
@@ -172,7 +172,7 @@ def _five(artifact: Artifact, fact: dict[str, Any]) -> tuple[questions.MissingAn
 
 
 def _place(artifact: Artifact, scene: Scene, name: str) -> int | None:
-    """Return the object with that id, or the only object of that class."""
+    """Return the index of the object with that id, or of the only object of that class."""
     index = artifact.vocabulary.index(name)
     named = [k for k, thing in enumerate(scene.objects) if thing.id == name]
     places = named or [k for k, thing in enumerate(scene.objects) if thing.class_index == index]

@@ -1,7 +1,7 @@
-"""The effect of additional evidence: relations, poses and the room type, against labels only.
+"""The effect of additional evidence (relations, poses, room type) compared with labels only.
 
 Each question is asked twice about the same scene: with labels only, and with one additional kind of
-evidence. The change is paired, with a confidence interval over scenes.
+evidence. The result is the paired change of a metric, with a confidence interval over scenes.
 
     T2   one class is removed with all its instances. The evidence is the relations (or poses) of
          the remaining instances, or the room type. Metric: change of MRR over absent classes
@@ -44,7 +44,8 @@ from training.evaluation.setting import Contender, Outcome, Setting
 
 KINDS = ("relations", "poses", "room type")
 
-# Removed classes per scene: with one, the change of a small source varies by .01 by chance.
+# Number of removed classes per scene. With one class, chance varies the change of a small source by
+# .01.
 _REMOVALS = 2
 
 
@@ -53,11 +54,12 @@ class Case:
     """One question, asked with and without additional evidence.
 
     Attributes:
-        place: position of the scene.
+        place: index of the scene.
         scenes: the scene with labels only, and with evidence.
-        target: the removed class in T2, the position of the intruder in T3.
-        truth, asked: (A, n, n) relations in T1, empty elsewhere.
-        items: number of listed relations in T1; 1 elsewhere.
+        target: the removed class in T2, the object index of the intruder in T3.
+        truth, asked: (A, n, n) bool in T1: relations that hold, and queried relations. Empty in T2
+            and T3.
+        items: number of listed relations in T1; 1 in T2 and T3.
     """
 
     place: int
@@ -71,10 +73,12 @@ class Case:
 def told(
     encoded: EncodedScene, kept: list[int], kind: str, between: Flags | None = None
 ) -> tuple[Scene, Scene] | None:
-    """Return a scene with labels only and with one of `KINDS`; None without such evidence.
+    """Return a scene twice: with labels only, and with evidence of one of `KINDS`.
+
+    The result is None if the scene lacks such evidence.
 
     Args:
-        kept: positions of the remaining instances.
+        kept: indices of the remaining instances.
         between: (n, n) mask of the pairs with evidence; all pairs by default.
     """
     bare = replace(scene_of(encoded, kept, ()), room_type=None)
@@ -113,7 +117,11 @@ def intrusions(
     intruders: NDArray[np.int64],
     kind: str,
 ) -> Iterator[Case]:
-    """Generate T3 cases: every scene with its intruder, (N,) classes; -1 skips a scene."""
+    """Generate T3 cases: every scene with its intruder.
+
+    Args:
+        intruders: (N,) class of the intruder of each scene; -1 skips the scene.
+    """
     for place, (encoded, intruder) in enumerate(zip(scenes.scenes, intruders, strict=True)):
         both = told(encoded, list(range(len(encoded.instance_classes))), kind)
         if intruder < 0 or both is None:
@@ -135,7 +143,7 @@ def _intruded(artifact: Artifact, scene: Scene, intruder: int) -> Scene:
 def halves(
     scenes: SceneTensors, structure: NDArray[np.bool_], kind: str, seed: int = 0
 ) -> Iterator[Case]:
-    """Generate T1 cases: half of the classes, at least two, have evidence; query other pairs."""
+    """Generate T1 cases: half of the classes (at least two) have evidence; others are queried."""
     for place, encoded in enumerate(scenes.scenes):
         own, classes = encoded.instance_classes, encoded.evidence.classes
         usable = classes[~structure[classes]]
@@ -214,7 +222,7 @@ def _changes(
     value: Callable[[Artifact, Scene, Case], float],
     kinds: tuple[str, ...] = KINDS,
 ) -> Outcome | None:
-    """Return the change by kind of evidence, and the metric on both sides, pooled over items.
+    """Return the metric with and without each kind of evidence, and its change, over all items.
 
     Args:
         cases_of: function of the artifact, scenes and a kind of evidence; yields the cases.

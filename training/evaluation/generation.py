@@ -1,4 +1,4 @@
-"""T4: generated scenes against held-out scenes.
+"""Task T4: compare generated scenes with held-out scenes.
 
 The metrics use only annotated classes without structure. Intervals resample the held-out scenes and
 keep the generated scenes fixed.
@@ -52,8 +52,9 @@ class Contradictions:
     """Contradictory relations in B scenes, between different classes.
 
     Attributes:
-        related: (B,) number of unordered pairs × canonical relations with at least one direction.
-        mirrored: (B,) number of these pairs with both directions.
+        related: (B,) number of pairs with a canonical relation in at least one direction, summed
+            over the relations.
+        mirrored: (B,) number of pairs with the relation in both directions, summed likewise.
         stacked: (B,) bool, the scene has an on-top relation.
         cyclic: (B,) bool, the scene has an on-top cycle.
     """
@@ -87,11 +88,11 @@ class Contradictions:
         return cls(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
     def at(self, index: Tensor) -> Contradictions:
-        """Select the scenes at the given positions."""
+        """Select the scenes at the given indices."""
         return Contradictions(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def metrics(self) -> dict[str, Metric]:
-        """Return the shares, if any scene has relations."""
+        """Return the shares of mirrored relations and on-top cycles that are defined."""
         shares = {
             "mirrored relations": (self.mirrored, self.related),
             "on-top cycles": (self.cyclic, self.stacked),
@@ -329,7 +330,7 @@ def generation_metrics(
         drawn: at least two generated scenes.
         held_out: (N, V) presence.
         train: (T, V) presence.
-        asked: (V,) bool, the classes that count.
+        asked: (V,) bool, the classes that the metrics use.
         emphasis: (N,) weights of the held-out scenes; 1 by default.
     """
     x, y, known = drawn.v[:, asked], held_out[:, asked], train[:, asked]
@@ -356,11 +357,11 @@ def generation_metrics(
 def generation_task(contender: Contender, setting: Setting) -> Outcome | None:
     """Measure T4: compare generated scenes with the first half of the held-out scenes.
 
-    The number of generated scenes is the size of the second half. There are three conditions: free,
-    with the room types of the second half, and with one given class. The given class is drawn from
-    all class mentions of the second half, so a scene is chosen in proportion to its number of
-    classes. In this condition the first half is weighted in the same way, so that a perfect sampler
-    has no discrepancy.
+    The number of generated scenes is the size of the second half. There are three conditions:
+    without evidence, with the room types of the second half, and with one given class. The given
+    class is drawn from all class mentions of the second half. So the probability of a scene is
+    proportional to its number of classes. In this condition the first half has the same weights, so
+    that a perfect sampler has no discrepancy.
     """
     if contender.sampler is None or setting.train is None:
         return None

@@ -5,7 +5,7 @@
     room        uniform over the classes seen in training in the same room type
     signature   a class typical of another room type
 
-Scenes with fewer than three classes get no intruder.
+Scenes with fewer than three classes are skipped.
 
 The lift of a class in a room type is p(class | room type) / p(class), over training scenes with a
 known room type. The signature of a room type has at most ten classes, those with the highest lift.
@@ -134,9 +134,10 @@ def by_signature(scenes: SceneTensors, train: SceneTensors) -> Tensor:
 def kinds_of_intruders(
     scenes: SceneTensors, structure: Tensor, train: SceneTensors | None, seed: int = 0
 ) -> dict[tuple[str, str], Ints]:
-    """Draw one intruder of each kind for every scene, by source and scene id.
+    """Draw one intruder of each kind for every scene.
 
-    The kinds are those of the calibration: uniform, by popularity and by signature.
+    The kinds are those of the calibration: uniform, by popularity and by signature. The keys of the
+    result are (source, scene id).
     """
     laws: list[Tensor | None] = [None]
     if train is not None:
@@ -153,7 +154,7 @@ class IntruderScores:
     """Log-odds of each object given the rest, for scenes with and without an intruder.
 
     Attributes:
-        scene: (N,) position of the scene.
+        scene: (N,) index of the scene.
         thing: (N,) class of the object.
         log_odds: (N,) log-odds of the object.
         intruder: (N,) bool, the object is the intruder.
@@ -185,7 +186,10 @@ class IntruderScores:
 
     @property
     def dirty(self) -> Items:
-        """Objects of scenes with an intruder, scored by -log-odds; only the intruder is true."""
+        """Return the objects of scenes with an intruder, with scores -log-odds.
+
+        Only the intruder counts as true.
+        """
         rows = ~self.clean
         score, truth = -self.log_odds[rows], self.intruder[rows]
         return Items(self.scene[rows], score, truth, self.scenes, self.skipped)

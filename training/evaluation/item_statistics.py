@@ -1,9 +1,9 @@
 """Statistics of scored items that are not sums over scenes.
 
-Each statistic is prepared once from scores (N,) and truth (N,). It is then evaluated with weights
-(N,), the number of times that each item counts; weights are whole numbers under resampling. Items
-of equal score are in random order, and the statistic is the expectation. An undefined statistic is
-NaN.
+Each function takes the scores (N,) and truth values (N,) of items. It returns the statistic as a
+function of the item weights (N,). A weight is the number of times that an item counts; resampling
+gives whole numbers. For items of equal score, the statistic is the expectation under random order.
+An undefined statistic is NaN.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BINS = 10
 
 @dataclass(frozen=True, eq=False)
 class _Levels:
-    """Items by distinct score, ascending."""
+    """Items grouped by equal score, in ascending order."""
 
     level: NDArray[np.int64]
     scores: Floats
@@ -58,8 +58,9 @@ def auroc(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
 def average_precision(score: Floats, truth: NDArray[np.bool_]) -> Prepared:
     """Return the mean precision at the true items.
 
-    Suppose n items of equal score, p of them true, follow N items with P true ones. The true item
-    at place k of the n then has an expected P + 1 + (k - 1)(p - 1)/(n - 1) true items among N + k.
+    Suppose that N items (P of them true) score higher than n items of equal score (p of them true).
+    If a true item has rank N + k, the expected number of true items among the first N + k items is
+    P + 1 + (k - 1)(p - 1)/(n - 1).
     """
     levels = _levels(score, truth)
 
@@ -130,7 +131,7 @@ def reliability(score: Floats, truth: NDArray[np.bool_]) -> Reliability:
 def _bins(scores: Floats, every: Floats, true: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the mass, mean score and share of true items of each bin.
 
-    A level that crosses a bin border is divided; its true items are divided in proportion.
+    If items of equal score cross a bin border, both bins get a proportional part of true items.
     """
     total = every.sum()
     edges = np.linspace(0.0, total, BINS + 1)

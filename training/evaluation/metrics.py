@@ -226,7 +226,7 @@ class Ratio(Metric):
             ValueError: the metrics have different items.
         """
         if not np.array_equal(self.denominators, other.denominators):
-            raise ValueError("the two metrics have different items")
+            raise ValueError("cannot subtract metrics with different items")
         return Ratio(self.numerators - other.numerators, self.denominators)
 
     @classmethod
@@ -265,7 +265,7 @@ class _OfItems(Metric):
         for field in fields(cls):  # type: ignore[arg-type]
             own = [getattr(part, field.name) for part in parts]
             values[field.name] = np.concatenate(own) if isinstance(own[0], np.ndarray) else own[0]
-        # Scene numbers of each part are shifted by the number of scenes before it.
+        # The scene indices of a part are shifted by the number of scenes in earlier parts.
         starts = np.cumsum([0, *(part.count for part in parts)]).tolist()
         shifted = [part.scene + start for part, start in zip(parts, starts[:-1], strict=True)]
         scene = np.concatenate(shifted).astype(np.int64)
@@ -344,7 +344,7 @@ class Scored(_OfItems):
 
     def resampled(self, resamples: int, seed: int) -> Floats:
         drawn = super().resampled(resamples, seed)
-        # Resampling inflates calibration errors, as a smaller number of answers would.
+        # Resampling inflates calibration errors, so these resamples are centred on the value.
         return _centred(drawn, self.value) if self.statistic == "ECE" else drawn
 
 
@@ -387,7 +387,7 @@ class Resampled(Metric):
         point: the value.
         drawn: (resamples,) from `resample` with seed 0.
         count: number of resampled scenes.
-        items: number of scenes compared with them.
+        items: number of scenes in the other set of the comparison.
     """
 
     point: float
@@ -401,8 +401,7 @@ class Resampled(Metric):
     ) -> Resampled:
         """Create the metric from a statistic of the scene weights.
 
-        Resampling inflates distances between sets, as smaller sets would. So the resamples are
-        centred on the value.
+        Resampling inflates distances between sets. So the resamples are centred on the value.
         """
         point = statistic(np.ones(scenes))
         drawn = resample(statistic, scenes, resamples)
@@ -421,7 +420,7 @@ class Resampled(Metric):
         return self.point
 
     def at(self, weight: Floats) -> float:
-        raise NotImplementedError("Resampled cannot be weighted by scene")
+        raise NotImplementedError("a metric of whole sets cannot be computed for scene weights")
 
     def resampled(self, resamples: int, seed: int) -> Floats:
         if seed != 0:

@@ -8,14 +8,14 @@
                 relations, drawn at random, gives its place: the relation, its direction and the
                 class at its other end
 
-Candidates of a hidden class are the absent classes that are not hidden themselves, so another
-hidden class never counts as an error. Precision@5 is the share of hidden classes among the first
-five absent classes. It cannot reach 1 with fewer than five hidden classes. Ties score their
-expectation under random order.
+The rank of a hidden class ignores all other hidden classes, so these never count as errors.
+Precision@5 is the share of hidden classes among the first five absent classes. With fewer than five
+hidden classes, precision@5 cannot reach 1. For ties, a metric is the expectation under random
+order.
 
-Structure classes are neither hidden nor candidates. Scenes with fewer than two other classes are
-skipped. T2-at excludes relations between equal classes and relations with structure. In T2 all
-relations are unobserved, so that they reveal nothing about the removed object.
+Structure classes are never hidden and never candidates. Scenes with fewer than two other classes
+are skipped. T2-at excludes relations between equal classes and relations with structure. In T2 all
+relations are unobserved, because relations could reveal the removed object.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ _CLOSED = 1.0
 
 @dataclass(frozen=True, eq=False)
 class MachineScore:
-    """Log-odds of a machine with all relations unobserved.
+    """The score of a machine: log-odds with all relations unobserved.
 
-    Seed-form machines sum relations out at the mean-field fixed point.
+    A seed-form machine sums relations out at the mean-field fixed point.
     """
 
     machine: BoltzmannMachine
@@ -81,7 +81,7 @@ class Ranking:
     """Ranks of all hidden classes of a set of scenes.
 
     Attributes:
-        scene: (N,) position of the scene in the set.
+        scene: (N,) index of the scene in the set.
         target: (N,) the hidden class.
         above: (N,) number of candidates with a higher score.
         ties: (N,) number of other candidates with the same score.
@@ -105,7 +105,7 @@ class Ranking:
             FloatingPointError: a score is NaN.
         """
         if bool(values.isnan().any()):
-            raise FloatingPointError("a score is NaN")
+            raise FloatingPointError("the score of a class is NaN")
         chosen = values.gather(1, target.unsqueeze(1))
         above, ties = (values > chosen).sum(1), (values == chosen).sum(1) - 1
         return cls(scene.numpy(), target.numpy(), above.numpy(), ties.numpy(), scenes, skipped)
@@ -155,11 +155,11 @@ def leave_one_out(
     *,
     told_room: bool = False,
 ) -> Ranking:
-    """Rank every class when it is removed from its scene.
+    """Remove each class of each scene in turn, and rank the removed class.
 
     Args:
         structure: (V,) bool.
-        score: higher means more likely missing.
+        score: a higher score of a class means that the class is more likely missing.
         told_room: pass the room type of each scene to the score.
 
     Raises:
@@ -182,7 +182,7 @@ class Partial:
     """Scenes with some classes hidden.
 
     Attributes:
-        scene: (N,) position of the scene in the set.
+        scene: (N,) index of the scene in the set.
         v: (N, V) presence of the shown classes.
         hidden: (N, V) bool, the hidden classes.
         scenes: number of scenes in the set.
@@ -232,9 +232,10 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
         ValueError: all scenes have fewer than two classes.
     """
     if not len(partial.v):
-        raise ValueError("all scenes have fewer than two classes: one to show and one to hide")
+        raise ValueError("no scene has two classes: one to show and one to hide")
     values = ask_rows(score, partial.v)
-    # Only non-candidates have -inf; a candidate of probability 0 gets the smallest finite score.
+    # -inf marks classes that are no candidates. So a candidate of probability 0 gets the smallest
+    # finite score.
     values = values.clamp(min=torch.finfo(values.dtype).min)
     values = values.masked_fill((partial.v > 0) | structure, -torch.inf)
     row, target = partial.hidden.nonzero(as_tuple=True)
@@ -298,7 +299,7 @@ PlacedScore = Callable[[Places], Tensor]
 def removed_places(
     scenes: SceneTensors, structure: Tensor, seed: int = 0
 ) -> tuple[Tensor, Tensor, Places]:
-    """Return the positions of the scenes (N,), the removed classes (N,), and the places."""
+    """Return the indices of the scenes (N,), the removed classes (N,), and the places."""
     found: list[tuple[int, int, int, int, bool]] = []
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
@@ -328,7 +329,7 @@ def removed_places(
 def leave_one_out_at(
     scenes: SceneTensors, structure: Tensor, score: PlacedScore, *, seed: int = 0
 ) -> tuple[Ranking, Ints]:
-    """Rank every removed class among the absent classes; also return the relation (N,) used.
+    """Return the rank of every removed class among the absent classes, and its relation (N,).
 
     Raises:
         LeakError: the score depends on more than the shown evidence.

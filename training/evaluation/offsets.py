@@ -1,9 +1,9 @@
 """Coverage of the placement offsets on held-out scenes.
 
-The task takes every pair of objects with known poses that stand in a relation, and looks up the
-offset distribution of their classes. In the plane, an offset is covered if it lies in the ellipse
-that should contain 80 % of offsets; in space, the region is an ellipsoid. Distances are measured
-from the mean offset, and from the offset of the relation alone.
+The task takes every related pair of objects with known poses. It looks up the offset distribution
+of their classes. In the plane, an offset is covered if it lies in the ellipse that should contain
+80 % of offsets; in space, the region is an ellipsoid. The task also measures the distance of the
+offset from two means: the mean for the relation and classes, and the mean for the relation alone.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SHARE: Final = 0.8
 """Share of the offsets that each region should contain."""
 
 _REGIONS: Final = {"the ellipse": 2, "the ellipsoid": 3}
-"""Name of a region and its number of axes, counted in the order x, y, z."""
+"""Number of axes of each region: x and y, or x, y and z."""
 
 METRICS: Final = (
     *(f"in {region}, {name}" for name in CANONICAL for region in _REGIONS),

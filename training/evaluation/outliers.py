@@ -1,14 +1,14 @@
-"""T3: rank of an intruder, an absent class that is added to a scene; and the alarm for intruders.
+"""Task T3: add an absent class to a scene as an intruder; measure its rank and the alarm.
 
-A score ranks by the log-odds of each object given the rest. A published model gets the labels of
-all instances of the scene and no other evidence. Its hit@1 follows the ranking of the service, by
-probability of being an intruder; hit@1 by log-odds is reported too. Structure is not ranked and
-raises no alarm. Ties score their expectation.
+A score ranks the objects by their log-odds given the other objects. A published model gets the
+labels of all instances of the scene and no other evidence. Its hit@1 follows the ranking of the
+service, by probability of being an intruder. The hit@1 by log-odds is also reported. Structure is
+not ranked and raises no alarm. For ties, a metric is the expectation under random order.
 
 The alarm threshold aims at a fixed share of alarms in clean scenes (scenes without an intruder). It
-follows the same rule for machines and baselines. Alarms of scenes of one place are correlated,
-places differ, and one source may be more varied than another. So the share is kept within each
-source, with a safety margin from resampled groups.
+follows the same rule for machines and baselines. The alarms in scenes of one place are correlated,
+and sources differ in their variety. So the threshold keeps the share within each source, with a
+safety margin from resampled groups.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ MEDIUM = 0.1
 _RESAMPLES = 200
 # The threshold keeps the target share of alarms in this share of the resampled sets of groups.
 _CONFIDENCE = 0.7
-# Minimum scenes of a source with its own threshold, and of all small sources together.
+# Minimum number of scenes for a threshold: of one source, and of all small sources together.
 _SOURCE_SCENES = 200
 _SMALL_SCENES = 30
 _SCENES = 1500
@@ -66,7 +66,7 @@ class Alarm:
     Attributes:
         suspicion: function that returns a score (N,) per object, higher = more likely an intruder.
         threshold: suspicion from which an object raises the alarm.
-        short: thresholds for lists of 1, 2, ... classes without structure.
+        short: thresholds for lists of 1, 2, ... classes; structure classes do not count.
     """
 
     suspicion: Callable[[IntruderScores], Floats]
@@ -120,8 +120,8 @@ def alarm_threshold(
 ) -> float:
     """Compute the suspicion from which an object raises the alarm.
 
-    The target share of false alarms holds within each source, because the scenes of a robot are of
-    one kind. One quantile over all sources would cause too many alarms in the most varied source.
+    The target share of false alarms holds within each source, because a robot sees scenes of one
+    kind. One quantile over all sources would cause too many alarms in the most varied source.
 
     Args:
         suspicion: (N,) score per object; higher = more likely an intruder.
@@ -189,7 +189,7 @@ def _bound(worst: Floats, group: NDArray[np.str_], rng: np.random.Generator, sha
 
 # ------------------------------------------------------------------------------------------ tasks
 
-# Short lists, as at the beginning of an exploration by a robot, are measured too.
+# Lengths of short lists, as at the start of an exploration by a robot.
 _SHORT_LISTS = (1, 2, 4)
 
 
@@ -316,7 +316,7 @@ def verdict(artifact: Artifact, sensitivity: Sensitivity, scene: Scene) -> Float
 
 
 def share_of_first(values: Floats, target: int) -> float:
-    """Return 1 if the value at `target` is the highest, 0 otherwise; expectation over ties."""
+    """Return 1 if the value at `target` is the highest, else 0; 1/m for m equal highest values."""
     best = values == values.max()
     return float(best[target] / best.sum())
 

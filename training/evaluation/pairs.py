@@ -35,7 +35,7 @@ RARE = 10
 
 VERTICAL = (CANONICAL.index("on-top"), CANONICAL.index("above"))
 
-# Lower bound of a share, so that the log-loss of a pair is at most about 21 nats.
+# Lower bound of the listed relations' share, so that the log-loss of a pair is at most 21 nats.
 _LEAST = 1e-9
 
 Floats = NDArray[np.float64]
@@ -46,9 +46,9 @@ class ScenePairs:
     """The questions about one scene.
 
     Attributes:
-        place: position of the scene in its set.
+        place: index of the scene in its set.
         scene: the scene.
-        ends: (P, 2) positions in the scene's classes, the smaller position first.
+        ends: (P, 2) indices into the scene's classes, the smaller index first.
         listed: (P, 8) bool, relations of the first class to the second, then of the second to the
             first.
     """
@@ -60,7 +60,7 @@ class ScenePairs:
 
     @property
     def classes(self) -> NDArray[np.int64]:
-        """(P, 2) class indices of the ends."""
+        """Class indices of the two classes of each pair, (P, 2)."""
         ends: NDArray[np.int64] = self.scene.evidence.classes[self.ends]
         return ends
 
@@ -119,7 +119,7 @@ class PairAnswers:
     """Answers about all pairs.
 
     Attributes:
-        scene: (N,) scene of each pair.
+        scene: (N,) index of the scene of each pair.
         classes: (N, 2) class indices.
         p: (N, 8) probabilities.
         listed: (N, 8) bool, listed relations.

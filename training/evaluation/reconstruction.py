@@ -3,7 +3,7 @@
 The error uses one deterministic up–down pass. The up pass computes the mean of the hidden layer
 given the scene, with annotated relations observed. The down pass computes p(v | h1) and
 p(r | v, h1). The object error is the mean absolute difference over classes. The relation error is
-the same over observed relation units between present objects.
+the mean absolute difference over observed relation units between present objects.
 """
 
 from __future__ import annotations

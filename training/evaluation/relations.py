@@ -1,22 +1,22 @@
-"""T1a, T1b and T3b: the annotated relations of a scene, by classes.
+"""Tasks T1a, T1b and T3b: the annotated relations between the classes of a scene.
 
     T1a   the evidence is the classes
     T1b   the evidence is the classes and a random half of the triples. Given triples a(x, y) and
           their mirror images a(y, x) are not candidates
-    T3b   one triple is false: does the model rank it as the worst fit, each triple judged given
-          the others?
+    T3b   one triple is false. The model scores each triple given the other triples. The false
+          triple should rank as the least likely
 
-T1 is R-precision over all ordered pairs i ≠ j of present classes × canonical relations: the number
-of predictions is the number of annotated triples. An unlisted triple counts as wrong, although
-annotators list only a few relations per scene. Structure classes are excluded. Scenes without
-annotated triples are skipped; T1b and T3b need two triples.
+The metric of T1 is R-precision: the number of predictions is the number of annotated triples. The
+candidates are all ordered pairs i ≠ j of present classes × canonical relations. An unlisted triple
+counts as wrong, although annotators list only a few relations per scene. Structure classes are
+excluded. Scenes without annotated triples are skipped; T1b and T3b need two triples.
 
-Triples are canonical and distinct. So T1b never gives a held-out relation in its opposite form
-(right for left). Relations that are not given are unobserved.
+Triples are canonical and distinct. So the evidence of T1b never contains a held-out relation in its
+opposite form (right for left). Relations outside the evidence are unobserved.
 
 The false triple of T3b has another relation between the two classes, or another present class at
-one end, with equal probability. The scene contains neither the false triple nor its mirror image,
-which the other triples would contradict directly.
+one end, with equal probability. The scene annotates neither the false triple nor its mirror image,
+because the other triples would contradict these directly.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def machine_score(machine: BoltzmannMachine, *, draws: int = 64) -> RelationScor
 
 
 def transitive_closure(given: Tensor) -> Tensor:
-    """Return all pairs connected by a chain of given pairs, (..., n, n) bool; repeated squaring."""
+    """Return all pairs that a chain of given pairs connects, (..., n, n) bool."""
     reach = given.float()
     while True:
         further = ((reach + reach @ reach) > 0).float()
@@ -73,7 +73,7 @@ class Candidates:
     """The k ranked triples of one scene.
 
     Attributes:
-        scene: position of the scene among the scored scenes.
+        scene: index of the scene among the scored scenes.
         relation: (k,) int64.
         key: (k,) int64, see `triple_keys`.
         score: (k,).
@@ -111,7 +111,7 @@ def telling(batch: Batch, given: Tensor | None = None) -> Batch:
 def _batches(
     scenes: SceneTensors, triples: int, block: int = 16
 ) -> Iterator[tuple[list[int], Batch]]:
-    """Iterate over (positions, batch) of the scenes with at least this many triples."""
+    """Yield (indices, batch) of the scenes with at least `triples` annotated triples."""
     related = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.holds.sum() >= triples]
     for start in range(0, len(related), block):
         index = related[start : start + block]
@@ -133,7 +133,7 @@ def _candidates(batches: Iterable[tuple[Batch, Tensor, Tensor]]) -> list[Candida
             relation, x, y = mask[row].nonzero(as_tuple=True)
             score = values[row, relation, x, y].double().numpy()
             if np.isnan(score).any():
-                raise FloatingPointError(f"a score of scene {row} of a batch is NaN")
+                raise FloatingPointError(f"the score of a triple in scene {row} of a batch is NaN")
             key = triple_keys(relation, own[x], own[y], batch.v.shape[1]).numpy()
             truth = (batch.holds[row, relation, x, y] > 0).numpy()
             found.append(Candidates(len(found), relation.numpy(), key, score, truth))
@@ -148,7 +148,7 @@ def score_scenes(
 
     Args:
         structure: (V,) bool.
-        counts: give the number of instances of each class; otherwise 0, which means not counted.
+        counts: pass the instance counts to the score. Otherwise all counts are 0 (unknown).
     """
 
     def scored() -> Iterator[tuple[Batch, Tensor, Tensor]]:
@@ -183,7 +183,7 @@ def random_half(truth: Tensor, scenes: SceneTensors, index: Sequence[int], seed:
 
     Args:
         truth: (B, A, n, n) bool, all triples.
-        index: positions of the B scenes.
+        index: indices of the B scenes.
     """
     given = torch.zeros_like(truth)
     for row, k in enumerate(index):
@@ -305,7 +305,8 @@ def placement_scores(
             using that triple; higher means more likely true.
 
     Returns:
-        The triples; their score is the suspicion, and the false triple is the true item.
+        The triples as items. The score of an item is the suspicion that its triple is false, and
+        the truth of an item is True for the false triple.
     """
     scene = [torch.zeros(0, dtype=torch.int64)]
     values = [torch.zeros(0, dtype=torch.float64)]

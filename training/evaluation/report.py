@@ -215,7 +215,8 @@ def evaluate(
     Args:
         artifact: the model as published, with its calibration.
         structure: (V,) bool.
-        train: training scenes, for copies in generated scenes and for typical classes.
+        train: training scenes. They show which generated scenes are copies, and which classes are
+            typical of a room type.
         limit: maximum number of scenes of a source for slow tasks, see `Setting`. The default is
             lower for a machine with sampled answers.
         everyday: folder of the everyday facts, see `Setting`.

@@ -7,10 +7,10 @@ information and reward switching many units on:
 
     T1  share of labelled relations that are switched on, given all objects. Other switched-on
         units cost nothing, so their number is reported too
-    T2  share of removed objects that are switched on again. As published, the relations of the
-        object stay on. In a gated machine they force the object on; in other machines they inform
-        the hidden layer, and the two-way weights of the GBM also raise the object. A second
-        variant deletes these relations
+    T2  share of removed objects that are switched on again. In the published protocol, the
+        relations of the object stay on. In a gated machine, these relations force the object on. In
+        other machines, they inform the hidden layer, and the two-way weights of the GBM also raise
+        the object. A second variant deletes these relations
     T3  mean over classes of |reconstruction - scene| after a class was added. A model that returns
         its input is wrong in one of V classes and scores 1/V
 
@@ -172,7 +172,7 @@ def switch_on_probability(
     for v, sign in ((there, 1.0), (absent, -1.0)):
         logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
         logit = logit + sign * machine.relation_term(logits, gate, r, observed).sum(-1)
-    # A relation that is on and requires i forces i on.
+    # If a relation is on and its gate would be closed without object i, object i must be present.
     held = (observed * r > machine.gate(edges, absent)).any(-1)
     return torch.where(held, torch.inf, logit).sigmoid()
 
@@ -189,7 +189,7 @@ def _touches(edges: Edges, target: Tensor) -> Tensor:
 
 
 def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
-    """Draw a removable class of each scene, (N,); -1 for scenes with fewer than two."""
+    """Draw a class to remove from each scene, (N,); -1 for scenes with fewer than two classes."""
     found = torch.full((len(scenes),), -1, dtype=torch.int64)
     plain = ~structure.numpy()
     for k, scene in enumerate(scenes.scenes):
@@ -200,7 +200,7 @@ def _targets(scenes: SceneTensors, structure: Tensor, seed: int) -> Tensor:
 
 
 def _blocks(scenes: SceneTensors, seed: int) -> Iterator[tuple[Tensor, Batch, torch.Generator]]:
-    """Iterate over (positions, batch, random generator) in blocks."""
+    """Yield (scene indices, batch, random generator) for blocks of scenes."""
     generator = torch.Generator().manual_seed(seed)
     for index in torch.arange(len(scenes)).split(_BLOCK):
         yield index, scenes.batch(index), generator

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """One row of the tables: a callable per task; None if the row does not support the task.
+    """One row of the tables.
+
+    The attribute of a task is None if the row does not support the task.
 
     Attributes:
         objects: score of T2 and T3.
@@ -39,7 +41,7 @@ class Contender:
         density: density, computed at its first use.
         alarm: alarm of T3.
         artifact: model for Calibration and for all questions to the service.
-        objects_in_rooms: score of T2 with the room type given.
+        objects_in_rooms: score of T2 with the room type as evidence.
         machine: machine for the seed protocol.
         parameters: number of trained weights, or None if this number is not meaningful.
     """
@@ -91,7 +93,7 @@ class Setting:
         return some_scenes(scenes, most, self.seed)
 
     def at(self, index: Tensor) -> Setting:
-        """Return the setting with only the scenes at the given positions."""
+        """Return the setting with only the scenes at the given indices."""
         return replace(self, scenes=subset(self.scenes, index))
 
     @cached_property

@@ -74,7 +74,7 @@ def _objects(
 
 
 def _each(names: tuple[str, ...], kinds: tuple[str, ...]) -> tuple[str, ...]:
-    """Combine all names with all kinds."""
+    """Return the metric names "name, kind" for all names and kinds."""
     return tuple(f"{name}, {kind}" for name in names for kind in kinds)
 
 

@@ -120,7 +120,8 @@ def _configs(
     """Return the full model and the selected rows, with the given limits.
 
     Raises:
-        ConfigError: invalid rows, see `load_rows`; no shipped rows; an unknown row.
+        ConfigError: the rows are invalid (see `load_rows`), the configuration has no shipped rows,
+            or a selected row is unknown.
     """
     full = load_config(reference)
     if limit is not None:
@@ -170,7 +171,10 @@ def _with_pools(reports: dict[str, SourceReport]) -> dict[str, SourceReport]:
 def _costs(
     folder: Path, configs: Sequence[Config], seeds: int
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Return trained weights by row, without weights fixed at zero, and mean training seconds."""
+    """Return, by row, the number of trained weights and the mean training time in seconds.
+
+    Weights fixed at zero do not count as trained.
+    """
     weights, seconds = {}, {}
     for config in configs:
         places = [place_of(folder, config.name, seed) / "run" for seed in range(seeds)]

@@ -68,10 +68,10 @@ YARDSTICKS = {
     "T2 partial": ("popularity", "MRR, 50 %"),
     "T3 signature": ("popularity", "hit@1"),
 }
-"""Tasks on shuffled scenes: the baseline that no other row should exceed, and the metric."""
+"""By task on shuffled scenes: the baseline that no other row should exceed, and the metric."""
 
 _RELATION_TASKS = ("T1a relations", "T1 pairs")
-# Annealing for log Z is slow for any number of scenes.
+# Tasks that a quick run leaves out: annealing for log Z is slow for any number of scenes.
 _SLOW_TASKS = ("Density",)
 # Settings of a quick run, which only tests the command; its results are meaningless.
 _QUICK_SCENES = 150
@@ -341,10 +341,10 @@ def compare_by_seed_protocol(domain: Domain, folder: Path, options: Options) -> 
 
 
 def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[str, Results]:
-    """Control experiment: rows trained on shuffled scenes, tested on real scenes, by task.
+    """Run the control experiment: train rows on shuffled scenes, and test them on real scenes.
 
     Baselines and epochs are also selected on shuffled validation scenes. Each row has one seed. The
-    reference of each task is its yardstick, which is measured even if not selected.
+    reference of each task is its baseline in `YARDSTICKS`, which is always measured.
 
     Raises:
         ConfigError: the split is random, see `Domain.require_groups`.
@@ -358,7 +358,9 @@ def compare_on_shuffled(domain: Domain, folder: Path, options: Options) -> dict[
     if not plan.material.related:
         asked = tuple(task for task in asked if task not in _RELATION_TASKS)
         if not asked:
-            raise ValueError(f"the scenes of {domain.name} contain no relations to shuffle")
+            raise ValueError(
+                f"the selected tasks need relations, but the scenes of {domain.name} contain none"
+            )
         plan = replace(plan, tasks=asked)
     rows = [machine_row(config, calibrated=False) for config in options.configs(domain, 0)]
     # One fit of a baseline serves all its tasks.

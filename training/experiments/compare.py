@@ -51,7 +51,7 @@ COMPARED: dict[str, tuple[str, ...]] = {
 RELATIONAL = ("T1a relations", "T1b completion", "T2-at missing at a place", "T3b placement")
 """Tasks that need scenes with relations."""
 
-# Tasks that exclude scenes without relations.
+# Tasks that skip scenes without relations.
 _RELATED = ("T2-at missing at a place", "T3b placement")
 # With fewer groups, intervals are rough.
 _ENOUGH_GROUPS = 15
@@ -64,7 +64,7 @@ console = Console()
 
 @dataclass(frozen=True)
 class Example:
-    """One removed object of one scene.
+    """An example question: a scene with one removed object, and the answers of both models.
 
     Attributes:
         scene: scene id.
@@ -94,8 +94,8 @@ class Comparison:
         certain: True if the scenes are certainly held out from both models.
         notes: remarks on the results.
         examples: questions with the most different answers.
-        unmeasured: relation tasks that the published second model was measured on, if the scenes
-            of this comparison contain no relations.
+        unmeasured: relation tasks of the second model's card that this comparison cannot measure,
+            because its scenes contain no relations.
     """
 
     results: Results
@@ -113,7 +113,7 @@ class Comparison:
         return self.results.ours
 
     def worse_by(self, margin: float) -> list[Difference]:
-        """Return primary metrics that are worse than the margin over the whole interval."""
+        """Return the primary metrics whose whole interval is below -margin."""
         return [
             row for row in self.results.differences if is_primary(row) and row.figure.high < -margin
         ]
@@ -168,7 +168,7 @@ def compare_command(
 
 
 def _served(store: Path) -> str:
-    """Return the alias `default`, or the baselines if the store lacks the alias."""
+    """Return `default`, or the name of the baselines if the store has no such alias."""
     return "default" if "default" in Store(store).aliases() else BASELINE_SIDE
 
 
@@ -218,7 +218,7 @@ def show(comparison: Comparison, console: Console) -> None:
 def compare(
     a: Side, b: Side, root: Path, *, limit: int | None, examples: int, say: Say
 ) -> Comparison:
-    """Ask both models the questions of `COMPARED`, in the classes of the first model.
+    """Measure both models on the tasks of `COMPARED`, in the classes of the first model.
 
     Args:
         root: folder with the scenes of the first model's configuration.
@@ -231,8 +231,8 @@ def compare(
     """
     if a.config is None or a.vocabulary is None:
         raise ConfigError(
-            f"{a.title} does not state its held-out scenes: use a model or run trained with this "
-            "project as the first one"
+            f"{a.title} does not state its held-out scenes: the first model must be trained with "
+            "this project"
         )
     say("reading scenes")
     sources = read_sources(a.config.data, root)
@@ -273,7 +273,7 @@ def side_by_side(
     *,
     progress: Progress = silent,
 ) -> Results:
-    """Measure every metric that both models support; differences are paired over groups.
+    """Measure every metric that both models support, with differences paired over groups.
 
     Args:
         structure: (V,) bool.
@@ -287,7 +287,7 @@ def side_by_side(
         for related in (False, True)
     }
     if len(set(groups[False])) < 2:
-        raise ValueError("intervals need scenes of at least two groups")
+        raise ValueError("a comparison with intervals needs scenes of at least two groups")
     reports = {}
     for title, rival in zip(titles, rivals, strict=True):
         report = SourceReport("held out", digest(setting))
@@ -300,7 +300,7 @@ def side_by_side(
 
 
 def unmeasured(rows: Sequence[Difference], other: Side) -> tuple[str, ...]:
-    """Return the relation tasks of the other model's card, if no row has a relation task."""
+    """Return the relation tasks of the other model's card if no row measures relations."""
     if other.artifact is None or any(row.task in RELATIONAL for row in rows):
         return ()
     measured = {metric.task for metric in other.artifact.manifest.metrics}
@@ -379,8 +379,8 @@ def changed_most(
 def _answers(
     score: ObjectScore, v: Tensor, structure: Tensor, vocabulary: Vocabulary
 ) -> tuple[str, ...]:
-    """Return the most probable missing objects, as in the task."""
+    """Return the labels of the most probable missing objects, best first."""
     values = score(v.unsqueeze(0))[0].masked_fill((v > 0) | structure, -torch.inf)
     order = values.argsort(descending=True, stable=True)[:_FIRST].tolist()
-    # A class that the model lacks is not an answer of the model.
+    # Classes that the model lacks have the lowest score and are left out.
     return tuple(vocabulary.labels[index] for index in order if values[index] > -BEYOND)

@@ -1,8 +1,8 @@
 """Decide whether a new version may replace the version that an alias serves.
 
-A primary metric must not be worse by more than the margin over the whole interval of the paired
-difference. Smaller or uncertain losses are accepted. If the served version was measured on
-relations, the comparison must measure relations too.
+The new version is refused if the whole interval of a paired difference shows a loss larger than the
+margin in a primary metric. Smaller or uncertain losses are accepted. If the served version was
+measured on relations, the comparison must measure relations too.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Seat:
     Attributes:
         alias: name of the alias.
         target: target of the alias; None for a new alias.
-        holder: the served model; None if it does not exist or cannot be read.
+        holder: the served model; None if the alias is new or the model cannot be read.
         note: reason why a comparison is impossible, or "".
     """
 

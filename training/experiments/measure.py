@@ -1,4 +1,4 @@
-"""Measure rows on every source; finished reports on disk are reused.
+"""Measure rows on every source, and reuse finished reports on disk.
 
 <folder>/<row>/seed-<n>/row.json          identity, digest of the training scenes, trained weights
                         trials.jsonl      all trials of the tuning
@@ -41,9 +41,9 @@ from training.evaluation.tasks import ONCE, WHOLE_SET
 from training.experiments.rows import Material, Rival, Row
 from training.runs import RunError
 
-# Called with the row, the source, and a note on the current step.
+# A progress function receives the row, the source, and a note on the current step.
 Progress = Callable[[str, str, str], None]
-# Last note on a row and source: measured now, or read from a file.
+# The last note on a row and source tells whether the report was measured now or read from a file.
 DONE, KNOWN = "done", "known"
 Reports = dict[tuple[str, int], dict[str, SourceReport]]
 
@@ -52,12 +52,12 @@ POOLED = "pooled"
 
 
 class BenchmarkError(RuntimeError):
-    """The folder holds files of another experiment; the text names them."""
+    """The folder contains files of another experiment; the message names them."""
 
 
 @contextmanager
 def resumable(console: Console, *others: type[Exception]) -> Iterator[None]:
-    """Handle errors of a resumable command: print the error or the hint to continue, and exit."""
+    """Handle errors of a resumable command: print the error, or how to continue, and exit."""
     expected: tuple[type[Exception], ...] = (
         *(ConfigError, DatasetError, BenchmarkError, RunError, BrokenProcessPool),
         *others,
@@ -78,7 +78,7 @@ class Plan:
 
     Attributes:
         folder: folder of the reports.
-        material: scenes that rows learn from.
+        material: training and validation scenes of the rows.
         settings: setting by source; `POOLED` is the union of all sources.
         tasks: names in `TASKS` or `SEED_TASKS`.
     """
@@ -120,7 +120,7 @@ class Plan:
     def measure(self, row: Row, progress: Progress) -> None:
         """Complete the reports of a row on all sources; train only if a report is incomplete.
 
-        KeyboardInterrupt passes through; finished tasks are on disk.
+        On KeyboardInterrupt, the results of finished tasks are already on disk.
 
         Raises:
             BenchmarkError: the folder holds other reports, see `known`.
@@ -165,7 +165,7 @@ def measure_rows(
 ) -> tuple[Reports, dict[str, str]]:
     """Measure all rows; return reports by (name, seed), and the error of each failed row by name.
 
-    KeyboardInterrupt stops the workers and passes through; finished tasks are on disk.
+    KeyboardInterrupt stops the workers. The results of finished tasks are already on disk.
 
     Args:
         fresh: delete earlier reports of these rows.
@@ -314,10 +314,10 @@ def _in_workers(
     failures: tuple[type[Exception], ...],
 ) -> dict[tuple[str, int], Exception]:
     """Measure rows in worker processes; return the `failures` by (name, seed)."""
-    # Pickled bytes avoid the shared memory of torch, which is small in containers.
+    # Pickling avoids the shared memory of torch, which is small in containers.
     material = pickle.dumps(plan)
     context = multiprocessing.get_context("spawn")
-    # SimpleQueue has no sending thread: all messages of a finished row are in the queue.
+    # SimpleQueue has no sending thread, so all messages of a finished row are already in the queue.
     messages: SimpleQueue[_Message] = context.SimpleQueue()
     with (
         _one_thread(),

@@ -2,7 +2,7 @@
 
 learning-curves.png   metrics of every machine and seed by epoch
 reliability-*.png     predicted probability against observed frequency, one file per machine
-recall.png            relations among the first k predictions, removed objects in the first k places
+recall.png            recall at k of relations and of removed objects
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def write_plots(
 
 
 def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
-    """Plot validation metrics by epoch; a colour is a machine, a line is a seed."""
+    """Plot validation metrics by epoch, with one colour per machine and one line per seed."""
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     axes = figure.subplots(2, 2).flat
     for axis, (column, title) in zip(axes, _CURVES.items(), strict=True):
@@ -83,14 +83,14 @@ def learning_curves(runs: Mapping[str, Sequence[Path]]) -> Figure:
 
 
 def read_curve(path: Path, column: str) -> tuple[list[int], list[float]]:
-    """Read epochs, counted from 1, and one column of the curve of a run."""
+    """Return the epochs, counted from 1, and one column of a run's curve file."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return [int(row["epoch"]) + 1 for row in rows], [float(row[column]) for row in rows]
 
 
 def reliability_diagrams(outcome: Outcome, title: str) -> Figure:
-    """Plot one diagram per question, with and without calibration; bins have equal mass.
+    """Plot one diagram per question, with and without calibration, over bins of equal mass.
 
     Most probabilities are small, so the axes are logarithmic.
     """

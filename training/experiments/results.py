@@ -40,7 +40,7 @@ class Cell:
     """One table entry.
 
     Attributes:
-        row, task, source, metric: position in the tables.
+        row, task, source, metric: names that locate the entry.
         figure: mean over seeds with the interval over scenes.
         seeds: the value of each seed.
     """
@@ -65,7 +65,10 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """Return `better`, `worse` or `undecided` for the reference row, by the whole interval."""
+        """Return `better` or `worse` if the whole interval agrees, else `undecided`.
+
+        The verdict is about the reference row.
+        """
         low, high = self.figure.low, self.figure.high
         if self.metric.startswith(_LOWER_IS_BETTER):
             low, high = -high, -low
@@ -77,7 +80,7 @@ class Asked:
     """Number of scored and skipped scenes of one task, for one row and seed.
 
     Attributes:
-        row, seed, task, source: position in the tables.
+        row, seed, task, source: names that locate the entry.
         scenes, skipped: number of scenes, and number of scenes that could not be scored.
         notes: additional values, such as a bandwidth, or log Z with its standard errors.
     """
@@ -127,7 +130,7 @@ class Results:
 
         Args:
             shown: metrics by task; by default those of `TASKS`.
-            changes: brackets hold the interval of the row minus the reference row.
+            changes: show in brackets the interval of the difference: row minus reference row.
         """
         parts: list[str] = []
         if shown is None:
@@ -197,8 +200,8 @@ def summarise(
     """Compute the metrics of every row and its paired differences to the reference row.
 
     Args:
-        groups: function of a task that returns the group of each scene. With it, differences
-            resample groups instead of scenes.
+        groups: function of a task that returns the group of each scene. With this function, the
+            bootstrap of differences resamples groups instead of scenes.
 
     Raises:
         ValueError: the reports lack `ours`.
@@ -229,7 +232,7 @@ def summarise(
 
 
 def only(report: SourceReport, wanted: Mapping[str, Sequence[str]]) -> SourceReport:
-    """Return the report with selected metrics only; resampling all metrics takes minutes."""
+    """Return the report with the wanted metrics only, because resampling all takes minutes."""
     outcomes = {
         task: outcome
         and replace(
@@ -255,8 +258,8 @@ def _asked(reports: Reports) -> Iterator[Asked]:
 def _by_metric(reports: Reports, row: str) -> Iterator[tuple[str, str, str, list[Metric]]]:
     """Iterate over (source, task, metric name, one metric per seed) of a row.
 
-    A metric is left out if its seeds are pooled from different sources. For example, skill is
-    undefined on a source where all queried relations hold.
+    A metric is left out if it is pooled from different sources for different seeds. For example,
+    skill is undefined on a source where all queried relations hold.
     """
     found: dict[tuple[str, str, str], list[Metric]] = {}
     for (name, _), by_source in reports.items():
@@ -285,13 +288,13 @@ def remarks(asked: Sequence[Asked]) -> list[str]:
 
 
 def _range(counts: Iterable[int]) -> str:
-    """Format a count over all rows; rows with different scenes give a range."""
+    """Format a count over all rows, as a range if the rows differ."""
     low, *others = sorted(set(counts))
     return f"{low:,}–{others[-1]:,}" if others else f"{low:,}"
 
 
 def _notes(asked: Sequence[Asked]) -> str:
-    """Format notes by source if rows agree, by row if sources agree, else by both."""
+    """Format notes by source if all rows agree, by row if all sources agree, else by both."""
     found: dict[str, Mapping[str, float]] = {}
     for place in ("{0.source}", "{0.row}, seed {0.seed}", "{0.row}, seed {0.seed}, {0.source}"):
         found = {place.format(one): one.notes for one in asked}

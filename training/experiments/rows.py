@@ -33,19 +33,19 @@ CALIBRATION = "calibration.json"
 """File name of a machine's calibration, in the folder of its run."""
 
 Say = Callable[[str], None]
-# Function from a setting to the contender of a row; a trained row ignores the setting.
+# Function of a setting that returns the contender of a row. A trained row ignores the setting.
 Rival = Callable[[Setting], Contender]
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The scenes that rows learn from.
+    """The scenes on which the rows are trained.
 
     Attributes:
         data: tensors of the three parts.
         vocabulary: classes of the scenes.
-        digest: digest of the scenes and their split. With the identity of a row it decides whether
-            reports of a folder are reused.
+        digest: digest of the scenes and their split. A report in a folder is reused only if this
+            digest and the identity of its row are unchanged.
     """
 
     data: TrainingData
@@ -82,8 +82,8 @@ class Row:
     Attributes:
         name: name of the row; all seeds of a row have the same name.
         seed: training seed.
-        identity: text that identifies everything except the scenes that affects the results.
-            Reports of another identity are rejected.
+        identity: text with everything that affects the results, except the scenes. Reports of
+            another identity are rejected.
         make: function that trains the row, or reads the trained row from its folder.
     """
 
@@ -100,14 +100,17 @@ def baseline_rows(
     related: bool = True,
     whole: bool = True,
 ) -> Iterator[Row]:
-    """Generate the rows of selected baselines; deterministic ones have a row for seed 0 only.
+    """Generate the rows of the selected baselines.
+
+    Deterministic baselines have a row for seed 0 only.
 
     Args:
-        related: the scenes contain relations; otherwise relation baselines are left out.
+        related: whether the scenes contain relations. Without relations, relation baselines are
+            left out.
         whole: add an alarm and place scores to object baselines.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: a name is not in `BASELINES`.
     """
     if unknown := sorted(set(names or ()) - set(BASELINES)):
         raise ValueError(f"unknown baselines {unknown}: must be among {list(BASELINES)}")
@@ -119,7 +122,7 @@ def baseline_rows(
 
 
 def reference_rows() -> Iterator[Row]:
-    """Generate reference rows for generated scenes and densities; they need no training."""
+    """Generate untrained reference rows for the evaluation of generated scenes and densities."""
     references: dict[str, Rival] = {
         "independent classes": independent_contender,
         "held-out scenes (floor)": floor_contender,
@@ -133,7 +136,7 @@ def _reference(rival: Rival, material: Material, folder: Path, say: Say) -> Riva
 
 
 def machine_row(config: Config, *, calibrated: bool = True) -> Row:
-    """Return a machine trained by a configuration; its run is in the row's folder, resumable.
+    """Return the row of a configuration's machine; its training can resume in the row's folder.
 
     Args:
         calibrated: calibrate the machine as for publication.
@@ -148,7 +151,7 @@ def machine_row(config: Config, *, calibrated: bool = True) -> Row:
 def _fitted(
     baseline: Baseline[Any], seed: int, whole: bool, material: Material, folder: Path, say: Say
 ) -> Rival:
-    """Fit a baseline; an object score also answers T2-at by its product with the place table."""
+    """Fit a baseline. The product of an object score and the place table also answers T2-at."""
     data = material.data
     score = _fit(baseline, data, seed, folder, say).score
     values: dict[str, Any] = dict.fromkeys(baseline.scores, score)
@@ -206,7 +209,7 @@ def always(contender: Contender) -> Rival:
 def _fit(
     baseline: Baseline[Any], data: TrainingData, seed: int, folder: Path, say: Say
 ) -> Fitted[Any]:
-    """Fit a baseline and write all trials; trials of an interrupted fit are replaced."""
+    """Fit a baseline and write all its trials; replace the trials of an interrupted fit."""
     fitted = baseline.fit(data.train, data.validation, data.structure, seed=seed, progress=say)
     trials = folder / "trials.jsonl"
     before = trials.read_text(encoding="utf-8").splitlines() if trials.exists() else []

@@ -32,7 +32,7 @@ BASELINE_SIDE = "baselines"
 _OBJECTS, _RELATIONS = "EASE", "frequency table"
 
 Say = Callable[[str], None]
-# Function from a task to the contender of a side.
+# Function of a task name that returns the contender of a side.
 Rival = Callable[[str], Contender]
 
 
@@ -43,7 +43,7 @@ class Side:
     Attributes:
         title: name in tables.
         config: training configuration, or None if unknown.
-        learnt: digest of each source that the model learnt from, by name.
+        learnt: digest of each training source, by source name.
         artifact: the model; None for the baselines.
         data: folder of the scenes of a run.
     """
@@ -113,10 +113,11 @@ def find(reference: str, store: Store, data: Path | None, say: Say) -> Side:
     """Return the side of a reference: folder of a run, the baselines, or a published model.
 
     Raises:
-        ConfigError: the reference matches none of them; see also `run_side` and `stored_side`.
+        ConfigError: the reference is neither a run nor the baselines nor a published model. See
+            also `run_side` and `stored_side`.
     """
     if reference == BASELINE_SIDE:
-        # Baselines are fitted on the training scenes of the other side.
+        # The baselines are fitted later, on the training scenes of the other side.
         return Side(BASELINE_SIDE, None, {}, None)
     folder = Path(reference)
     if (folder / "config.json").is_file():
@@ -146,7 +147,7 @@ def _baselines(data: TrainingData, say: Say) -> Contender:
 
 # --------------------------------------------------------------------------------- held-out scenes
 
-# Filter of scenes: False if the model is known to have learnt from the scene.
+# Filter of scenes: returns False if the model is known to have learnt from the scene.
 Kept = Callable[[AnnotatedScene], bool]
 
 
@@ -180,7 +181,7 @@ def held_out(
         ConfigError: the first model does not state its split, or all test scenes are left out.
     """
     if a.config is None:
-        raise ConfigError(f"{a.title} does not state how its scenes were split")
+        raise ConfigError(f"{a.title} does not record the split of its scenes")
     everything = [scene for some in sources.values() for scene in some]
     data = a.config.data
     candidates = split(everything, seed=data.split_seed, protocol=data.split)["test"]
@@ -213,7 +214,7 @@ def _kept(
 ) -> tuple[Kept, str, bool]:
     """Return a filter for held-out scenes of a side, a note, and whether the filter is certain."""
     if side.artifact is None:
-        return _all, "", True  # fitted on the training scenes of the first model
+        return _all, "", True  # the baselines are fitted on the training scenes of the first model
     digests = {name: digest_of(some) for name, some in sources.items()}
     shared = {
         name
@@ -258,7 +259,7 @@ def _scenes_of(
     digests: Mapping[str, str],
     root: Path,
 ) -> list[AnnotatedScene] | None:
-    """Return the scenes that a side was split from, or None if they are not available unchanged."""
+    """Return all scenes of a side before its split, or None if any source has changed."""
     found: list[AnnotatedScene] = []
     for source in data.sources:
         name = source_name(source)

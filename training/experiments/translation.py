@@ -1,8 +1,8 @@
 """Query a model about scenes in the classes of another model.
 
-Each class of the scenes is looked up in the model by name. Classes that the model pools under one
-name share its score. An unknown class is not shown to the model. The model can neither propose it
-nor suspect it, so it comes last in both cases.
+Each class of the scenes is looked up in the model by name. Scene classes that map to the same model
+class share its score. A class without a counterpart in the model is unknown: it is not part of the
+model's input. As a missing object and as an outlier, it has the lowest rank.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from training.evaluation.setting import Contender
 
 Score = TypeVar("Score")
 
-# Larger than every log-odds and finite, so that unknown classes share the last rank.
+# Absolute score of unknown classes: larger than all log-odds, so that these classes rank last, and
+# finite.
 BEYOND = 1e9
 
 
@@ -58,7 +59,8 @@ class Translation:
         """Return the model as a contender for scenes in the other classes.
 
         Args:
-            task: T3 and T3b suspect low scores; the other tasks propose high scores.
+            task: name of the task. In T3 and T3b the lowest score ranks first; in other tasks the
+                highest score ranks first.
         """
         if task.startswith("T3"):
             return replace(self, unknown=BEYOND)._contender(model)
@@ -75,7 +77,10 @@ class Translation:
         )
 
     def presence(self, v: Tensor) -> Tensor:
-        """Map presence or counts (B, V) to the model's classes; pooled classes take the maximum."""
+        """Map presence or counts (B, V) to the model's classes.
+
+        If several scene classes map to one model class, the result is their maximum.
+        """
         known = self.own >= 0
         index = self.own[known].expand(len(v), -1)
         return torch.zeros(len(v), self.size).scatter_reduce(1, index, v[:, known], "amax")
@@ -100,7 +105,7 @@ class Translation:
                     anchor=anchor[known],
                     outgoing=places.outgoing[known],
                 )
-                # A present class may share its name with the missing class; then the score is -inf.
+                # The score is -inf if a present class maps to the same model class.
                 values = score(own).clamp(min=-BEYOND)
                 found[known] = self.scores(values)
             return found
@@ -129,7 +134,7 @@ class Translation:
         holds, observed = torch.zeros(A, n, n), torch.zeros(A, n, n, dtype=torch.bool)
         pair = (slice(None), place[:, None], place[None, :])
         told = (slice(None), kept[:, None], kept[None, :])
-        # Classes that the model pools share all their given relations.
+        # Scene classes that map to one model class share their observed relations.
         for a, i, j in batch.observed[row][told].nonzero().tolist():
             observed[a, place[i], place[j]] = True
             holds[a, place[i], place[j]] += batch.holds[row][told][a, i, j]
@@ -143,7 +148,7 @@ class Translation:
             room=torch.tensor([-1]),
         )
         values = score(small)[0].clamp(min=-BEYOND)[pair]
-        # The model cannot relate two objects of the same pooled class.
+        # The model has no relations between two objects of the same class.
         apart = place[:, None] != place[None, :]
         found[told] = torch.where(apart, values, torch.tensor(self.unknown))
 

@@ -55,7 +55,7 @@ FIGURES = {
     "MRR": ("T2 missing", "MRR"),
     "R-precision": ("T1a relations", "R-precision, instance counts"),
 }
-"""Task and metric of the evaluation, by name; trials are judged by these metrics."""
+"""Task and metric of the evaluation, by short name; these metrics rank the trials."""
 
 _BY: dict[By, tuple[str, ...]] = {
     "mrr": ("MRR",),
@@ -64,7 +64,7 @@ _BY: dict[By, tuple[str, ...]] = {
 }
 # All trials use the same scenes and seed, so that they differ only in the searched settings.
 _FIXED = ("data.", "training.seed", "training.threads")
-# Median pruning starts after this number of finished trials and this share of a run.
+# Median pruning starts after this number of finished trials, and this share of a trial's epochs.
 _RIVALS = 4
 _WARM_UP = 1 / 3
 
@@ -99,9 +99,9 @@ def tune(
 ) -> None:
     """Search for better settings on validation scenes only.
 
-    The first trial is the unchanged configuration; optuna samples the others. The best
-    configuration is written to <folder>/<configuration>/best.toml. After Ctrl-C, the same command
-    continues; finished trials are kept.
+    The first trial is the unchanged configuration. Optuna samples the settings of the other trials.
+    The command writes the best configuration to <folder>/<configuration>/best.toml. After Ctrl-C,
+    the same command continues with the next trial; finished trials are kept.
     """
     with resumable(console):
         original = load_config(configuration)
@@ -152,11 +152,11 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not TOML: {error}") from error
     if not values:
-        raise ConfigError(f"{path.name} contains no settings")
+        raise ConfigError(f"the search space {path.name} contains no settings")
     found = {}
     for name, entry in values.items():
         if name.startswith(_FIXED):
-            raise ConfigError(f"{name!r} is fixed: all trials share it, so it cannot be searched")
+            raise ConfigError(f"{name!r} must be the same in all trials: remove it from the space")
         try:
             found[name] = _distribution(entry)
         except (ValueError, ValidationError) as error:
@@ -251,14 +251,14 @@ class Search:
         return study
 
     def run(self, study: Study, trials: int) -> None:
-        """Run until the study has this number of trials; the first uses the unchanged settings."""
+        """Run trials until the study has `trials`; the first trial uses the unchanged settings."""
         import optuna
         from optuna.trial import TrialState
 
         if not study.trials:
             study.enqueue_trial({}, user_attrs={"as it is": True})
         for halted in study.get_trials(states=(TrialState.RUNNING,)):
-            # An interrupted trial is queued again and resumes from its checkpoint.
+            # Queue an interrupted trial again. The new trial resumes from the checkpoint.
             original = halted.user_attrs.get("as it is", False)
             study.enqueue_trial(halted.params, user_attrs={"as it is": original})
             study.tell(halted.number, state=TrialState.FAIL)
@@ -392,7 +392,7 @@ def _conclude(search: Search, study: Study, original: Config) -> None:
         gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
         comment.append(f"Difference to {original.name}, paired by scenes: {', '.join(gaps)}.")
         comment.append(
-            f"The best of {len(study.trials)} trials is biased upwards: train both with more seeds."
+            f"The best of {len(study.trials)} trials is optimistic: train both with more seeds."
         )
     path = search.folder / "best.toml"
     text = "".join(f"# {line}\n" for line in comment) + "\n" + config_toml(tuned)

@@ -58,7 +58,7 @@ class ChainSamples:
     """The stored samples of a machine, with weights given the evidence.
 
     Args:
-        machine: a machine with fixed weights; it is read once, here.
+        machine: a machine with fixed weights; its weights are read at construction only.
     """
 
     def __init__(self, machine: BoltzmannMachine) -> None:

@@ -1,16 +1,17 @@
 """Weighted draws of h1 from p(h1 | evidence), used for every answer without a closed form.
 
 Given h1, unobserved relations sum out, and the likelihood of observed relations is a product over
-units. The proposal q is factorial: the mean-field fixed point. Each draw h then has the weight
+units. The proposal q is the factorial mean-field fixed point. Each draw h then has the weight
 
-    log w = h·x + sum_e term_e(ℓ_e(h)) - log q(h),   x = c1 + v'W + J h2.
+    log w = h·x + sum_e term_e(ℓ_e(h)) - log q(h),   x = c1 + v'W + J h2,
 
-The likelihood of observed relations can be raised to a power (`pull`) to reduce their influence.
-Any expectation over p(h1 | evidence) is a weighted mean. The uniform numbers are fixed (a scrambled
-Sobol sequence), so equal evidence always gives the same answer. With two layers, h2 stays at its
-mean-field value.
+where term_e is `BoltzmannMachine.relation_term`. The likelihood of observed relations can be raised
+to a power (`pull`) to reduce their influence. An expectation over p(h1 | evidence) is the weighted
+mean over the draws. The uniform numbers are fixed (a scrambled Sobol sequence), so equal evidence
+always gives the same answer. With two layers, h2 stays at its mean-field value.
 
-Source: self-normalised importance sampling; Rao–Blackwellised, because only h1 is sampled.
+The method is self-normalised importance sampling. It is Rao–Blackwellised: only h1 is sampled, and
+unobserved relations are summed out.
 """
 
 from __future__ import annotations
@@ -51,10 +52,13 @@ class HiddenDraws:
     def implied(
         self, machine: BoltzmannMachine, edges: Edges, given: Tensor, *, apart: bool = False
     ) -> Tensor:
-        """Return the logit shifts (B, E) implied by the given relations (B, E), 1 where on.
+        """Return the logit shifts (B, E) that given relations imply for other relations.
 
-        The strictness of the implications depends on the context. The context is at its mean given
-        the objects, without relations.
+        The shifts depend on the context h1. Here h1 is its mean given the objects only.
+
+        Args:
+            given: (B, E), 1 where a relation is given as holding.
+            apart: leave out the implications between relations of the same two classes.
         """
         return machine.implied(edges, given, self.field.x.sigmoid(), apart=apart)
 

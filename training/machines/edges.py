@@ -32,7 +32,7 @@ class Edges(ABC):
     @property
     @abstractmethod
     def shape(self) -> torch.Size:
-        """(B or 1, E)."""
+        """Shape of the tensors of units, (B or 1, E)."""
 
     @property
     @abstractmethod
@@ -59,12 +59,12 @@ class TripleEdges(Edges):
 
     @property
     def shape(self) -> torch.Size:
-        """(1, E)."""
+        """Shape of the tensors of units, (1, E)."""
         return self.valid.shape
 
     @property
     def classes(self) -> Tensor:
-        """(1, 0), because the table is the same for all classes."""
+        """An empty tensor (1, 0), because the table does not depend on the classes of a scene."""
         return self.subject.new_zeros(1, 0)
 
     def expand(self, rows: int) -> TripleEdges:
@@ -101,7 +101,7 @@ class PairEdges(Edges):
 
     @property
     def shape(self) -> torch.Size:
-        """(B, A·n·m)."""
+        """Shape of the tensors of units, (B, A·n·m)."""
         (B, n), m = self.subjects.shape, self.objects.shape[1]
         return torch.Size((B, self.relations * n * m))
 
@@ -117,23 +117,23 @@ class PairEdges(Edges):
 
     @cached_property
     def relation(self) -> Tensor:  # type: ignore[override]
-        """a of each unit, (B, E) int64."""
+        """The relation a of each unit, (B, E) int64."""
         axis = torch.arange(self.relations, device=self.subjects.device)
         return self._flat(axis[:, None, None])
 
     @cached_property
     def subject(self) -> Tensor:  # type: ignore[override]
-        """i of each unit, (B, E) int64."""
+        """The subject class i of each unit, (B, E) int64."""
         return self._flat(self.subjects[:, None, :, None])
 
     @cached_property
     def object(self) -> Tensor:  # type: ignore[override]
-        """j of each unit, (B, E) int64."""
+        """The object class j of each unit, (B, E) int64."""
         return self._flat(self.objects[:, None, None, :])
 
     @cached_property
     def valid(self) -> Tensor:  # type: ignore[override]
-        """(B, E) bool."""
+        """False where a unit is padding, (B, E) bool."""
         pairs = self.valid_subjects.unsqueeze(-1) & self.valid_objects.unsqueeze(-2)
         return self._flat(pairs.unsqueeze(1))
 
@@ -203,7 +203,7 @@ def triple_keys(relation: Tensor, subject: Tensor, object_: Tensor, classes: int
 
 
 def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the positions of keys in a sorted table, and whether the table has each key."""
+    """Return the index of each key in a sorted table, and whether the table contains the key."""
     if not table.numel():
         return torch.zeros_like(keys), torch.zeros_like(keys, dtype=torch.bool)
     position = torch.searchsorted(table, keys.contiguous()).clamp(max=table.numel() - 1)

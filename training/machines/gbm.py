@@ -22,21 +22,21 @@ from training.machines.rbm import RBM, scale
 
 
 class GBM(RBM):
-    """ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1; otherwise relations are as in the RBM."""
+    """The GBM: an RBM with relation logits ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1."""
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__(spec)
         self.g = nn.Parameter(torch.zeros(spec.T, 2))
 
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """d_t + g_t v_i + g'_t v_j + U_t·h1."""
+        """Return d_t + g_t v_i + g'_t v_j + U_t·h1."""
         subject = v[..., edges.subject[0]]
         object_ = v[..., edges.object[0]]
         two_way = subject * self.g[:, 0] + object_ * self.g[:, 1]
         return super().relation_logits(edges, v, h1) + two_way
 
     def relation_input(self, edges: Edges, r: Tensor) -> Tensor:
-        """sum_t r_t (g_t [i is the subject] + g'_t [i is the object]), (..., B, V)."""
+        """Return sum_t r_t (g_t [i is the subject] + g'_t [i is the object]), (..., B, V)."""
         result = r.new_zeros(*r.shape[:-1], self.spec.V)
         result = result.index_add(-1, edges.subject[0], r * self.g[:, 0])
         return result.index_add(-1, edges.object[0], r * self.g[:, 1])
@@ -59,7 +59,11 @@ class GBM(RBM):
         return bernoulli(logits.sigmoid_(), generator)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """sum over R_i of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0); 0 in the local form."""
+        """Return the attraction of each candidate i by its relations R_i, (..., B, N).
+
+        In the seed form it is the sum over R_i of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0).
+        In the local form it is 0.
+        """
         if not self.relations_act:
             return super().attraction(v, h1, edges, candidates)
         subject, object_ = edges.subject[0], edges.object[0]

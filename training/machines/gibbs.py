@@ -1,4 +1,4 @@
-"""Block Gibbs sampling with any units clamped and any units unobserved.
+"""Block Gibbs sampling, in which any units can be clamped or unobserved.
 
 One step samples the blocks in this order:
 
@@ -8,12 +8,12 @@ One step samples the blocks in this order:
     h2 | h1         factorial
     v  | h1         RBM and GBM: factorial, given r. Triway: with every unobserved relation summed
                     out; factorial in the local form, object after object in the seed form
-    r  | v, h1      factorial. Where relations imply each other: group after group, given earlier
-                    groups, by the chain rule
+    r  | v, h1      factorial. If relations imply each other, they are sampled in groups, each group
+                    given the earlier groups (chain rule)
 
-A plain block sampler cannot leave its state in the gated seed form: while a relation of i is on,
-p(v_i = 1) = 1. Hence v is sampled with R_i summed out (`collapsed`, the default). The plain kernel
-remains for contrastive divergence, whose single step need not mix.
+A plain block sampler cannot leave its state in the gated seed form: while a relation of object i is
+on, p(v_i = 1) = 1. Hence v is sampled with the relations R_i of object i summed out (`collapsed`,
+the default). Contrastive divergence can use the plain kernel, because its single step need not mix.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Clamp:
 
     def __post_init__(self) -> None:
         if len({self.edges is None, self.r is None, self.observed is None}) > 1:
-            raise ValueError("observed relations need edges, r and observed")
+            raise ValueError("a clamp with observed relations needs all of edges, r and observed")
 
     @property
     def relations(self) -> tuple[Edges, Tensor, Tensor] | None:
@@ -231,7 +231,7 @@ def sample_relations(
     generator: torch.Generator,
     clamp: Clamp = FREE,
 ) -> tuple[Edges, Tensor]:
-    """Sample r | v, h1 over the open units of v; observed units keep their value.
+    """Sample r | v, h1 over the units that may be on given v; observed units keep their value.
 
     Returns:
         The units and r (B, E). In a Triway machine the classes of `clamp.edges` come first.
@@ -249,7 +249,10 @@ def sample_relations(
 
 
 def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Return a random group for each unit (..., n, n); a(i, j) and a(j, i) always differ."""
+    """Return a random group for each unit (..., n, n).
+
+    The units a(i, j) and a(j, i) are always in different groups.
+    """
     group = torch.randint(_RELATION_GROUPS, like.shape, generator=generator)
     later = torch.randint(2, like.shape, generator=generator).triu(1)
     later = later + (1 - later.mT).tril(-1)

@@ -24,8 +24,8 @@ from training.machines.mean_field import Evidence, mean_field
 class _ContextGain(torch.autograd.Function):
     """Compute G[b,i] = sum_k [softplus(x_bk + W_ik) - softplus(x_bk)] without a (B, V, H1) tensor.
 
-    The form log(1 + sigmoid(x)(exp(W) - 1)) needs one transcendental function for each term and
-    shares exp(W). The backward pass recomputes row by row, so memory stays at one (V, H1) block.
+    The form log(1 + sigmoid(x)(exp(W) - 1)) needs one logarithm for each term; all rows share
+    exp(W). The backward pass recomputes the terms row by row, so it stores one (V, H1) block only.
     """
 
     @staticmethod
@@ -67,8 +67,8 @@ def object_log_odds(
     """Return the log-odds of candidate objects at the mean-field fixed point, (B, N).
 
     The result is exact for one layer in the local form without observed relations. A second layer
-    h2 stays at its mean-field value. In the seed form, and with observed relations, the context is
-    replaced by its factorial approximation; `presence_log_odds` uses weighted draws instead.
+    h2 stays at its mean-field value. In the seed form, and with observed relations, the result uses
+    a factorial approximation of the context; `presence_log_odds` uses weighted draws instead.
     Candidates must be absent in `evidence.v`. The result is differentiable.
 
     Args:
@@ -102,8 +102,8 @@ def presence_log_odds(
         log-odds_i = b_i + G_i + log E_w[exp(W_i·h1 + attraction_i)] - log mean exp(W_i·h1)
 
     over weighted draws of h1. G_i = log E_q[exp(W_i·h1)] has a closed form under the proposal q of
-    the draws. The last term uses the unweighted draws; it is a control variate that removes the
-    common error of both terms.
+    the draws. The last term estimates G_i from the unweighted draws. It is a control variate that
+    cancels the error that both estimates share.
 
     Args:
         candidates: (B or 1, N) int64.
@@ -163,7 +163,7 @@ def relation_log_odds(
     *,
     count: int = 64,
 ) -> tuple[Tensor, Tensor]:
-    """Return log-odds, with standard errors, of units of `edges` that the evidence does not have.
+    """Return the log-odds of the unobserved units in `edges`, with standard errors.
 
     p(r_e = 1 | rest) = E_{h1 | rest}[ sigmoid(ℓ_e(h1) + x_e) ] in both forms. x_e is the shift
     implied by the observed relations. The log-odds are -inf where the gate is off.
@@ -201,10 +201,10 @@ def relation_log_odds_observed(machine: BoltzmannMachine, evidence: Evidence) ->
         ValueError: the machine has the local form, or a unit is unobserved.
     """
     if not machine.relations_act:
-        raise ValueError("the local form has no closed form with observed relations")
+        raise ValueError("relation log-odds have a closed form only in a machine of the seed form")
     relations = evidence.relations(machine)
     if relations is None or not bool(relations[2].all()):
-        raise ValueError("every relation unit must be observed")
+        raise ValueError("the closed form of relation log-odds needs every relation unit observed")
     edges, r, _ = relations
     field = mean_field(machine, evidence)
     context = machine.relation_context(edges)

@@ -3,17 +3,17 @@
     E(v,r,h1,h2) = - b·v - c1·h1 - c2·h2 - v'W h1 - h1'J h2 - sum_e r_e ℓ_e(v,h1)
 
 The sum runs over the variant's relation units e = (a,i,j). A variant defines the existing units,
-the gate that allows a unit to be on, and the logit ℓ_e. All other terms are defined here. With a
-given room type t, c1 stands for c1 + Q[t]: the room type is a condition, not a unit of the model.
+the gate that allows a unit to be on, and the logit ℓ_e. All other terms are defined here. If a room
+type t is given, c1 means c1 + Q[t]. The room type is a condition, not a unit of the model.
 
 Every variant has two forms of the relation part:
 
     seed    - r_e ℓ_e - κ_a         for every active unit
     local   - r_e ℓ_e + log(1 + exp ℓ_e)
 
-The local form keeps p(r | v, h1), and unobserved relations drop out of all other conditionals. The
-seed form keeps the paper's energy. Its κ (0 in the paper) compensates for the attraction that a
-summed-out relation has on its two ends.
+Both forms have the same p(r | v, h1). In the local form, unobserved relations drop out of all other
+conditionals. The seed form keeps the paper's energy. Its κ (0 in the paper) compensates for the
+attraction that a summed-out relation has on its two objects.
 
 Shapes: leading sample dimensions first, then scenes B, then units. Energies have the leading shape.
 """
@@ -123,9 +123,9 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def places(self, pairs: PairEdges) -> tuple[Edges, Tensor, Tensor]:
-        """Return the machine's units, the place of each pair's unit, and whether there is one.
+        """Return the machine's units, and for each pair the index of its unit and if it has a unit.
 
-        The last two are (B, A·n·m). For a pair without a unit the place is arbitrary.
+        The last two have shape (B, A·n·m). For a pair without a unit, the index is arbitrary.
         """
 
     @abstractmethod
@@ -146,15 +146,22 @@ class BoltzmannMachine(nn.Module, ABC):
     def open_units(
         self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the units that v leaves open, as (edges, r, observed); r has the given values."""
+        """Return the units that may be on given v, as (edges, r, observed).
+
+        r contains the values of the given units.
+        """
 
     @abstractmethod
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return (..., B, E): 1 where a unit may be on, given v (..., B, V)."""
+        """Return the gates (..., B, E): 1 if a unit may be on given v (..., B, V), else 0."""
 
     @abstractmethod
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return ℓ_e(v, h1), (..., B, E); h1 is (..., B, H1), binary or a mean."""
+        """Return the relation logits ℓ_e(v, h1), (..., B, E).
+
+        Args:
+            h1: (..., B, H1), binary states or means.
+        """
 
     @abstractmethod
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
@@ -180,7 +187,7 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return the rows U_e, (B or 1, E, H1). They are allocated, so use few units only."""
+        """Return the context weights U_e of every unit, (B or 1, E, H1); pass few units only."""
 
     @abstractmethod
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
@@ -202,7 +209,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return values (B, E) of units as a table (B, A, n, n) over classes; -inf without a unit.
 
         Args:
-            classes: (B, n) int64, -1 where padded; `edges` are their units.
+            classes: (B, n) int64, -1 where padded; `edges` has the units between these classes.
         """
 
     @property
@@ -215,7 +222,7 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the unobserved units that act on objects; None in the local form."""
 
     def context_units(self, edges: Edges) -> Edges | None:
-        """Return the units that act on the context unobserved while relations are trained."""
+        """Return the unobserved units that act on the context while relations are trained."""
         del edges
         return None
 
@@ -247,12 +254,14 @@ class BoltzmannMachine(nn.Module, ABC):
         """Set this machine's relation weights to those of `machine` at beta = 0, see `scaled`."""
 
     def relation_log_partition(self) -> float:
-        """Return the part of log Z from the relation units of independent objects."""
+        """Return the part of log Z that relation units contribute at beta = 0, see `scaled`."""
         return 0.0
 
     @abstractmethod
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Return the machine at beta on the path from `base` (independent objects, 0) to this (1).
+        """Return the machine at beta on the path from `base` (beta = 0) to this machine (beta = 1).
+
+        The base has independent objects.
 
         Without a base, beta multiplies every logit. This is the machine at temperature 1 / beta.
         """
@@ -340,21 +349,26 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return F = -log sum_{h1} exp(-E), shape (..., B), where a closed form exists.
 
         In the seed form, every unit of `edges` is observed as r and other units are off. In the
-        local form, every relation is unobserved (r = None), and F is exact. A second layer must be
-        given as h2.
+        local form, every relation is unobserved (r = None), and F is exact. A machine with a second
+        layer needs its state h2.
 
         Raises:
             ValueError: there is no closed form.
-            ValueError: where no closed form exists.
         """
         if self.spec.H2 and h2 is None:
-            raise ValueError("F has no closed form over a second layer: give h2")
+            raise ValueError("the free energy has no closed form over a second layer: pass h2")
         if not self.relations_act:
             if r is not None:
-                raise ValueError("F has no closed form in the local form with relations observed")
+                raise ValueError(
+                    "the free energy of a local-form machine has no closed form with observed "
+                    "relations: pass r=None"
+                )
             return self.free_energy_given(v, v.new_zeros(()), h2, room)
         if r is None or edges is None:
-            raise ValueError("F has no closed form in the seed form with relations unobserved")
+            raise ValueError(
+                "the free energy of a seed-form machine needs observed relations (r and edges): "
+                "without them it has no closed form"
+            )
         bare, context = self.linear_relations(edges, v, r)
         free = self.free_energy_given(v, context, h2, room) - bare - self.pair_offset(edges, v)
         return torch.where((r > self.gate(edges, v)).any(-1), torch.inf, free)

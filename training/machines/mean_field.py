@@ -4,9 +4,9 @@ The iteration starts with h2 at its prior and alternates, with damping:
 
     m2 = sigmoid(c2 + m1'J),   y = c1 + v'W + J m2 + sum_e slope_e(m1) U_e,   m1 = sigmoid(y)
 
-slope_e is r_e for an observed unit of the seed form. For other units it is the tangent of the
-relation term. With one layer, the result is exact in two cases: all relations are observed (seed
-form), or none is observed (local form).
+slope_e is r_e for an observed unit of the seed form. For other units it is the derivative of the
+relation term by its logit. With one layer, the result is exact in two cases: all relations are
+observed (seed form), or all relations are unobserved (local form).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from training.machines.machine import BoltzmannMachine
 
 @dataclass(frozen=True)
 class Evidence:
-    """The observed values of some scenes.
+    """The evidence of B scenes: the observed values of their units.
 
     Attributes:
         v: (B, V) presence.
@@ -60,7 +60,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class MeanField:
-    """The fixed point: logits y of h1 and x without relations (B, H1), means of h2 (B, H2)."""
+    """The fixed point: logits of h1 with (y) and without relations (x), and means of h2."""
 
     y: Tensor
     x: Tensor
@@ -75,7 +75,7 @@ def mean_field(
     damping: float = 0.8,
     pull: float = 1.0,
 ) -> MeanField:
-    """Return one fixed point of h1 and h2 given the evidence; differentiable in the weights.
+    """Return a fixed point of h1 and h2 given the evidence, differentiable in the weights.
 
     Args:
         iterations: number of sweeps over both layers.

@@ -1,7 +1,7 @@
-"""log Z by annealed importance sampling (AIS): a lower and an upper estimate.
+"""Lower and upper estimates of log Z by annealed importance sampling (AIS).
 
 The path runs over machines of the same family (`BoltzmannMachine.scaled`). It starts at beta = 0
-with independent objects, whose log Z is a sum, and ends at the machine itself at beta = 1. Forward
+with independent objects, whose log Z is exact, and ends at the machine itself at beta = 1. Forward
 runs give a lower bound in expectation, E[log w] ≤ log Z. Reverse runs start from samples of the
 machine and give an upper bound.
 
@@ -49,8 +49,8 @@ class LogPartition:
 
         Args:
             base: log Z of the base.
-            log_weight: log weights, as the path of that direction accumulates them.
-            reverse: the runs lead to the base, not from it.
+            log_weight: log weights, accumulated along the path in the direction of the runs.
+            reverse: True if the runs end at the base; False if they start there.
         """
         sign, count = (-1 if reverse else 1), len(log_weight)
         mean = float(log_weight.logsumexp(0)) - math.log(count)
@@ -62,8 +62,8 @@ class LogPartition:
 def independent_base(machine: BoltzmannMachine, b: Tensor | None = None) -> BoltzmannMachine:
     """Return the machine at beta = 0: independent objects with log-odds b (default: the machine's).
 
-    Relation units of the RBM and GBM keep their bias d. Those of the Triway contribute a factor of
-    one.
+    The relation units of an RBM or GBM keep their bias d. The relation units of a Triway contribute
+    a factor of one to Z.
     """
     base = build(machine.spec).to(machine.b.dtype).requires_grad_(False)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The RBM with the Triway's shared weights, for comparisons: factors without tri-way edges.
+"""An RBM for comparisons: it has the Triway's shared weights (factors) but no tri-way edges.
 
     E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
     U_t = P[a] + sum_k S[i,k] M[a,k] O[j,k]
@@ -20,7 +20,7 @@ from training.machines.rbm import RBM, scale
 
 
 class ProductRBM(RBM):
-    """ℓ_t = d_t + U_t·h1 with U factorised."""
+    """The RBM with logits ℓ_t = d_t + U_t·h1 and factorised U."""
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__(spec)

@@ -28,7 +28,7 @@ from training.machines.machine import BoltzmannMachine
 
 
 class RBM(BoltzmannMachine):
-    """ℓ_t = d_t + U_t·h1 over the triples seen in training."""
+    """The RBM, with relation logits ℓ_t = d_t + U_t·h1 for the triples seen in training."""
 
     def __init__(self, spec: MachineSpec) -> None:
         super().__init__(spec)
@@ -98,7 +98,7 @@ class RBM(BoltzmannMachine):
         return h1.new_zeros(*h1.shape[:-1], candidates.shape[-1])
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return each unit's value at its triple; most relations have no unit."""
+        """Return the units' values as a table over classes; -inf for relations without a unit."""
         pairs = pair_edges(classes, self.spec.A)
         _, position, found = self.places(pairs)
         if not self.spec.T:
@@ -137,8 +137,8 @@ def scale(
 ) -> Machine:
     """Return a copy with parameters beta·θ, plus (1 - beta)·θ_base for the names in `keep`.
 
-    Parameters in `fixed` are unchanged: they are factors, and only one factor of a product may
-        scale.
+    Parameters in `fixed` are unchanged. They are factors of products, of which only one factor may
+    scale.
     """
     result = copy.copy(machine)
     result._parameters = {}

@@ -19,14 +19,15 @@ h1 cannot represent such a rule.
     log-odds of r_e given r_G  =  ℓ_e(h1) + x_e(r_G),       e = (a, i, j)
     x_e = sum_f (gamma[0,a,f] + sum_q z_q gamma[q,a,f]) phi_f(i, j; r_G),    z = B E[h1 | v]
 
-r_G is a condition, as a room type is for h1. All other conditionals keep their closed form. Without
-observed relations, x = 0. z makes the strength of the rules depend on the context, because some
-sources list every visible pair and others only a few neighbours. phi_f reads the 2A relations b in
-both directions, and never r_e itself:
+The model conditions on r_G, as it conditions on a room type. All other conditionals keep their
+closed form. Without observed relations, x = 0. z makes the strength of the rules depend on the
+context, because some sources list every visible pair and others only a few neighbours. The features
+phi_f use the A relations in both directions (2A relations b and c), but never r_e itself:
 
-    pair      r_b(i, j)                                           2A features
-    path      there is a class k with r_b(i, k) and r_c(k, j)     (2A)²
-    degree    other classes k with r_b(i, k), with r_b(k, j)      4A, counted up to 3
+    pair      r_b(i, j)                                              2A features
+    path      there is a class k with r_b(i, k) and r_c(k, j)        (2A)² features
+    degree    number of other classes k with r_b(i, k), and with     4A features, each at most 3
+              r_b(k, j)
 
 Forms: `seed` is the energy above, with a compensating offset κ_a for each active unit (0 in the
 paper). `local` adds softplus(ℓ_e) for every active unit.
@@ -147,7 +148,7 @@ class Triway(BoltzmannMachine):
         return pairs.unflatten(self.residual[position] * found)
 
     def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """Return the shifts by gamma and B; zero without them."""
+        """Return the logit shifts x_e; zeros in a machine without the weights gamma and B."""
         if not self.spec.G:
             return super().implied(edges, given, h1)
         grid = _pairs(edges).unflatten(given)
@@ -265,7 +266,7 @@ class Triway(BoltzmannMachine):
         """
         frame = None if given is None else _pairs(given[0])
         if frame is not None and len(frame.subjects) != len(v):
-            raise ValueError(f"observed relations need one row per chain: {len(v)}")
+            raise ValueError(f"observed relations must have one row per chain, {len(v)} rows")
         edges = self.edges(present_classes(v, None if frame is None else frame.subjects))
         r = self.b.new_zeros(edges.shape)
         known = torch.zeros_like(r, dtype=torch.bool)
@@ -287,7 +288,10 @@ class Triway(BoltzmannMachine):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """Sample v; the seed form goes object by object, or keeps the objects of active relations.
+        """Sample v given h1.
+
+        The seed form samples object by object if collapsed. Otherwise it keeps the objects of
+        relations that are on.
 
         Raises:
             ValueError: the seed form has κ and is not collapsed.
@@ -297,7 +301,9 @@ class Triway(BoltzmannMachine):
         if collapsed:
             return self._collapsed_sweep(v.clone(), h1, held, generator)
         if bool(self.kappa.any()):
-            raise ValueError("the plain kernel needs κ = 0: κ ties objects even given h1 and r")
+            raise ValueError(
+                "collapsed=False needs κ = 0: with κ, objects are dependent even given h1 and r"
+            )
         drawn = super().sample_objects(v, h1, r, edges, generator)
         return drawn.maximum(self.held_objects(edges, r))
 
@@ -321,7 +327,7 @@ class Triway(BoltzmannMachine):
         return _pairs(edges).unflatten(gate).sum((-1, -2)) @ self.kappa
 
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return the values in the layout of the units."""
+        """Return the values as a table over the classes, which is the layout of the units."""
         return _pairs(edges).unflatten(values)
 
     def acting_units(self, v: Tensor) -> Edges | None:
@@ -358,9 +364,12 @@ def _pairs(edges: Edges) -> PairEdges:
 
 
 def implication_features(given: Tensor) -> Tensor:
-    """Return phi, (B, F, n, n), of the given relations (B, A, n, n), 1 where on.
+    """Return the features phi, (B, F, n, n), of given relations.
 
-    The pair feature of a itself equals r_e where e is given, so `implied` gives it no weight.
+    The pair feature of relation a equals r_e where e is given, so `implied` ignores it.
+
+    Args:
+        given: (B, A, n, n), 1 where a relation is given as holding, else 0.
     """
     n = given.shape[-1]
     between = given * ~torch.eye(n, dtype=torch.bool, device=given.device)
@@ -376,7 +385,7 @@ def implication_features(given: Tensor) -> Tensor:
 
 
 def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-    """Return x, (B, A, n, n).
+    """Return the logit shifts x, (B, A, n, n).
 
     Args:
         gamma: (1 + G, A, F).
@@ -389,7 +398,7 @@ def implied(gamma: Tensor, B: Tensor, given: Tensor, h1: Tensor, *, apart: bool 
     itself = torch.zeros(gamma.shape[1:], dtype=torch.bool, device=gamma.device)
     itself[:, :A].fill_diagonal_(True)
     if apart:
-        # Paths and neighbours of other classes remain.
+        # The path and degree features remain: they are about other classes.
         itself[:, : 2 * A] = True
     gamma = gamma.masked_fill(itself, 0.0)
     weight = gamma[0] + torch.einsum("bq,qaf->baf", h1 @ B.T, gamma[1:])

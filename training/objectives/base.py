@@ -25,12 +25,16 @@ class Objective(ABC):
     def __init__(
         self, config: ObjectiveConfig, machine: BoltzmannMachine, structure: Tensor | None = None
     ) -> None:
-        """Args: structure: (V,) bool, classes such as walls; default: no structure classes."""
+        """Store the settings.
+
+        Args:
+            structure: (V,) bool, classes such as walls; default: no structure classes.
+        """
         self.config = config
         nothing = torch.zeros(machine.spec.V, dtype=torch.bool)
         self.structure = nothing if structure is None else structure
 
-    # If True, the last epoch counts as the best: a likelihood with a prior needs no early stopping.
+    # If True, the last epoch counts as the best. A likelihood with a prior needs no early stopping.
     keeps_last = False
 
     @classmethod
@@ -50,7 +54,7 @@ class Objective(ABC):
         return []
 
     def finish(self, machine: BoltzmannMachine, train: SceneTensors) -> BoltzmannMachine:
-        """Return the machine with its best weights, ready for storage.
+        """Return the machine, which has its best weights, in the form to store.
 
         Args:
             train: the scenes on which the objective was trained.
@@ -90,10 +94,10 @@ def relation_nll(
     h1: Tensor,
     generator: torch.Generator,
 ) -> Tensor:
-    """Return -sum over units of weight_e log p(r_e | v, h1).
+    """Return -sum over units e of weight_e log p(r_e | v, h1).
 
-    A machine with implications adds a second term. For that term, a random share of the observed
-    relations of each scene is given, and the sum runs over the other units.
+    For a machine with implications, the function adds a second term. In this term, a random share
+    of the observed relations of each scene is given, and the sum runs over the other units.
 
     Args:
         logits, r, observed, weight: (B, E) over `edges`.

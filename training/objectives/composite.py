@@ -5,9 +5,9 @@ In each scene one present class i is removed, with all its instances and relatio
     ranking    - log softmax over absent candidates of the log-odds, at i
     presence   n·softplus(-log-odds_i) + sum over the other absent classes of softplus(log-odds)
 
-n is the number of removable classes. It makes the second term an unbiased estimate of the
-pseudo-likelihood, which balances present and absent units. With the ranking term alone, log-odds of
-different objects are not comparable.
+n is the number of removable classes. The factor n makes the second term an unbiased estimate of the
+pseudo-likelihood, which balances present and absent units. With the ranking term alone, the
+log-odds of different objects are not comparable.
 
 For scenes with annotated relations:
 
@@ -15,11 +15,12 @@ For scenes with annotated relations:
 
 This term approximates the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)) by
 the mean of h1. Unannotated relations are summed out. Scenes without annotated relations train the
-object part only. A machine with implications is trained on the same scenes with a random share of
-their relations given, by log p(r_e | r_given, v, E[h1 | v]) of the other relations.
+object part only. For a machine with implications, the loss has a second relation term: a random
+share of the relations of each scene is given, and the term is the sum of
+- log p(r_e | r_given, v, E[h1 | v]) over the other relations.
 
-A class that a source never mentions counts as absent from its scenes. The reason is that a request
-has no source, and all classes have to be ranked.
+A class that a source never mentions counts as absent from the scenes of the source. The reason is
+that a request has no source, and the service has to rank all classes.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Varin, Reid and Firth, "An
 overview of composite likelihood methods" (2011).
@@ -63,7 +64,9 @@ class Masked:
 
 
 def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) -> Masked | None:
-    """Remove one class from each scene with at least two; return None if no scene has two.
+    """Remove one class from each scene with at least two removable classes.
+
+    The result is None if all scenes have fewer.
 
     Args:
         structure: (V,) bool; structure classes are neither removed nor candidates.
@@ -82,13 +85,13 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
 class ObjectChains:
     """Persistent chains over objects and context: a generative gradient for the local form.
 
-    In the local form relations sum to one. The chains therefore run over (v, h1, h2), with h1
-    summed out:
+    In the local form, relations sum to one, so the chains need only (v, h1, h2). The loss is the
+    difference of free energies, in which h1 is summed out:
 
         mean F(data, h2) - mean F(chains, h2),   F = -b·v - c2·h2 - sum softplus(c1 + v'W + J h2)
 
-    Each chain keeps a room type (or none) drawn from the training scenes. Both means then have the
-    same mixture of conditions.
+    Each chain keeps a room type (or none) drawn from the training scenes. So data and chains have
+    the same distribution of room types.
 
     Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
 
@@ -130,7 +133,7 @@ class ObjectChains:
 
 
 class CompositeLikelihood(Objective):
-    """Ranking + presence_weight · presence + relation_weight · relations.
+    """The loss ranking + presence_weight · presence + relation_weight · relations.
 
     With a generative_weight (local form), the weighted persistent-chain gradient is added
     (`ObjectChains`). Conditionals alone give a joint distribution whose samples differ from the
@@ -179,7 +182,7 @@ class CompositeLikelihood(Objective):
         masked: Masked,
         generator: torch.Generator,
     ) -> Tensor:
-        """Return log-odds of each class given the other classes, relations unobserved, (B, V)."""
+        """Return the log-odds (B, V) of each class given the others, with relations unobserved."""
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
             drop = torch.rand(v.shape, generator=generator) < self.config.structure_dropout

@@ -1,11 +1,11 @@
-"""Contrastive divergence, plain and persistent, by differences of the energy.
+"""Contrastive divergence, plain and persistent, from differences of the energy.
 
-The gradient of the negative log-likelihood is <dE>_data - <dE>_model. Both terms are energies of
-sampled states, so autograd derives the update of any variant. In the seed form h1 is summed out
-(Rao–Blackwell), and the terms are free energies given v, r and h2.
+The gradient of the negative log-likelihood is <dE>_data - <dE>_model. The loss is the difference of
+the energies of sampled states, and autograd derives the update of any variant. In the seed form h1
+is summed out (Rao–Blackwell), so the terms are free energies given v, r and h2.
 
-In the local form relations sum to one given (v, h1), so their model term has mean zero and is left
-out. The machine of (v, h1, h2) and log p(r | v, h1) on the data remain.
+In the local form, relations sum to one given (v, h1). Their model term has mean zero and is left
+out. The loss is then the energy difference over (v, h1, h2), minus log p(r | v, h1) of the data.
 
 Sources: Hinton, "Training products of experts by minimizing contrastive divergence" (2002);
 Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008); Montavon and
@@ -73,7 +73,10 @@ def energy_difference(
     data_room: Tensor,
     model_room: Tensor,
 ) -> Tensor:
-    """Return mean F(data) - mean F(model); in the local form mean E, plus -log p(r | v, h1)."""
+    """Return mean F(data) - mean F(model) in the seed form.
+
+    In the local form, E replaces F, and -log p(r | v, h1) of the data is added.
+    """
     if not machine.relations_act:
         positive = machine.object_energy(data.v, data.h1, data.h2, data_room)
         positive = positive + relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
@@ -108,7 +111,7 @@ class ContrastiveDivergence(Objective):
             )
         if not machine.relations_act:
             # The energies use sampled h1. After one step the model state still has the h1 of the
-            # data, from which c1 and J would learn nothing.
+            # data. With equal h1 in both terms, c1 and J would have no gradient.
             model = replace(model, h1=sample_h1(machine, model, generator, clamp))
         return energy_difference(machine, data, observed, model, room, room)
 
@@ -154,7 +157,7 @@ class PersistentCD(Objective):
         return State(edges=edges, **{name: self.saved[name] for name in ("v", "h1", "h2", "r")})
 
     def state(self) -> dict[str, Tensor]:
-        """Return the offsets, the chains, and the classes in the layout of their relations."""
+        """Return the offsets, the chains, and the classes between which their relations are."""
         state = dict(zip(_OFFSETS, self.offsets, strict=True))
         if self.chains is None:
             return state
@@ -171,11 +174,11 @@ class PersistentCD(Objective):
 def centre_gradients(
     machine: BoltzmannMachine, mu: Tensor, lambda1: Tensor, lambda2: Tensor
 ) -> None:
-    """Replace gradients by (b, c1, c2, W, J) with centred ones, in place.
+    """Replace the gradients of (b, c1, c2, W, J) by centred gradients, in place.
 
-    d<v>, d<h1> and d<vh1> are differences of data and model. The centred gradient of W is
-    d<vh1> - μ d<h1>' - d<v> λ1'. Bias gradients are reduced by the shift that the weights cause
-    through the offsets.
+    d<v>, d<h1> and d<vh1> are differences between data and model means. The centred gradient of W
+    is d<vh1> - μ d<h1>' - d<v> λ1'. Each bias gradient is reduced by the product of the centred
+    weight gradients and the offsets.
     """
     b, c1, c2 = (getattr(machine, name).grad for name in ("b", "c1", "c2"))
     W, J = machine.W.grad, machine.J.grad

@@ -4,8 +4,8 @@
 
 A unit is known if its source states whether the relation holds (`training.datasets.sources`). Other
 units drop out. Sources differ in what they list: people mention notable relations, and a procedural
-room lists all. Each source therefore has its own offset δ for each relation. Offsets are trained,
-and left out when serving.
+room lists all. Each source therefore has its own trained offset δ for each relation. The service
+does not use the offsets.
 
 Weights and offsets have normal priors, with the precisions `weight_prior` and `offset_prior`. With
 word vectors X, the factors and end weights of a class are a trained map of its vector plus a small
@@ -15,12 +15,13 @@ deviation of the class:
 
 A rare class then behaves like classes with similar word vectors.
 
-A robot seldom sees a whole scene. In training the context therefore sees a random share of the
-objects, with a uniform share for each scene. Otherwise the context would learn relations that hold
-in complete scenes of one source, and the model would not predict them in other scenes.
+A robot seldom sees a whole scene. In training, the context h1 therefore depends on a random subset
+of the objects; the share is drawn uniformly for each scene. Otherwise the context would learn
+relations that hold in complete scenes of one source, and would not predict them in other scenes.
 
-A machine with implications is trained on the same scenes with a random share of their relations
-given, by log p(r_e | r_given, v, E[h1 | v]) of the other relations. The object part is unchanged.
+For a machine with implications, the loss has a second term: a random share of the relations of each
+scene is given, and the term is the sum of - log p(r_e | r_given, v, E[h1 | v]) over the other
+relations. The object part of the machine is not trained.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Mnih and Salakhutdinov,
 "Probabilistic matrix factorization" (2007), for normal priors on factors.
@@ -56,9 +57,9 @@ _OBJECT_PART = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B", "usual",
 _MAP_PRIOR = 0.1
 _ROWS = ("S", "O")
 _COLUMNS = ("s", "o")
-# τ: this prior weighs as much as four scenes at even odds.
+# τ, the precision of the prior of a residual. It weighs as much as four scenes with p(r) = 1/2.
 _PRECISION = 1.0
-# Least number of scenes that observe a triple, and least residual that is stored.
+# Minimum number of scenes that observe a triple, and minimum size of a stored residual.
 _SPEAKING_SCENES = 5
 _LEAST_RESIDUAL = 0.1
 _NEWTON_STEPS = 12
@@ -71,7 +72,7 @@ class WordPrior(nn.Module):
     Args:
         words: (V, D) scaled word vectors.
         width: number of weights of a class.
-        columns: the weights are (width, V), not (V, width).
+        columns: True if the weights have shape (width, V), False for (V, width).
     """
 
     def __init__(self, words: Tensor, width: int, *, columns: bool) -> None:
@@ -140,7 +141,7 @@ class RelationLikelihood(Objective):
             self.offsets.copy_(state["offsets"])
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the mean negative log-likelihood of scenes, plus a scene's part of the prior."""
+        """Return the mean over scenes of the negative log-likelihood, plus the prior's share."""
         with cached():
             return self._loss(machine, batch, generator)
 
@@ -178,7 +179,7 @@ def partly_shown(v: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:
-    """Add a word prior to the class weights of a factorised machine; others are unchanged."""
+    """Add a word prior to the class weights of a factorised machine; ignore other machines."""
     for names, columns in ((_ROWS, False), (_COLUMNS, True)):
         for name in names:
             weight = dict(machine.named_parameters()).get(name)
@@ -199,15 +200,15 @@ def with_counted_residuals(
 ) -> BoltzmannMachine:
     """Return the machine with weights of single triples, smoothed towards counts.
 
-    Shared factors state the meaning of a relation over all classes. For some pairs they give a high
-    probability although many scenes observe that the relation does not hold (a window on a stove).
-    After training, each triple e = (a,i,j) observed in enough scenes therefore gets its own weight
-    δ_e, which maximises
+    Shared factors describe a relation over all classes. For some pairs, the factors give a high
+    probability although the relation is false in many scenes (a window on a stove). After training,
+    this function therefore fits a weight δ_e for each triple e = (a,i,j) that enough scenes
+    observe. δ_e maximises
 
         sum over scenes of log p(r_e | v, E[h1 | v], w_e' + δ_e) - τ/2 δ_e²
 
-    by Newton's method. All other weights are fixed, and the context sees a random share of the
-    objects, as in training. With few scenes, δ_e stays close to 0.
+    by Newton's method. All other weights are fixed. As in training, the context depends on a random
+    subset of the objects. With few scenes, δ_e stays close to 0.
 
     Args:
         train: scenes with known relations.

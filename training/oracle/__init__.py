@@ -1,1 +1,1 @@
-"""Reference posterior of scenes under any machine, by weighted draws of the context; slow."""
+"""Slow reference for the posterior of scenes under any machine, by weighted draws of h1."""

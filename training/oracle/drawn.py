@@ -22,7 +22,7 @@ from training.oracle.units import NO_UNIT, Units, mean_log_p, units_between
 Floats = NDArray[np.floating[Any]]
 Places = NDArray[np.int64]
 
-# Rows and candidates are processed in blocks of about this many relation units times draws.
+# Maximum of relation units × draws in a block of rows or candidates.
 _BLOCK = 1 << 22
 
 
@@ -32,8 +32,9 @@ class _Between(NamedTuple):
     Attributes:
         units: layout of the E units.
         logits: (M, E), one row for each draw.
-        said: (M, E) log-weight change that removes an observation from the draws; or 0.
-        holds: (1, E), 1 where observed as on; None without observed relations.
+        said: (M, E) change of the log-weights that removes the observation of a unit from the
+            draws; 0 without observed relations.
+        holds: (1, E), 1 where a unit is observed as on; None without observed relations.
     """
 
     units: Units
@@ -43,7 +44,10 @@ class _Between(NamedTuple):
 
 
 class DrawnPosterior:
-    """See `Posterior`. In the local form without observed relations, objects have a closed form."""
+    """A `Posterior` from weighted draws.
+
+    In the local form without observed relations, the log-odds of objects have a closed form.
+    """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:
         self.observation = observe(machine_of(artifact.weights), scene)
@@ -53,7 +57,7 @@ class DrawnPosterior:
 
     @property
     def unit_count(self) -> int:
-        """Number of relation units of the evidence; in the seed form, of all present classes."""
+        """Number of relation units of the evidence (seed form: between all present classes)."""
         return self.observation.unit_count
 
     @cached_property
@@ -72,7 +76,7 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def absent_log_odds(self, absent: Places) -> Floats:
-        """See `Posterior`; in closed form in a local machine without observed relations."""
+        """See `Posterior`; the local form without observed relations has a closed form."""
         machine, evidence = self.observation.machine, self.observation.evidence
         where = torch.from_numpy(np.asarray(absent, dtype=np.int64))
         if not machine.relations_act and evidence.edges is None:
@@ -110,7 +114,7 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def log_odds_apart(self, one: Places, other: Places) -> tuple[Floats, Floats]:
-        """See `Posterior`; the draws are reweighted by all units of the pair, in both ways."""
+        """See `Posterior`; all units of the pair, in both directions, reweight the draws."""
         units, said = self._between.units, self._between.said
         logits = self._between.logits + self._implied(apart=True)
         ends = torch.from_numpy(one), torch.from_numpy(other)
@@ -118,7 +122,7 @@ class DrawnPosterior:
         log_weight = self.draws.log_weight
         if said.dim():
             forward, backward = (way.grid(said, 0.0).sum(1) for way in ways)
-            # For a class with itself, both directions are the same units.
+            # For a pair of equal classes, both directions have the same units.
             log_weight = log_weight + forward + backward * (ends[0] != ends[1])
         weight = torch.softmax(log_weight, dim=0).unsqueeze(1)
         found = []
@@ -141,7 +145,7 @@ class DrawnPosterior:
         r = units.flat(observation.holds).to(logits.dtype)
         gate = machine.gate(units.edges, evidence.v)
         unseen = machine.relation_term(logits, gate, r, torch.zeros_like(observed))
-        # Where e is not observed, the difference is zero and the weights do not change.
+        # For an unobserved unit, the difference is zero and the weights do not change.
         said = self._pull.relations * (unseen - machine.relation_term(logits, gate, r, observed))
         return _Between(units, logits, said, (r * observed).unsqueeze(0))
 
@@ -154,7 +158,7 @@ class DrawnPosterior:
         return self.draws.implied(machine, edges, between.holds, apart=apart).squeeze(0)
 
     def unit_log_odds(self, relation: Places, subject: Places, object_: Places) -> Floats:
-        """See `Posterior`; selects from the log-odds of all relations."""
+        """See `Posterior`; the result is a selection from the log-odds of all relations."""
         return self.relation_log_odds()[relation, subject, object_]
 
     @torch.inference_mode()
@@ -186,7 +190,7 @@ class DrawnPosterior:
         observation, draws = self.observation, self.draws
         machine, evidence = observation.machine, observation.evidence
         classes, counts = observation.classes[anchors], observation.counts[anchors]
-        # Each unit is computed with its candidate present; a unit never involves two candidates.
+        # All candidates can be present at once, because a unit involves one candidate only.
         v = evidence.v.clone()
         v[:, candidates] = 1.0
         weight = weights_with(machine, evidence, draws, candidates)
@@ -218,10 +222,10 @@ class DrawnPosterior:
 
     @torch.inference_mode()
     def reasons(self, rows: Places) -> Floats:
-        """See `Posterior`; the context is at its mean field on both sides.
+        """See `Posterior`; both log-odds of a difference use the mean field of the context.
 
-        The difference of two estimates from draws would be smaller than their noise. The scene
-        without i and j gives the log-odds of i without j and of j without i.
+        With draws, the noise would exceed the difference of two estimates. One scene, without i and
+        j, gives both the log-odds of i without j and the log-odds of j without i.
         """
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
@@ -244,15 +248,14 @@ class DrawnPosterior:
         i, j = pairs.unbind(1)
         without[i, j], without[j, i] = log_odds.unbind(1)
         without = without[places]
-        # On the diagonal only the class itself is removed, so these are its log-odds given the
-        # rest.
+        # On the diagonal only the class itself is removed. This gives its log-odds given the rest.
         change = without.gather(1, places.unsqueeze(1)) - without
         change[torch.arange(len(places)), places] = 0.0
         return _numpy(change)
 
     @torch.inference_mode()
     def reasons_for_absent(self, candidates: Places) -> Floats:
-        """See `Posterior`; the context is at its mean field on both sides, as in `reasons`."""
+        """See `Posterior`; both log-odds of a difference use the mean field, as in `reasons`."""
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
         where = torch.from_numpy(np.asarray(candidates, dtype=np.int64)).unsqueeze(0)

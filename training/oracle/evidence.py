@@ -1,12 +1,12 @@
 """Convert a scene to evidence in the tensor layout of a machine.
 
 Presence is soft: a class seen with confidence c < 1 enters as v = c. This is a first-order
-approximation. The energy is linear in v_i, so v = c is the mean over v_i ~ Bernoulli(c). The
-dependence of the context on either value is not averaged. Unseen classes enter as v = 0.
+approximation. The energy is linear in v_i, so v = c gives the mean energy over v_i ~ Bernoulli(c).
+The context is computed once from v = c, and not averaged over v_i. Unseen classes enter as v = 0.
 
-Relations that the scene states or shows are observed; all other relations are unobserved. In the
-local form unobserved relations drop out, so only classes with an observed relation get units. A
-relation without a unit in the machine is ignored.
+Listed relations and relations derived from poses are observed; all other relations are unobserved.
+In the local form, unobserved relations drop out, so only classes with an observed relation have
+units. A relation without a unit in the machine is ignored.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from training.oracle.units import Units, units_between
 DRAWS = 64
 """Number of draws of the context for an estimate; a power of two balances the Sobol sequence."""
 
-# With very many relations the number of draws is reduced to this, to limit the time of a question.
+# Minimum number of draws. With very many relations, fewer draws limit the time of a question.
 _FEWEST_DRAWS = 8
 _RELATION_DRAWS = 1 << 25
 
@@ -39,9 +39,10 @@ def draw_context(
     rows: int | None = None,
     pull: float = 1.0,
 ) -> HiddenDraws:
-    """Return the fixed, weighted draws of h1 for all estimates.
+    """Return weighted draws of h1 given the evidence; equal evidence gives equal draws.
 
-    The number is `DRAWS`, or less where rows × relation units × draws would exceed a bound.
+    The number of draws is `DRAWS`. It is smaller if rows × relation units × draws would exceed a
+    bound.
 
     Args:
         rows: number of all rows of the question; default: the rows of the evidence.
@@ -102,7 +103,7 @@ class Observation:
         observed = evidence.observed & self.units.flat(kept)
         edges = self.units.edges
         if self.machine.relations_act:
-            # Unobserved relations act in the seed form, and each row has its own anchors.
+            # In the seed form unobserved relations act, and each row has its own anchors.
             edges = edges.expand(size)
         return Evidence(v, edges, evidence.r.expand(size, -1), observed, room)
 
@@ -111,7 +112,7 @@ def observe(machine: BoltzmannMachine, scene: Scene) -> Observation:
     """Return the observation of a scene.
 
     Raises:
-        ValueError: the machine does not have the class of an object, or the room type.
+        ValueError: the machine lacks the class of an object or the room type.
     """
     spec = machine.spec
     found = class_evidence(scene)

@@ -5,10 +5,10 @@ Score of objects v and relations r, at temperature 1:
     local form   b·v + sum_k softplus(x_k) + log p(r | v, h1)
     seed form    b·v + sum_k softplus(x_k + sum_e r_e U_ek) + sum_e r_e ℓ⁰_e
 
-with x = c1 + v'W + J m. In the seed form the score is log p(v, r) up to log Z. In the local form it
-is log p(v) up to log Z, plus the log-likelihood of r given the h1 from which r was sampled. A
-second layer enters by its mean field m: c2·m and the entropy of m are added, which gives a lower
-bound on the sum over h2.
+with x = c1 + v'W + J m. In the seed form, the score is log p(v, r) + log Z. In the local form, the
+score is log p(v) + log Z, plus the log-likelihood of r given the h1 from which r was sampled. With
+a second layer, m is the mean field of h2. The score then also contains c2·m and the entropy of m,
+which gives a lower bound on the sum over h2.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from app.inference import relations
 from training.machines import BoltzmannMachine
 from training.machines.edges import Edges, pair_edges
 
-# A plain number, because tensors do not accept numpy scalars.
+# A Python float, because tensors do not accept numpy scalars.
 NO_UNIT = float(relations.NO_UNIT)
 
 
@@ -25,7 +25,7 @@ class Units:
 
     Attributes:
         edges: (1, E) units in the machine's layout.
-        place: (A, n, m) int64, the place in `edges` of each unit; or (A, P), see `of_pairs`.
+        place: (A, n, m) int64, the index in `edges` of each unit; or (A, P), see `of_pairs`.
         exists: (A, n, m) bool; where False, `place` is arbitrary.
     """
 
@@ -34,18 +34,21 @@ class Units:
     exists: Tensor
 
     def grid(self, values: Tensor, missing: float) -> Tensor:
-        """Return values (..., E) of the units as (..., A, n, m); `missing` without a unit."""
+        """Return values (..., E) of the units as (..., A, n, m); `missing` if there is no unit."""
         if not values.shape[-1]:
             return values.new_full((*values.shape[:-1], *self.place.shape), missing)
         return torch.where(self.exists, values[..., self.place], missing)
 
     def of_pairs(self, subjects: Tensor, objects: Tensor) -> Units:
-        """Return the units of pairs of class places (P,); `grid` then gives (..., A, P)."""
+        """Return the units of P pairs of class indices (P,); `grid` then gives (..., A, P)."""
         place, exists = (grid[:, subjects, objects] for grid in (self.place, self.exists))
         return Units(self.edges, place, exists)
 
     def flat(self, grid: Tensor) -> Tensor:
-        """Return (..., A, n, m) as (..., E); values without a unit are dropped, the rest is 0."""
+        """Return values (..., A, n, m) as (..., E).
+
+        Values without a unit are dropped. Units without a value are 0.
+        """
         values = grid.new_zeros(*grid.shape[:-3], self.edges.shape[-1])
         values[..., self.place[self.exists]] = grid[..., self.exists]
         return values

@@ -215,7 +215,7 @@ def test_sources_by_name_are_found_in_the_folder_extra(
                 ({"yaw": "north"}, "yaw must be a number"),
                 ({"yaw": math.nan}, "yaw of '0' must be finite"),
                 ({"box2d": [3, 0, 1, 1]}, "box2d of '0' must be"),
-                ({"supported_by": 9}, "'0' has the unknown support '9'"),
+                ({"supported_by": 9}, "supported_by of '0' is '9', which is no object"),
             )
         ),
     ],
@@ -550,7 +550,9 @@ def test_malformed_coco(tmp_path: Path, content: Any, message: str) -> None:
 
 @pytest.mark.parametrize("ends", [(0, "left", 1), (-1, "left", 0)])
 def test_relations_name_objects_of_their_scene(ends: tuple[int, str, int]) -> None:
-    with pytest.raises(ValueError, match=r"a relation names object -?1, but there are 1 objects"):
+    with pytest.raises(
+        ValueError, match=r"a relation has object index -?1, but the scene has 1 objects"
+    ):
         AnnotatedScene("s", "t", "g", None, (AnnotatedObject("0", "bed"),), (ends,))
 
 

@@ -103,5 +103,5 @@ def test_a_model_of_other_sources_has_seen_nothing(tmp_path) -> None:
 
 
 def test_who_does_not_say_what_was_held_out_cannot_come_first(tmp_path) -> None:
-    with pytest.raises(ConfigError, match="does not state how its scenes were split"):
+    with pytest.raises(ConfigError, match="does not record the split of its scenes"):
         held_out(BASELINES, side("b"), SCENES, tmp_path)
