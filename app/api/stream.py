@@ -1,4 +1,4 @@
-"""The WebSocket ``GET /stream``: clients send scene updates and receive answers (docs/stream.md)."""
+"""The WebSocket ``GET /stream``: clients send scene updates and get answers (docs/stream.md)."""
 
 from __future__ import annotations
 

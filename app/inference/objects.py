@@ -5,10 +5,11 @@ The hidden units contribute a sum of logs to the log-odds of class i, called the
     gain_i = sum_k [softplus(x_k + W_ik) - softplus(x_k)]
            = sum_k log(sigmoid(-x_k) + sigmoid(x_k) exp(W_ik))
 
-and every factor lies between 1 and exp(W_ik). So the factors of a group are multiplied before one
-log is taken, as long as the product stays within float32. Both terms of a factor are positive, so
-digits do not cancel. The form 1 + sigmoid(x) (exp(W) - 1) would be 0 for large x and W below -17.
-For weights in float64, or too large for float32, each log is taken separately.
+The module computes exp(W) once. Every factor (the argument of a log) lies between 1 and exp(W_ik).
+So the module multiplies a group of factors and takes one log of the product, if the product stays
+within float32. Both terms of a factor are positive, so digits do not cancel. The form
+1 + sigmoid(x) (exp(W) - 1) would be 0 for large x and W below -17.
+If the weights are float64 or too large for float32, the module takes each log separately.
 """
 
 from __future__ import annotations
