@@ -1,1 +1,1 @@
-"""Serving: read scenes, hold the loaded models and answer questions; independent of HTTP."""
+"""The serving layer: it reads scenes, holds the loaded models and answers questions, without HTTP."""
