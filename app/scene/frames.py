@@ -26,7 +26,7 @@ def is_world_fixed(frame_id: str) -> bool:
 
 
 def _plain(frame_id: str) -> str:
-    # "MAP" and "map " also mean "map". If they counted as body frames, the relations would be wrong.
+    # "MAP" and "map " also mean "map". As body frames, they would give wrong relations.
     return frame_id.strip().casefold()
 
 

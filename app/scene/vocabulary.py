@@ -223,7 +223,7 @@ def _object_class(entry: Any) -> ObjectClass:
         raise ValueError(f"unknown fields in object class {entry['label']!r}: {unknown}")
     aliases, structure = entry.get("aliases", []), entry.get("structure", False)
     if not isinstance(aliases, list) or not all(isinstance(name, str) for name in aliases):
-        raise ValueError(f"aliases of {entry['label']!r} must be a list of strings, not {aliases!r}")
+        raise ValueError(f"aliases of {entry['label']!r} must be a string list, not {aliases!r}")
     if not isinstance(structure, bool):
         raise ValueError(f"structure of {entry['label']!r} must be a boolean, not {structure!r}")
     size = entry.get("size")

@@ -1,1 +1,1 @@
-"""The serving layer: it reads scenes, holds the loaded models and answers questions, without HTTP."""
+"""The serving layer, without HTTP: it reads scenes, loads models and answers questions."""

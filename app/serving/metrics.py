@@ -151,7 +151,7 @@ class Metrics:
         )
         self._infos: set[Info] = set()
         self._is_ready = False
-        # The look-up of a series by its labels takes longer than the count, so these dicts cache it.
+        # The look-up of a series by its labels is slower than the count, so these dicts cache it.
         self._of_request: dict[tuple[str, str, str], Counter] = {}
         self._of_route: dict[str, Histogram] = {}
         self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
