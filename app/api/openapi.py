@@ -32,7 +32,7 @@ _ERRORS: Final = {
     catalogue.CONTRADICTORY_EVIDENCE: [
         FieldError(
             pointer="#/relations/1",
-            message="contradicts an earlier relation of this pair, which is the opposite",
+            message="this relation contradicts an earlier relation of the same two objects",
         )
     ],
 }

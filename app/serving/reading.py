@@ -500,7 +500,7 @@ def _triples(
             continue
         index, i, j = canonicalise(subject, relation.relation, other)
         if (index, j, i) in triples:
-            message = "contradicts an earlier relation of this pair, which is the opposite"
+            message = "this relation contradicts an earlier relation of the same two objects"
             faults.add(Reason.CONTRADICTION, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])
