@@ -222,7 +222,7 @@ def _root(name: str, below: dict[str, tuple[str, str]]) -> str:
 
 
 def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
-    """Return the box of an object at (0, 0), and the boxes of all objects above it, side by side."""
+    """Return the box of an object at (0, 0), and the boxes of all objects that stand above it."""
     boxes: list[Box] = []
     x = 0.0
     for other, (supporter, relation) in below.items():
