@@ -156,14 +156,11 @@ class ScoredRelation(Reply):
     probability: Probability
 
 
-# Dataclasses: an answer has thirty of these, and a pydantic model takes ten times as long.
-
-
 @dataclass(slots=True)
 class Because:
-    """The change of an object's log-odds by the presence of another object (by id)."""
+    """How much the presence of `object` (an id) changes the log-odds of another object."""
 
-    # A dataclass too: an answer has some thirty of these.
+    # This is a dataclass, because an answer has about thirty of them.
     object: str
     log_odds_change: Finite
 
