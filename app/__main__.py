@@ -20,7 +20,7 @@ def main() -> int:
     """Serve until the process is stopped.
 
     Returns:
-        The exit status: 2 for invalid settings; else see `serve`.
+        The exit status: 2 for invalid settings, otherwise the exit status of `serve`.
     """
     began = monotonic()
     try:
@@ -33,20 +33,20 @@ def main() -> int:
     return serve(settings, began)
 
 
-# Threshold of the garbage collector's youngest generation. An answer has about 200 containers,
-# which reference counting frees. The default of 700 costs 4 to 8 % of a request's time.
+# Number of new objects that starts a garbage collection. Reference counting already frees the
+# about 200 containers of an answer. The default of 700 costs 4 to 8 % of a request's time.
 _YOUNG = 10_000
 
 
-# See mallopt(3).
+# Name and value of the option for mallopt(3).
 _M_MMAP_THRESHOLD, _LARGE = -3, 128 * 1024
 
 
 def _give_back_what_is_large() -> None:
-    """Make the C library return freed blocks of 128 KiB or more to the system at once.
+    """Make the C library return freed blocks of 128 KiB or more to the operating system at once.
 
-    By default, the C library raises this threshold whenever a large block is freed. Request bodies
-    of several megabytes would then leave 20 MB of unused memory.
+    By default, the C library raises the limit of 128 KiB whenever a large block is freed. After
+    request bodies of several megabytes, the process would then hold 20 MB of unused memory.
     """
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
@@ -57,7 +57,7 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
 
     Args:
         host: name or address.
-        port: port; 0 for any free port.
+        port: number of the port, or 0 for any free port.
         send_timeout: seconds after which Linux closes a connection whose client does not
             acknowledge the bytes sent. On other systems only a proxy can limit this time.
 
@@ -73,7 +73,7 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
             place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if family == socket.AF_INET6:
                 place.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            if hasattr(socket, "TCP_USER_TIMEOUT"):  # connections inherit it
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # connections inherit the option
                 milliseconds = int(send_timeout * 1e3)
                 place.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
             place.bind(address)
@@ -93,7 +93,7 @@ def _refuse_address(settings: Settings, error: OSError) -> int:
     """Print why the service cannot listen on its address; return the exit status."""
     place = f"{settings.host}:{settings.port}"
     if error.errno == errno.EADDRINUSE:
-        reason = f"SCENE_PORT: {place} is in use by another program; set SCENE_PORT to a free one"
+        reason = f"SCENE_PORT: another program uses {place}; set SCENE_PORT to a free port"
     else:
         variable = "SCENE_PORT" if error.errno == errno.EACCES else "SCENE_HOST"
         reason = f"{variable}: the service cannot listen on {place}: {error.strerror or error}"
@@ -115,18 +115,18 @@ def serve(settings: Settings, began: float) -> int:
         sockets = _bind(settings.host, settings.port, settings.client_timeout)
     except OSError as error:
         return _refuse_address(settings, error)
-    # Objects of the start stay in use. Searching them for garbage would take a fifth of the start.
-    # The runtime enables the collector again when it serves.
+    # Objects that the start creates stay in use. A search for garbage among them would take a fifth
+    # of the startup time. The runtime enables the garbage collector again after the start.
     gc.disable()
     gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
     _give_back_what_is_large()
-    # Matrix products of a question are small; threads would take cores from other processes.
-    # numpy reads this variable at its import.
+    # A question needs only small matrix products. More threads would take cores from other
+    # processes. numpy reads this variable at its import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from app.server import build
 
     server = build(settings, began)
-    # On Ctrl-C, the server shuts down in order and raises KeyboardInterrupt afterwards.
+    # On Ctrl-C, the server finishes its shutdown and then raises KeyboardInterrupt.
     with suppress(KeyboardInterrupt):
         try:
             server.run(sockets)

@@ -1,7 +1,7 @@
 """``python -m app.compile``: compile kernels and sources for this machine before the first start.
 
-Otherwise, the first start compiles the kernels, which takes about a minute. If the service cannot
-store the result, it compiles at every start.
+Otherwise, the first start compiles the kernels. This takes about a minute. If the service cannot
+store the compiled kernels, every start compiles them again.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from app.settings import Settings
 
 
 def main() -> int:
-    """Warm up every model of the store, which compiles the kernels; then compile all sources.
+    """Warm up every model of the store, then compile all Python sources to bytecode.
+
+    The warm-up compiles the kernels.
 
     Returns:
-        The exit status: 1 if a model, an alias or the store is not usable.
+        The exit status: 1 if a model, an alias or the store is not usable, else 0.
     """
     settings = Settings()
     dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))

@@ -1,12 +1,12 @@
-"""Compilation of kernels with numba: cached on disk, and run without the interpreter's lock.
+"""Compilation of kernels with numba. The module caches compiled kernels on disk.
 
-Compiled code must match its sources. numba checks the file of a kernel before it uses the kernel's
-code. But this code also contains functions and constants of other files. So the name of the cache
+A cached kernel must match its sources. numba checks only the file that defines the kernel. But the
+compiled code also contains functions and constants of other files. So the name of the cache
 directory is a digest of all these files, of the versions of Python, numba, llvmlite and numpy, and
 of the CPU. `python -m app.compile` fills the directory before the first start.
 
-The directory contains pickled code: a user who can write to it can run code in the service. So only
-the user of the service may access it. The service refuses a directory that other users can change.
+The directory contains pickled code: a user who can write to it can run code in the service. So
+the service refuses a directory that other users can change.
 """
 
 from __future__ import annotations
@@ -39,16 +39,21 @@ _NAMES: Final = "loops-" + 16 * "[0-9a-f]"
 # The digest covers all files of these packages.
 _KERNELS: Final = ("inference", "scene")
 
-# Number of directories of other versions that are kept, so that a downgrade need not compile.
+# Number of cache directories of other versions to keep. After a downgrade, the service then finds
+# its compiled kernels.
 _KEPT: Final = 2
-# Seconds after its last use during which a directory is always kept.
+# The service never removes a cache directory within this time in seconds after its last use.
 _RECENT: Final = 600.0
-# Maximum seconds to wait for another process that compiles; then both compile, which is safe.
+# Maximum time in seconds to wait for another process that compiles. After it, both processes
+# compile. This is safe.
 _PATIENCE: Final = 600.0
 
 
 def sources(package: Path) -> list[Path]:
-    """Return the files whose code may be compiled: two packages, and modules with kernels."""
+    """Return the files whose code a kernel may contain.
+
+    These are all files of the packages in `_KERNELS`, and all modules that mention this module.
+    """
     paths = sorted(package.rglob("*.py"))
     return [
         path
@@ -58,7 +63,7 @@ def sources(package: Path) -> list[Path]:
 
 
 def digest(package: Path) -> str:
-    """Return 16 hexadecimal digits for the kernel sources, the compiler and the CPU."""
+    """Return a digest of the kernel sources, the compiler and the CPU: 16 hexadecimal digits."""
     versions = [version(name) for name in ("numba", "llvmlite", "numpy")]
     found = hashlib.sha256(repr((sys.version, versions, platform.machine(), _cpu())).encode())
     for path in [*sources(package), Path(__file__)]:
@@ -69,7 +74,7 @@ def digest(package: Path) -> str:
 
 
 def _cpu() -> str:
-    """Return the model and features of the processor, as far as the system reports them."""
+    """Return the model and the features of the CPU, as far as the operating system reports them."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
         return "".join(line for line in lines if line.startswith(("model name", "flags", "Feat")))
@@ -80,11 +85,12 @@ def _prepare(root: str) -> tuple[Path | None, str]:
     """Create the directory of compiled code.
 
     Args:
-        root: parent of the directories; "" for `.numba_cache` beside the package or, if that is not
-            usable, the user's cache directory.
+        root: parent of the directory. With "", the function tries `.numba_cache` beside the
+            package, then the user's cache directory.
 
     Returns:
-        The directory, or None if none is usable; and the reasons against the unusable ones.
+        The directory, or None if no directory is usable, and a text that gives the reason for each
+        unusable directory.
     """
     name, problems = f"loops-{digest(_PACKAGE)}", []
     roots = [Path(root)] if root else [_PACKAGE.parent / ".numba_cache", *_user_cache()]
@@ -111,7 +117,7 @@ def _user_cache() -> list[Path]:
 
 
 def _make_private(folder: Path) -> None:
-    """Create a directory that only this user can write to; raise OSError if that fails."""
+    """Create a directory that only this user can write to. If this fails, raise OSError."""
     folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     folder.mkdir(mode=0o700, exist_ok=True)
     own, root = folder.lstat(), folder.parent.stat()
@@ -119,10 +125,11 @@ def _make_private(folder: Path) -> None:
         raise NotADirectoryError(f"{folder} is not a directory")
     if own.st_uid != os.geteuid() or root.st_uid not in {os.geteuid(), 0}:
         raise PermissionError(f"{folder} or its parent belongs to another user")
-    # In a sticky directory such as /tmp, other users can add files but not replace our files.
+    # A parent with the sticky bit, such as /tmp, is safe: other users can add files to it, but
+    # cannot replace files of this user.
     is_open = root.st_mode & stat.S_IWOTH and not root.st_mode & stat.S_ISVTX
     if is_open or own.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise PermissionError(f"other users can write to {folder}")
+        raise PermissionError(f"other users can write to {folder} or to its parent")
     tempfile.TemporaryFile(dir=folder).close()
     os.utime(folder)
 
@@ -143,14 +150,14 @@ def _remove_old(current: Path) -> None:
 
 _FOLDER, _PROBLEM = _prepare(os.environ.get("NUMBA_CACHE_DIR", ""))
 if _FOLDER is not None:
-    # For child processes.
+    # Child processes read this variable.
     os.environ["NUMBA_CACHE_DIR"] = str(_FOLDER)
 
 from numba import config, njit  # noqa: E402
 from numba.core import event  # noqa: E402
 
 if _FOLDER is not None:
-    # numba may have been imported earlier with another value.
+    # numba reads the variable at its import, and the import may have happened earlier.
     config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 _LOOPS: Final[list[Any]] = []
@@ -158,7 +165,7 @@ _LOOPS: Final[list[Any]] = []
 
 def _compile(function: Function, **options: Any) -> Function:
     options |= {"cache": _FOLDER is not None, "nogil": True, "error_model": "numpy"}
-    # Kernels are never called from C.
+    # Only Python calls the kernels, so they need no wrapper for C.
     options["no_cfunc_wrapper"] = True
     found: Function = njit(**options)(function)
     _LOOPS.append(found)
@@ -166,36 +173,41 @@ def _compile(function: Function, **options: Any) -> Function:
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function; division by zero gives the hardware's result (infinity or NaN)."""
+    """Compile a function. Division by zero then gives infinity or NaN instead of an exception."""
     return _compile(function)
 
 
 def compiled_in_any_order(function: Function) -> Function:
-    """Compile a function whose sums the compiler may reorder, for vector instructions.
+    """Compile a function, and let the compiler reorder sums to use vector instructions.
 
-    The compiler chooses the order once, so results are reproducible. Such functions must not call
-    `elementary`, where the order of operations in exp and log matters.
+    The compiler chooses the order once, so results are reproducible. Such a function must not call
+    `elementary`, because exp and log depend on the order of their operations.
     """
     return _compile(function, fastmath={"reassoc", "contract"})
 
 
 def inlined(function: Function) -> Function:
-    """Inline a function into the compiled functions that call it, with their options."""
+    """Inline a function into each compiled function that calls it.
+
+    The compiler options of the caller then apply to the inlined code.
+    """
     found: Function = njit(inline="always", error_model="numpy")(function)
     return found
 
 
 def check_cache() -> None:
-    """Log the directory of compiled kernels, unless it is the usual directory."""
+    """Log the directory of compiled kernels, unless it is the first choice."""
     if _FOLDER is None:
-        _logger.warning("no directory for compiled kernels, each start compiles: %s", _PROBLEM)
+        _logger.warning(
+            "no directory for compiled kernels is usable, so each start compiles: %s", _PROBLEM
+        )
     elif _PROBLEM:
         _logger.info("compiled kernels are stored in %s: %s", _FOLDER, _PROBLEM)
 
 
 @contextmanager
 def progress() -> Iterator[None]:
-    """Log the compilation of kernels in the context; only one process compiles at a time."""
+    """Log each kernel that the ``with`` block compiles. Only one process compiles at a time."""
     if _FOLDER is None or (_FOLDER / "complete").exists():
         yield
         return
@@ -212,14 +224,14 @@ def progress() -> Iterator[None]:
 
 
 class _Progress(event.Listener):
-    """Log at most one line per second while kernels are compiled."""
+    """Listener that logs at most one line per second while numba compiles kernels."""
 
     def __init__(self) -> None:
         self._begun: set[int] = set()
         self._logged = float("-inf")
 
     def on_start(self, event: Any) -> None:
-        """Log the start of a compilation; ignore functions of numba itself."""
+        """Log the start of a compilation. Ignore functions of numba itself."""
         loop = event.data["dispatcher"]
         if not any(loop is known for known in _LOOPS):
             return
@@ -243,7 +255,7 @@ def _wait(descriptor: int) -> None:
                 _logger.info("waiting for another process that compiles the same kernels")
                 is_waiting = True
             time.sleep(0.1)
-        except OSError:  # a file system without locks
+        except OSError:  # the file system does not support locks
             return
         else:
             return

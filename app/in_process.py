@@ -1,4 +1,4 @@
-"""The service inside this process, as an httpx transport for a client."""
+"""An httpx transport that runs the service in the process of the client."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ from scene_client.schemas import FieldError
 
 
 class _Given(Settings):
-    """Settings that ignore environment variables, which configure separate services."""
+    """Settings that ignore environment variables.
+
+    The variables configure services that run in their own process.
+    """
 
     @classmethod
     def settings_customise_sources(
@@ -36,7 +39,7 @@ class _Given(Settings):
 
 
 class InProcess(httpx.BaseTransport):
-    """The application on its own event loop, in its own thread.
+    """Transport that runs the application on its own event loop in its own thread.
 
     Args:
         store: directory of published models.
@@ -69,21 +72,21 @@ class InProcess(httpx.BaseTransport):
         thread = Thread(target=_live, args=(app, started, ending), daemon=True, name="scene")
         thread.start()
         self._loop = started.result()
-        # Runs at the end of the program at the latest, so that the thread ends first.
+        # This ends the thread when the transport is closed or deleted, or at the program's exit.
         self._finalize = weakref.finalize(self, _end, self._loop, ending, thread)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """See `httpx.BaseTransport`."""
+        """Answer one request; see `httpx.BaseTransport`."""
         future = asyncio.run_coroutine_threadsafe(self._answer(request), self._loop)
         try:
             return future.result(request.extensions["timeout"]["read"])
         except TimeoutError:
             future.cancel()
-            raise httpx.ReadTimeout("no answer in time", request=request) from None
+            raise httpx.ReadTimeout("the answer did not come in time", request=request) from None
 
     async def _answer(self, request: httpx.Request) -> httpx.Response:
         response = await self._asgi.handle_async_request(request)
-        # The body can only be read on this event loop.
+        # Only this event loop can read the body.
         body = await response.aread()
         return httpx.Response(response.status_code, headers=response.headers, content=body)
 

@@ -17,7 +17,7 @@ which objects are missing, which objects do not belong, and what a similar scene
 Positions are in metres, in the axes of `frame_id`. Objects are named by their ids, or by their
 labels if only one object has the label. Robots with frequent scene changes can open a stream: the
 WebSocket `GET /stream` accepts updates and sends the newest answers (docs/stream.md).
-Every failure is a problem document (RFC 9457); programs can branch on its `type`.
+Every failure is a problem document (RFC 9457). Its `type` identifies the problem type.
 The figures in the examples are illustrations. Real figures depend on the model.
 """
 
@@ -26,7 +26,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     """Create the application of the service.
 
     Args:
-        settings: settings of the service; read from the environment if missing.
+        settings: settings of the service. With None, the function reads them from the environment.
 
     Raises:
         pydantic.ValidationError: the environment holds an invalid setting.
@@ -36,7 +36,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        # Load the models before the server accepts connections, so that clients need not wait.
+        # The server accepts connections only after the models are loaded.
         await runtime.start()
         yield
         runtime.stop()

@@ -20,11 +20,11 @@ from app.serving.runtime import Runtime
 from app.serving.stream import Streams
 from app.settings import Settings
 
-# Seconds that an idle connection is kept open. A proxy in front must close idle connections
-# earlier, or it may send a request on a connection that this server is closing.
+# The server closes a connection after this idle time in seconds. A proxy must close its idle
+# connections earlier. Otherwise it may send a request on a connection that the server is closing.
 KEEP_ALIVE: Final = 20
 
-# Minimum seconds that streams have for their last message.
+# Minimum time in seconds that streams have for their last message during a shutdown.
 LEAVE: Final = 0.3
 
 _logger = logging.getLogger("app.server")
@@ -33,16 +33,16 @@ _logger = logging.getLogger("app.server")
 class Server(uvicorn.Server):
     """A server that shuts down in three steps on SIGTERM.
 
-    First it refuses new requests, turns readiness off and closes the streams. After
-    ``drain_seconds``, in which load balancers notice the missing readiness, it closes the listening
-    socket. Then it finishes the requests in progress. A second signal, or Ctrl-C, skips the first
-    step.
+    First, the server refuses new requests, answers readiness checks with 503 and closes the
+    streams. Load balancers have ``drain_seconds`` to notice this. Then the server closes the
+    listening socket. Last, it finishes the requests in progress. A second signal, or Ctrl-C, skips
+    the wait of the first step.
 
     Args:
         config: configuration of uvicorn.
-        runtime: drained before the shutdown.
-        streams: drained before the shutdown.
-        drain_seconds: seconds from SIGTERM until the listening socket is closed.
+        runtime: the runtime, which refuses new requests during the shutdown.
+        streams: the open streams, which the server closes in the first step.
+        drain_seconds: time in seconds from SIGTERM until the server closes the listening socket.
         began: `time.monotonic()` at the start of the process.
     """
 
@@ -69,7 +69,7 @@ class Server(uvicorn.Server):
         """
         try:
             await super().startup(sockets)
-            # uvloop does not report that a socket cannot listen.
+            # uvloop does not report an error if a socket cannot listen.
             if not all(map(_listens, sockets or [])):
                 raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE))
         except OSError:
@@ -101,8 +101,8 @@ class Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
-        """Return whether to close the socket now; uvicorn calls this ten times per second."""
-        # Not in handle_exit(), because a signal handler can interrupt the event loop anywhere.
+        """Return whether to stop serving now. uvicorn calls this method ten times per second."""
+        # handle_exit() must not close streams: a signal can interrupt the event loop at any point.
         if self._runtime.draining:
             self._streams.drain()
         if self._closing_at is not None and monotonic() >= self._closing_at:
@@ -114,7 +114,7 @@ class Server(uvicorn.Server):
 def _listens(place: socket) -> bool:
     try:
         return place.getsockopt(SOL_SOCKET, SO_ACCEPTCONN) == 1
-    except OSError:  # closed
+    except OSError:  # the socket is closed
         return False
 
 
@@ -148,14 +148,14 @@ def build(settings: Settings, began: float) -> Server:
         log_config=log_config(settings.log_level, settings.log_format, settings.secrets),
         access_log=False,
         server_header=False,
-        # X-Forwarded-* is ignored: the service uses neither the client's address nor its scheme.
+        # The service uses neither the client's address nor its scheme, so it ignores X-Forwarded-*.
         proxy_headers=False,
         timeout_graceful_shutdown=settings.drain_timeout,
     )
     if settings.is_open:
         _logger.warning(
-            "SCENE_HOST admits other machines and SCENE_API_KEY is not set: every machine that "
-            "reaches port %d can use the service",
+            "SCENE_HOST gives other machines access and SCENE_API_KEY is not set, so every machine "
+            "that reaches port %d can use the service",
             settings.port,
         )
     return Server(config, app.state.runtime, app.state.streams, settings.drain_seconds, began)

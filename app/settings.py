@@ -16,7 +16,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from scene_client.schemas import MAX_RELATIONS
 
 MAX_OBJECTS = 256
-"""Maximum number of objects in a scene; a setting can lower it, but not raise it."""
+"""Upper limit of the setting ``SCENE_MAX_OBJECTS``."""
 
 
 _EXPORTER = ("opentelemetry.sdk.trace", "opentelemetry.exporter.otlp.proto.http")
@@ -26,7 +26,7 @@ _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT
 def _is_installed(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ModuleNotFoundError:  # its parent package is missing
+    except ModuleNotFoundError:  # the parent package is missing
         return False
 
 
@@ -39,7 +39,7 @@ def _words(value: object) -> object:
 
 
 LOOPBACK: Final = frozenset(("127.0.0.1", "localhost", "[::1]"))
-"""Names of this machine in a Host header."""
+"""Names in a Host header that mean the machine itself."""
 
 _ANY_HOST: Final = "*"
 _HOST: Final = re.compile(r"[a-z0-9_]([a-z0-9._-]*[a-z0-9_])?")
@@ -58,7 +58,7 @@ def _in_host_header(text: str) -> str:
 
 
 def _is_origin(text: str) -> bool:
-    """Return whether a browser would send exactly this text as the origin of a page."""
+    """Return whether a browser could send exactly this text as the Origin header."""
     try:
         parts = urlsplit(text)
         port = parts.port
@@ -72,10 +72,13 @@ def _is_origin(text: str) -> bool:
 
 
 class Settings(BaseSettings):
-    """The settings of an operator. The defaults are safe: loopback only, admin routes off.
+    """The settings of the service.
+
+    The defaults are safe: the service listens only on the loopback address, and the administration
+    routes refuse every request.
 
     Raises:
-        pydantic.ValidationError: a value is invalid; every message names its variable.
+        pydantic.ValidationError: a value is invalid. Each message names the environment variable.
     """
 
     model_config = SettingsConfigDict(
@@ -245,12 +248,12 @@ class Settings(BaseSettings):
 
     @property
     def secrets(self) -> list[str]:
-        """The keys, which logs must mask."""
+        """The configured keys. The log masks them."""
         return [key.get_secret_value() for key in (self.admin_key, self.api_key) if key]
 
     @property
     def accepted_hosts(self) -> frozenset[str] | None:
-        """Allowed names in a Host header, without ports; None if every name is allowed."""
+        """Allowed names in a Host header, without ports, or None if every name is allowed."""
         if _ANY_HOST in self.allowed_hosts:
             return None
         if self.allowed_hosts:
@@ -267,7 +270,7 @@ class Settings(BaseSettings):
     def _listens_everywhere(self) -> bool:
         try:
             return ip_address(self.host).is_unspecified
-        except ValueError:  # a name
+        except ValueError:  # the host is a name, not an address
             return False
 
     @field_validator("host")
@@ -286,8 +289,8 @@ class Settings(BaseSettings):
             return tuple(name if name == _ANY_HOST else _in_host_header(name) for name in value)
         except ValueError:
             raise ValueError(
-                "SCENE_ALLOWED_HOSTS must be *, or a list of names and addresses without scheme, "
-                "port and wildcard"
+                "SCENE_ALLOWED_HOSTS must be * or a list of names and addresses; a name must not "
+                "contain a scheme, a port or a wildcard"
             ) from None
 
     @field_validator("store")
@@ -302,7 +305,7 @@ class Settings(BaseSettings):
     def _covers_the_default(cls, value: int, info: ValidationInfo) -> int:
         if value < info.data.get("request_timeout_ms", 0):
             raise ValueError(
-                "SCENE_MAX_REQUEST_TIMEOUT_MS must not be below SCENE_REQUEST_TIMEOUT_MS"
+                "SCENE_MAX_REQUEST_TIMEOUT_MS must be at least SCENE_REQUEST_TIMEOUT_MS"
             )
         return value
 
@@ -316,9 +319,11 @@ class Settings(BaseSettings):
                 "SCENE_OPENTELEMETRY needs the packages of the dependency group telemetry "
                 "(pip install '.[telemetry]')"
             )
-        # Without an endpoint, FastAPI would start but never send a trace.
+        # Without an endpoint, the service would start but never send a trace.
         if not any(map(os.environ.get, _ENDPOINTS)):
-            raise ValueError(f"SCENE_OPENTELEMETRY needs {_ENDPOINTS[0]}, the URL of a collector")
+            raise ValueError(
+                f"SCENE_OPENTELEMETRY needs the URL of a collector: set {_ENDPOINTS[0]}"
+            )
         return value
 
     @field_validator("admin_key", "api_key")
@@ -327,7 +332,7 @@ class Settings(BaseSettings):
         if value is None:
             return None
         key = value.get_secret_value()
-        # A header must be able to carry the key, and a short key could be guessed.
+        # The key must be a valid header value. An attacker could guess a short key.
         if len(key) < 16 or not (key.isascii() and key.isprintable()) or " " in key:
             raise ValueError(
                 f"SCENE_{str(info.field_name).upper()} must have at least 16 printable ASCII "
@@ -352,7 +357,8 @@ class Settings(BaseSettings):
     def _are_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if not all(map(_is_origin, value)):
             raise ValueError(
-                "SCENE_CORS_ORIGINS must list origins as browsers send them: http or https, host "
-                "in lower case, port only if it is not the default port, without path and wildcard"
+                "SCENE_CORS_ORIGINS must list origins as browsers send them, such as "
+                "https://panel.example:8443: http or https, a host in lower case, and a port only "
+                "if it is not the default port; a path or wildcard is not allowed"
             )
         return value

@@ -1,4 +1,4 @@
-"""The HTTP layer: routes, problems, middleware, documentation."""
+"""The HTTP layer: routes, problem documents (RFC 9457), middleware and documentation pages."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def build(
     """Build the application that serves ``runtime`` over HTTP.
 
     Args:
-        settings: limits, keys, origins, pages.
+        settings: settings of the service, such as limits, keys and allowed origins.
         runtime: the models and the queue of requests.
         lifespan: starts and stops ``runtime``.
-        **metadata: title, description and version for the documentation.
+        **metadata: title, description and version of the API for the documentation.
     """
     app = openapi.DocumentedAPI(
         lifespan=lifespan,
@@ -65,7 +65,8 @@ def build(
     app.router.routes.extend(asked)
     for router in (
         stream.router,
-        # First: if several routes share a path, the first sets the Allow header of a 405.
+        # Before `models.router`: of several routes with one path, the first sets the Allow header
+        # of a 405 response.
         models.administration,
         models.changes,
         models.router,

@@ -20,15 +20,16 @@ from app.settings import Settings
 from scene_client.schemas import FieldError
 
 MAX_MEMBERS: Final = 32
-"""Maximum number of members of a JSON object; valid requests have fewer.
+"""Maximum number of members of a JSON object. Objects of valid requests have fewer members.
 
-The report about an unknown member takes a hundred times the memory of the member.
+The limit bounds the memory of error reports: each unknown member needs a report, and the report
+takes a hundred times the memory of the member.
 """
 
 SMALL: Final = 64 * 1024
-"""Maximum size in bytes of a body that is always accepted if it arrives in one piece.
+"""The service always accepts a body of at most this size in bytes if it arrives in one piece.
 
-So unfinished bodies of one client do not block the usual requests of other clients.
+So incomplete bodies of one client cannot block small requests of other clients.
 """
 
 
@@ -39,7 +40,7 @@ class Bodies:
         settings: settings of the service.
 
     Attributes:
-        held: bytes of the bodies of all requests in progress.
+        held: total size in bytes of the bodies of all requests in progress.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -49,10 +50,11 @@ class Bodies:
         self.held = 0
 
     async def read(self, receive: Receive) -> bytes:
-        """Read a whole body; the caller subtracts its length from `held` after the answer.
+        """Read a whole body. After the answer, the caller subtracts the body's length from `held`.
 
         Raises:
-            ProblemError: the body is too large, too slow or incomplete, or too many bytes are held.
+            ProblemError: the body is too large, too slow or incomplete, or the bodies of all
+                requests in progress are too large together.
         """
         body: bytes | bytearray = b""
         try:
@@ -92,17 +94,18 @@ class Bodies:
 
 
 def parse(body: bytes) -> Any:
-    """Parse one JSON value; accept only texts that all JSON parsers read alike.
+    """Parse one JSON value. Refuse texts that JSON parsers read in different ways.
 
-    Refused: encodings other than UTF-8, a byte order mark, NaN and Infinity, lone surrogates,
-    nesting deeper than 200, integers of more than 4,300 digits, duplicate names in an object.
+    The function refuses encodings other than UTF-8, a byte order mark, NaN and Infinity, lone
+    surrogates, nesting deeper than 200, integers of more than 4,300 digits, and duplicate names in
+    an object.
 
     Raises:
-        ProblemError: `catalogue.NOT_JSON` for such a text; `catalogue.INVALID_REQUEST` if an
-            object has more than `MAX_MEMBERS` members.
+        ProblemError: `catalogue.NOT_JSON` for a refused text, or `catalogue.INVALID_REQUEST` for an
+            object with more than `MAX_MEMBERS` members.
     """
     try:
-        # from_json() is strict, but only the decoder of the standard library sees repeated names.
+        # from_json() is strict, but only the decoder of the standard library finds duplicate names.
         from_json(body, allow_inf_nan=False)
         return _DECODER.decode(body.decode())
     except _TooManyMembersError:
@@ -113,7 +116,7 @@ def parse(body: bytes) -> Any:
         detail = "An object has two members with the same name."
         raise ProblemError(catalogue.NOT_JSON, detail) from None
     except ValueError as error:
-        # The message of the parser has the reason and the position, but no part of the input.
+        # The message of the parser contains the reason and the position, but never the input.
         detail = f"The body is not valid JSON: {error}."
         raise ProblemError(catalogue.NOT_JSON, detail) from None
 
@@ -150,10 +153,10 @@ def _is_json(content_type: bytes) -> bool:
 
 
 class JSONRoute(APIRoute):
-    """A route that validates a strict JSON body once and whose endpoint returns bytes.
+    """A route that parses and validates the JSON body itself. Its endpoint returns bytes.
 
-    FastAPI documents the route, but does not read the body: its parser is too lenient. The endpoint
-    receives the validated body as ``asked``, the HTTP request as ``http`` and the path parameters.
+    FastAPI only documents the route, because its JSON parser is too lenient. The endpoint receives
+    the validated body as ``asked``, the HTTP request as ``http`` and the path parameters.
     """
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -193,14 +196,14 @@ class JSONRoute(APIRoute):
             bodies.held -= len(body)
 
     def check(self, http: Request) -> None:
-        """Hook to refuse a request before its body is read; this class refuses none."""
+        """Subclasses may refuse a request here, before its body is read. Default: do nothing."""
 
 
 class AdminJSONRoute(JSONRoute):
     """A `JSONRoute` that requires the admin key."""
 
     def check(self, http: Request) -> None:
-        """See `check_admin`."""
+        """Check the admin key with `check_admin`."""
         check_admin(http)
 
 
@@ -208,7 +211,8 @@ def check_admin(http: Request) -> None:
     """Check that the request carries the admin key.
 
     Raises:
-        ProblemError: `catalogue.UNAUTHORIZED` without the key, or if no admin key is configured.
+        ProblemError: `catalogue.UNAUTHORIZED` if the request lacks the key, or if the service has
+            no admin key.
     """
     if not carries(http.headers, ADMIN_KEY, http.app.state.settings.admin_key):
         raise ProblemError(

@@ -11,10 +11,10 @@ class ProblemType:
     """A problem type (RFC 9457).
 
     Attributes:
-        slug: last segment of the ``type`` member. It never changes, so programs can branch on it.
+        slug: last segment of the ``type`` member. It never changes, so clients can compare it.
         status: HTTP status.
-        title: short summary, the same for every occurrence.
-        explanation: cause and remedy, shown on the page of the problem type.
+        title: short summary. All problems of this type have the same title.
+        explanation: cause and remedy. The page of the problem type shows this text.
     """
 
     slug: str
@@ -24,7 +24,7 @@ class ProblemType:
 
     @property
     def uri(self) -> str:
-        """The ``type`` member (RFC 9457, section 3.1.1)."""
+        """The ``type`` member of the problem document (RFC 9457, section 3.1.1)."""
         return f"/problems/{self.slug}"
 
 
@@ -55,26 +55,26 @@ HOST_REFUSED: Final = ProblemType(
     "host-refused",
     421,
     "The service does not answer to this host name",
-    "The Host header must be one of the names in SCENE_ALLOWED_HOSTS. The port is ignored. "
-    "The default names are 127.0.0.1, localhost, [::1] and the address in SCENE_HOST. "
-    "Add the name that your clients use. Health checks answer to every host name.",
+    "The Host header must be one of the names in SCENE_ALLOWED_HOSTS. The service ignores the port "
+    "in this header. The default names are 127.0.0.1, localhost, [::1] and the address in "
+    "SCENE_HOST. Add the name that your clients use. Health checks answer to every host name.",
 )
 UNAUTHORIZED: Final = ProblemType(
     "unauthorized",
     401,
     "A valid key is required",
-    "Administration routes need the admin key, as X-Admin-Key or as Authorization: Bearer. Without "
-    "SCENE_ADMIN_KEY the service refuses every administration request. With SCENE_API_KEY, the "
-    "other routes need that key, as X-API-Key or as Authorization: Bearer. Health checks and pages "
-    "such as this one are open.",
+    "Administration routes need the admin key in the header X-Admin-Key or Authorization: Bearer. "
+    "If SCENE_ADMIN_KEY is not set, the service refuses every administration request. If "
+    "SCENE_API_KEY is set, all other routes need that key in the header X-API-Key or "
+    "Authorization: Bearer. Health checks and HTML pages need no key.",
 )
 ORIGIN_REFUSED: Final = ProblemType(
     "origin-refused",
     403,
     "Pages of this origin may not send this request",
     "A browser asked whether a page of another origin may send a request. SCENE_CORS_ORIGINS lists "
-    "the allowed origins. Their pages may ask questions and read the models, but not administer "
-    "the service.",
+    "the allowed origins. Pages of these origins may ask questions and read the models. They may "
+    "not administer the service.",
 )
 NOT_FOUND: Final = ProblemType(
     "not-found",
@@ -86,7 +86,7 @@ MODEL_NOT_FOUND: Final = ProblemType(
     "model-not-found",
     404,
     "The model or version does not exist",
-    "Name a model by an alias, by its name (its newest version answers) or as name@version. "
+    "Name a model by an alias, by its name or as name@version. A name selects the newest version. "
     "GET /models lists all models, versions and aliases.",
 )
 METHOD_NOT_ALLOWED: Final = ProblemType(
@@ -99,21 +99,22 @@ ALIAS_CONFLICT: Final = ProblemType(
     "alias-conflict",
     409,
     "The alias does not point to the expected version",
-    "Another client has moved the alias. Read GET /models, decide again, and send the new "
-    "`expected`. The name of a model cannot be an alias either.",
+    "Another client has moved the alias. GET /models shows its new target. Send the request again "
+    "with this target as `expected`. An alias cannot have the name of a model either.",
 )
 MODEL_UNUSABLE: Final = ProblemType(
     "model-unusable",
     409,
     "An alias cannot point to this version",
-    "The version is in the store, but the service refused to load it. GET /models says why.",
+    "The version is in the store, but the service refused to load it. GET /models gives the "
+    "reason.",
 )
 REFRESH_REFUSED: Final = ProblemType(
     "refresh-refused",
     409,
     "The new state of the store was refused",
     "A version in the store failed its verification or its warm-up, or the target of an alias is "
-    "not usable. The service still serves the versions that it served before. "
+    "not usable. The service still serves the previous versions. "
     "`failures` lists each refused version or alias with the reason.",
 )
 STORE_NOT_WRITABLE: Final = ProblemType(
@@ -134,7 +135,8 @@ BODY_TOO_LARGE: Final = ProblemType(
     "body-too-large",
     413,
     "The body is too large",
-    "Send fewer scenes in one request. The limit is SCENE_MAX_BODY_BYTES, for chunked bodies too.",
+    "Send fewer scenes in one request. SCENE_MAX_BODY_BYTES sets the limit. The limit also applies "
+    "to chunked bodies.",
 )
 BODIES_FULL: Final = ProblemType(
     "bodies-full",
@@ -154,8 +156,9 @@ INVALID_REQUEST: Final = ProblemType(
     "invalid-request",
     422,
     "The request is not valid for this route",
-    "The body is JSON, but does not match the schema of this route. `errors` lists the errors. In "
-    "each, `pointer` is a JSON pointer into the body, and `suggestions` holds the nearest names.",
+    "The body is JSON, but does not match the schema of this route. `errors` lists the errors. "
+    "The `pointer` of an error is a JSON pointer into the body. `suggestions` lists the nearest "
+    "valid names.",
 )
 UNKNOWN_LABELS: Final = ProblemType(
     "unknown-labels",
@@ -163,8 +166,9 @@ UNKNOWN_LABELS: Final = ProblemType(
     "The model does not know some of the labels",
     "`errors` points at each unknown label and suggests the nearest known labels. With "
     "`unknown_labels` set to `ignore`, the service ignores unknown labels and lists them in "
-    "`ignored`. With `nearest`, it maps each to the most similar class and lists it in `mapped`. "
-    "It refuses a label without a similar class. GET /models/{name}/vocabulary lists every label.",
+    "`ignored`. With `nearest`, it maps each unknown label to the most similar class and lists it "
+    "in `mapped`. It refuses a label without a similar class. GET /models/{name}/vocabulary lists "
+    "every known label.",
 )
 CONTRADICTORY_EVIDENCE: Final = ProblemType(
     "contradictory-evidence",
@@ -178,51 +182,52 @@ ANSWER_TOO_LARGE: Final = ProblemType(
     422,
     "The answer would be too large",
     "The answer would exceed SCENE_MAX_ANSWER_BYTES. `errors` points at the parameter to lower: "
-    "`top_k`, `count` or the number of `objects`. Shorter ids help too. All scenes of a batch "
-    "share one limit. Send the refused scenes in another request.",
+    "`top_k`, `count` or the number of `objects`. Shorter ids also make the answer smaller. All "
+    "scenes of a batch share one limit. Send the refused scenes in another request.",
 )
 QUEUE_FULL: Final = ProblemType(
     "queue-full",
     429,
     "Too many requests are waiting",
     "The queue of requests (SCENE_QUEUE_REQUESTS) or the queue of this model's scenes "
-    "(SCENE_QUEUE_ROWS) is full. The service also refuses a request that would spend too much of "
-    "its time in the queue. The service did not start the computation. Send the request again "
-    "after the time in Retry-After.",
+    "(SCENE_QUEUE_ROWS) is full. The service also refuses a request that would wait in the queue "
+    "for too much of its time limit. The service did not start the computation. Send the request "
+    "again after the time in Retry-After.",
 )
 DEADLINE_PASSED: Final = ProblemType(
     "deadline-passed",
     504,
     "The deadline passed",
-    "The answer was not complete within the time of the request. X-Request-Timeout-Ms sets this "
-    "time; the default is SCENE_REQUEST_TIMEOUT_MS. The service has dropped the work.",
+    "The answer was not complete within the time limit of the request. X-Request-Timeout-Ms sets "
+    "this limit. The default is SCENE_REQUEST_TIMEOUT_MS. The service has stopped the computation.",
 )
 DRAINING: Final = ProblemType(
     "draining",
     503,
     "The service is shutting down",
     "The service finishes the requests in progress and refuses new requests. Send the request to "
-    "another instance, or again after the time in Retry-After.",
+    "another instance, or send it again after the time in Retry-After.",
 )
 NOT_READY: Final = ProblemType(
     "not-ready",
     503,
     "The service is not ready",
-    "Either the service is still starting, or its default model is not usable. GET /models says "
-    "why. Send the request again after the time in Retry-After.",
+    "Either the service is still starting, or its default model is not usable. GET /models gives "
+    "the reason. Send the request again after the time in Retry-After.",
 )
 MODEL_UNAVAILABLE: Final = ProblemType(
     "model-unavailable",
     503,
     "This model is not usable",
-    "The version is in the store, but the service refused to load it. GET /models says why. Other "
-    "models may still answer.",
+    "The version is in the store, but the service refused to load it. GET /models gives the "
+    "reason. Other models may still be usable.",
 )
 INTERNAL_ERROR: Final = ProblemType(
     "internal-error",
     500,
     "The service failed",
-    "This is a defect of the service. The log of the service has the details under the request id.",
+    "This is a defect of the service. Search the log of the service for the request id to find the "
+    "details.",
 )
 
 UPGRADE_REQUIRED: Final = ProblemType(
@@ -230,7 +235,8 @@ UPGRADE_REQUIRED: Final = ProblemType(
     426,
     "This route is for WebSockets",
     "GET /stream opens a WebSocket of version 13. Send its handshake as the first request of a "
-    "connection, or after the answers to all earlier requests. docs/stream.md describes the rest.",
+    "connection, or after the answers to all earlier requests. docs/stream.md describes the "
+    "protocol.",
 )
 TOO_MANY_STREAMS: Final = ProblemType(
     "too-many-streams",

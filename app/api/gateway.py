@@ -1,4 +1,4 @@
-"""The only ASGI middleware: ids, access log, metrics, hosts, origins, keys and admission."""
+"""The only ASGI middleware of the service. `Gateway` lists its steps."""
 
 from __future__ import annotations
 
@@ -36,11 +36,12 @@ OTHER: Final = "other"
 HEALTH: Final = ("/health/live", "/health/ready")
 """Suffixes of the paths that answer to every Host header.
 
-Orchestrators and load balancers use the address of a replica. They learn only yes or no.
+Orchestrators and load balancers send the address of a replica as Host header. The answer of a
+health check contains only its status.
 """
 
-# Paths without a key. Orchestrators check health without credentials. The pages are the same in
-# every installation and contain no data of it. docs/security.md gives the reasons.
+# Paths that need no key. Orchestrators check health without credentials. The pages are the same in
+# every installation and contain no private data. docs/security.md gives the reasons.
 OPEN_ROUTES: Final = frozenset(
     {
         "/health/live",
@@ -55,13 +56,14 @@ OPEN_ROUTES: Final = frozenset(
     }
 )
 _OPEN_FOLDERS: Final = ("/docs/", "/redoc/", "/static/", "/problems/")
-# Suffixes, because a proxy may leave a prefix in the path.
+# Suffixes of the paths without admission control. A proxy may leave a prefix in the path.
 _NOT_QUEUED: Final = (*HEALTH, "/metrics")
 
 _REQUEST_ID: Final = re.compile(rb"[A-Za-z0-9._~:-]{1,128}")
 _TIMEOUT: Final = re.compile(rb"[1-9][0-9]{0,5}")
 _HOST: Final = re.compile(rb"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?")
-# Methods of RFC 9110 and RFC 5789. Clients may send any other word, which metrics must not count.
+# Methods of RFC 9110 and RFC 5789. The metrics count all other methods as "-", because clients
+# could otherwise create any number of series.
 _METHODS: Final = frozenset(
     ("GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH")
 )
@@ -69,7 +71,7 @@ _SWITCHED: Final = 101
 # Close code of RFC 6455 for an internal error.
 _DEFECT: Final = 1011
 
-# With these headers, browsers do not guess the media type and send no Referer.
+# These headers stop browsers from guessing the media type and from sending a Referer.
 _ALWAYS: Final = (
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
@@ -81,21 +83,23 @@ _access = logging.getLogger("app.access")
 
 
 class Gateway:
-    """The steps of every request, in this order.
+    """Middleware that applies these steps to every request, in this order.
 
-    1. Request id: the response returns it as `X-Request-Id`, and the access log names it. A
-       client's own id is kept if it has 1 to 128 unreserved URI characters or colons.
-    2. Host header: it must name this service. Otherwise an attacker could point the name of a
-       page at this machine, and browsers would treat both as one origin (DNS rebinding).
+    1. Request id: the response contains the id as `X-Request-Id`, and the access log contains it
+       too. The client may choose an id of 1 to 128 unreserved URI characters or colons.
+    2. Host header: the header must name this service. This check prevents DNS rebinding, where
+       an attacker points the host name of a web page at this machine.
     3. Origin: pages of other origins get an answer only if the settings list the origin.
-    4. Key: with an API key configured, the request needs this key or the admin key.
-    5. Admission: the request gets a deadline and waits in the backlog until it may start.
+    4. Key: if the settings contain an API key, the request needs this key or the admin key.
+    5. Admission: the gateway sets a deadline, and the request waits in the backlog until it may
+       start.
 
     Args:
         app: the application.
         settings: settings of the service.
         runtime: owner of the backlog and the metrics.
-        direct: routes by path that bypass the router of the framework, which takes 15 µs.
+        direct: maps paths to routes that bypass the router of the framework. The router takes
+            15 µs.
     """
 
     def __init__(
@@ -164,7 +168,7 @@ class Gateway:
         return (host is not None and host[1] in (self._hosts or ())) or path.endswith(HEALTH)
 
     async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check key and size, wait for admission, and answer every failure."""
+        """Check the key and the size of a request, wait for admission, and answer every failure."""
         try:
             if self._settings.api_key is not None and not self._may_enter(scope):
                 raise ProblemError(
@@ -214,7 +218,7 @@ class Gateway:
             await send({"type": "websocket.close", "code": _DEFECT})
 
     def _draining(self) -> ProblemError:
-        # Without this header a client would send its next request on the same connection.
+        # Without the Connection header, a client would send its next request on this connection.
         return ProblemError(
             catalogue.DRAINING,
             "The service finishes the requests in progress and then stops.",
@@ -239,7 +243,7 @@ class Gateway:
 
     def _check_size(self, value: bytes) -> None:
         limit = self._settings.max_body_bytes
-        # Most servers check the header. len() guards int() against very long numbers.
+        # The limit on len() protects int() from very long numbers.
         if value.isdigit() and (len(value) > 18 or int(value) > limit):
             raise too_large(limit)
 
@@ -264,7 +268,7 @@ class Gateway:
                 **record.known(),
             }
             message = f"{method} {route} {status} {seconds * 1e3:.2f} ms"
-            # Faster than `_access.info`, which searches for the line of its caller.
+            # `_access.info` is slower, because it searches the stack for its caller.
             _access.handle(
                 _access.makeRecord(
                     "app.access", logging.INFO, "", 0, message, (), None, extra={"entry": entry}
@@ -289,17 +293,18 @@ def too_large(limit: int) -> ProblemError:
 
 
 def carries(headers: Headers, name: str, expected: SecretStr | None) -> bool:
-    """Return whether a request carries a key, in its own header or else as a bearer token.
+    """Return whether a request carries a key, in the header ``name`` or else as a bearer token.
 
     Args:
         headers: headers of the request.
         name: name of the header for the key.
-        expected: the configured key; without one the result is False.
+        expected: the configured key. With None, the result is False.
     """
     scheme, _, token = headers.get("authorization", "").partition(" ")
     given = headers.get(name) or (token.strip() if scheme.lower() == "bearer" else "")
     secret = expected.get_secret_value() if expected else ""
-    # Constant time, and always compared: the response time must not reveal the key or its presence.
+    # The comparison takes constant time and always runs, because the response time must not reveal
+    # the key, or whether a key is configured.
     equal = hmac.compare_digest(given.encode(), secret.encode())
     return equal and bool(secret)
 
@@ -316,7 +321,8 @@ class CrossOrigin(CORSMiddleware):
         super().__init__(
             app,
             allow_origins=origins,
-            # No PUT and no admin key header: administration is for the command line only.
+            # PUT and the admin key header are missing, because pages must not administer the
+            # service.
             allow_methods=("GET", "POST"),
             allow_headers=(
                 "Authorization",
@@ -332,7 +338,7 @@ class CrossOrigin(CORSMiddleware):
         """Answer a preflight request (CORS).
 
         Raises:
-            ProblemError: `catalogue.ORIGIN_REFUSED`.
+            ProblemError: `catalogue.ORIGIN_REFUSED` if the service does not allow the request.
         """
         response = super().preflight_response(request_headers)
         if response.status_code != 200:
@@ -347,8 +353,9 @@ class CrossOrigin(CORSMiddleware):
 def may_connect(headers: Headers, origins: Sequence[str]) -> bool:
     """Return whether a client may open a WebSocket.
 
-    Allowed are pages of the service, pages of the listed origins, and clients without an Origin
-    header. Browsers send no preflight for WebSockets, but a page cannot change its Origin header.
+    The function accepts pages of the service, pages of the listed origins, and clients without an
+    Origin header. Browsers send no preflight request for a WebSocket, so the Origin header is the
+    only protection. A page cannot change this header.
 
     Args:
         headers: headers of the handshake.

@@ -1,6 +1,6 @@
-"""Liveness and readiness, on own routes and on those of the Open Inference Protocol.
+"""Liveness and readiness, on `/health` routes and on the routes of the Open Inference Protocol.
 
-A process is live if it answers. It is ready if its default model has answered a real question in
+A process is live if it answers. It is ready if its default model has answered a question during
 the warm-up.
 """
 
@@ -30,7 +30,7 @@ _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MOD
 
 @router.get("/health/live", summary="Is the process alive?", responses=problems())
 async def health_live() -> Health:
-    """Status 200 while the process runs, whatever the state of its models."""
+    """Status 200 while the process runs, even if its models are not usable."""
     return Health(status="live")
 
 
@@ -49,20 +49,20 @@ async def server_metadata() -> ServerMetadata:
 
 @protocol.get("/health/live", summary="Is the process alive?", responses=problems())
 async def server_live() -> ServerLive:
-    """As `GET /health/live`."""
+    """Same check as `GET /health/live`."""
     return ServerLive(live=True)
 
 
 @protocol.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
 async def server_ready(runtime: RuntimeDep) -> ServerReady:
-    """As `GET /health/ready`."""
+    """Same check as `GET /health/ready`."""
     runtime.check_ready()
     return ServerReady(ready=True)
 
 
 @protocol.get("/models/{name}", summary="Model metadata", responses=_NO_MODEL)
 async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
-    """Versions and variant of a model, named by an alias, `name` or `name@version`."""
+    """Versions and variant of a model. Name the model by an alias, `name` or `name@version`."""
     models = runtime.models
     reference = models.resolve(name).reference
     return ModelMetadata(
@@ -74,6 +74,6 @@ async def model_metadata(name: Reference, runtime: RuntimeDep) -> ModelMetadata:
 
 @protocol.get("/models/{name}/ready", summary="Is this model usable?", responses=_NO_MODEL)
 async def model_ready(name: Reference, runtime: RuntimeDep) -> ModelReady:
-    """Status 200 when the model answers."""
+    """Status 200 if the model is usable, else 404 or 503."""
     model = runtime.models.resolve(name)
     return ModelReady(name=model.reference.name, ready=True)

@@ -38,14 +38,14 @@ Reference = Annotated[
 ]
 Version = Annotated[str, Path(description="a version that GET /models lists")]
 
-# For the documentation only. The routes check the key themselves, before they read the body.
+# These schemes are only for the documentation. The routes check the key before they read the body.
 _SCHEMES: Final = [
     Security(APIKeyHeader(name=ADMIN_KEY, scheme_name="admin-key", auto_error=False)),
     Security(HTTPBearer(scheme_name="admin-key-as-bearer-token", auto_error=False)),
 ]
 
 
-# A coroutine, because FastAPI runs plain functions in a thread, which costs 100 µs.
+# This is a coroutine, because FastAPI runs plain functions in a thread. The thread costs 100 µs.
 async def _runtime(http: Request) -> Runtime:
     runtime: Runtime = http.app.state.runtime
     return runtime
@@ -70,7 +70,7 @@ changes = APIRouter(
     response_model_exclude_none=True,
 )
 async def list_models(runtime: RuntimeDep) -> ModelList:
-    """All models, versions and aliases of the store, with a reason for each refused version."""
+    """All models, versions and aliases of the store. Each refused version has a reason."""
     return describe.everything(runtime.models)
 
 
@@ -87,20 +87,20 @@ async def show_model(name: Reference, runtime: RuntimeDep) -> ModelSummary:
     response_model_exclude_none=True,
 )
 async def show_version(name: Reference, version: Version, runtime: RuntimeDep) -> VersionDetails:
-    """Metrics, training data, terms and card of a version; for a refused version, the reason."""
+    """Metrics, training data, terms of use and model card of a version, or why it was refused."""
     return describe.version(runtime.models, name, version)
 
 
 @router.get("/{name}/vocabulary", summary="The vocabulary of a model", responses=_USABLE)
 async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> VocabularyAnswer:
-    """Object classes with their aliases, relations and room types."""
+    """Object classes with their aliases, spatial relations, and room types of a model."""
     return describe.vocabulary(runtime.models.resolve(name))
 
 
 @router.get("/{name}/contexts", summary="The hidden units of a model", responses=_USABLE)
 async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
-    """Hidden units with their strongest objects; `context` of `/generate` uses their numbers."""
-    # In a thread, because the first call takes 0.2 s.
+    """Hidden units with their strongest objects. `context` of `/generate` takes their numbers."""
+    # This runs in a thread, because the first call takes 0.2 s.
     return await asyncio.to_thread(describe.contexts, runtime.models.resolve(name))
 
 
@@ -113,7 +113,8 @@ async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
 async def refresh_models(http: Request) -> RefreshAnswer:
     """Load, verify and warm up all versions in the store, then replace all served models at once.
 
-    The models served now answer in the meantime. If a new model fails, they stay in place.
+    The previous models answer in the meantime. If a new model fails, the service keeps the previous
+    models.
     """
     check_admin(http)
     runtime: Runtime = http.app.state.runtime

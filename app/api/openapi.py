@@ -32,7 +32,7 @@ _ERRORS: Final = {
     catalogue.CONTRADICTORY_EVIDENCE: [
         FieldError(
             pointer="#/relations/1",
-            message="contradicts an earlier relation of this pair, which is the opposite",
+            message="this relation contradicts an earlier relation of the same two objects",
         )
     ],
 }
@@ -52,7 +52,7 @@ TAGS: Final = [
 
 
 def problems(*kinds: ProblemType) -> Responses:
-    """Return the ``responses`` of a route with these problems and the internal error."""
+    """Return the ``responses`` of a route that may answer these problems or an internal error."""
     responses: Responses = {}
     for kind in (*kinds, catalogue.INTERNAL_ERROR):
         response = responses.setdefault(
@@ -87,7 +87,7 @@ def queued(*kinds: ProblemType) -> Responses:
 
 
 def described(example: Example) -> dict[str, Any]:
-    """An example request as an Example Object."""
+    """Return an example request as an Example Object of OpenAPI."""
     if example.problem is None:
         return {"summary": example.summary, "value": example.value}
     problem = catalogue.PROBLEM_TYPES[example.problem]
@@ -104,7 +104,7 @@ def operation_id(route: APIRoute) -> str:
 
 
 def _state_whole_numbers(node: Any) -> None:
-    """Write the bounds of integers as integers; FastAPI writes floats, which round the largest."""
+    """Write the bounds of integers as integers. FastAPI writes floats, which round large bounds."""
     if isinstance(node, dict):
         if node.get("type") == "integer":
             for bound in ("minimum", "maximum"):
@@ -121,7 +121,7 @@ class DocumentedAPI(FastAPI):
     """FastAPI with an OpenAPI document that describes the real answers of the service."""
 
     def openapi(self) -> dict[str, Any]:
-        """Return FastAPI's document with examples, and with problems for its validation errors."""
+        """Return FastAPI's document, with examples, and with problems as its error responses."""
         if self.openapi_schema is None:
             document = super().openapi()
             schemas = document["components"]["schemas"]
@@ -156,8 +156,8 @@ def _timeout_parameter(most: int) -> dict[str, Any]:
         "name": TIMEOUT_HEADER,
         "in": "header",
         "required": False,
-        "description": "time in milliseconds that the client waits for the answer; after it, the "
-        "service answers 504",
+        "description": "time limit of the request in milliseconds; after this time, the service "
+        "answers 504",
         "schema": {"type": "integer", "minimum": 1, "maximum": most},
         "examples": {"second": {"summary": "one second", "value": min(1000, most)}},
     }

@@ -1,7 +1,7 @@
-"""HTML pages: the board, the interactive documentation and a page for each problem type.
+"""HTML pages: the scene editor (board), the API documentation and a page for each problem type.
 
 The Content-Security-Policy of each page lets a browser load files from this service only. So a
-forgotten link to another host fails, and that host learns nothing about the readers.
+page cannot contact another host by mistake.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ STATIC: Final = Path(__file__).parents[1] / "static"
 _BOARD: Final = "board.html"
 _VENDOR: Final = "vendor/"
 
-# Swagger UI and Redoc use inline styles, and Redoc searches in a worker made from a blob. Inline
-# scripts stay forbidden.
+# Swagger UI and Redoc need inline styles. The search of Redoc runs in a web worker that Redoc
+# creates from a blob. Inline scripts stay forbidden.
 _POLICY: Final = "; ".join(
     (
         "default-src 'none'",
@@ -42,7 +42,7 @@ _POLICY: Final = "; ".join(
 )
 _HEADERS: Final = {"Content-Security-Policy": _POLICY}
 
-# Policy of the board, which has no inline styles.
+# Policy of the scene editor (board.html). Its page has no inline styles.
 _STRICT_POLICY: Final = "; ".join(
     (
         "default-src 'none'",
@@ -104,16 +104,18 @@ async def show_problem_type(slug: str) -> HTMLResponse:
 
 
 class Assets(StaticFiles):
-    """Static files with entity tags; files of a vendored library never change.
+    """Static files with entity tags.
 
-    The folder of such a library names its version.
+    Browsers may cache the files of vendored libraries for a year. They never change, because the
+    folder name of a library contains its version.
     """
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         """Return a file, or 304 if the browser already has it."""
         response = await super().get_response(path, scope)
         if response.status_code in {200, 304}:
-            # Without "no-cache" a browser could mix modules of two releases.
+            # "no-cache" makes the browser check each file for a newer version. Otherwise it could
+            # mix JavaScript modules of two releases.
             kept = path.startswith(_VENDOR)
             response.headers["Cache-Control"] = (
                 "public, max-age=31536000, immutable" if kept else "no-cache"
@@ -122,7 +124,7 @@ class Assets(StaticFiles):
 
 
 def install(app: FastAPI, *, docs: bool) -> None:
-    """Serve the pages and their assets; ``docs`` False leaves out /, /docs and /redoc."""
+    """Serve the pages and their assets. With ``docs`` False, omit /, /docs and /redoc."""
     app.include_router(problems)
     static = Assets(directory=STATIC)
     app.mount("/static", static, name="static")

@@ -1,4 +1,7 @@
-"""Failures as problem details (RFC 9457), without traceback, file name or copy of the input."""
+"""Problem documents (RFC 9457) for all failures.
+
+A problem document never contains a traceback, a file name or a copy of the input.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,8 @@ from scene_client.validation import MAX_ERRORS, field_errors, pointer
 
 MEDIA_TYPE: Final = "application/problem+json"
 
-# ASGI extension: with it, the server can refuse a handshake with any response, not only with 403.
+# With this ASGI extension, the server can refuse a handshake with any response. Without the
+# extension, the response is always 403.
 _DENIAL: Final = "websocket.http.response"
 
 _logger = logging.getLogger("app.api")
@@ -61,8 +65,8 @@ _OF_REASON: Final = {
 class ProblemError(HTTPException):
     """A failure with its problem type.
 
-    It extends `HTTPException` because Starlette wraps all other exceptions that are raised while a
-    body is read.
+    It extends `HTTPException`, because Starlette wraps all other exceptions that occur while it
+    reads a body.
     """
 
     def __init__(
@@ -94,11 +98,11 @@ class ProblemError(HTTPException):
 
 
 def from_exception(error: Exception, *, at: Location = ()) -> ProblemError:
-    """Return the problem for an exception; an unexpected exception gives an internal error.
+    """Return the problem for an exception. For an unexpected one, it is an internal error.
 
     Args:
         error: the raised exception.
-        at: position of the failing request in the body, for an entry of a batch.
+        at: location of the failing request in the body, for an entry of a batch.
     """
     match error:
         case ProblemError():
@@ -161,9 +165,9 @@ def unfit(
     """Return the problem for a body that does not match its schema.
 
     Args:
-        error: the error of the validation.
+        error: the validation error.
         body: the validated value.
-        at: position of ``body`` in the request.
+        at: location of ``body`` in the request, for an entry of a batch.
     """
     faults = error.errors()
     # FastAPI puts "body" in front of each location.
@@ -200,7 +204,7 @@ def respond(request: HTTPConnection, problem: ProblemError) -> Response:
 async def answer(problem: ProblemError, scope: Scope, receive: Receive, send: Send) -> None:
     """Answer a request, or the handshake of a WebSocket, with a problem."""
     if scope["type"] == "websocket" and _DENIAL not in scope.get("extensions", {}):
-        # Closing before the stream is accepted: the server answers the handshake with 403.
+        # The server answers the handshake with 403 if the stream closes before it is accepted.
         await send({"type": "websocket.close", "code": 1008})
     else:
         await respond(HTTPConnection(scope), problem)(scope, receive, send)
@@ -214,10 +218,10 @@ Handler = Callable[[Request, Exception], Any]
 
 
 def install(app: FastAPI) -> None:
-    """Answer failures of ``app`` with problems, in place of the handlers of the framework.
+    """Replace the exception handlers of the framework by handlers that answer with problems.
 
-    `app.api.gateway.Gateway` answers unexpected exceptions. The framework would raise them again
-    after its answer, and the server would then close a connection that the client may reuse.
+    `app.api.gateway.Gateway` answers unexpected exceptions. The framework would raise such an
+    exception again after its answer. The server would then close the connection.
     """
     for kind in (HTTPException, RequestValidationError, ServingError):
         app.add_exception_handler(kind, _handle)

@@ -1,4 +1,4 @@
-"""The WebSocket ``GET /stream``: scene updates in, answers out (docs/stream.md)."""
+"""The WebSocket ``GET /stream``: clients send scene updates and get answers (docs/stream.md)."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from scene_client.stream_messages import (
 
 PATH: Final = "/stream"
 READING_SHARE: Final = 0.2
-"""Share of a core for reading the messages of one stream; beyond it, reading slows down.
+"""Maximum share of one core that the service uses to read the messages of one stream.
 
-The limit is in time, not in messages: a small update takes 0.05 ms, but an invalid update of
-256 objects takes 36 ms.
+Above this share, the service reads the stream more slowly. The limit applies to processor time,
+because a small update takes 0.05 ms, but an invalid update of 256 objects takes 36 ms.
 """
 READING_BURST: Final = 1.0
-"""Processor seconds that a stream may use for reading in one burst."""
+"""Processor time in seconds that the service may spend on one burst of messages of a stream."""
 LEAST_COST: Final = 0.25e-3
-"""Minimum cost of a message in seconds, for its frame and the answer to it."""
+"""Minimum time in seconds that a message costs. It covers the frame and the answer."""
 
 Closing = tuple[int, str]
 """Code and reason of a close frame (RFC 6455, section 7.4)."""
@@ -95,8 +95,8 @@ def _refusal(connection: HTTPConnection, streams: Streams) -> ProblemError | Non
 class _Conversation:
     """One open stream, with a task that reads messages and a task that sends answers.
 
-    Answers are never queued. Messages that arrive while an answer is computed or sent update the
-    scene, and the next answer covers all of them.
+    The service never queues answers. While it computes or sends an answer, new messages only update
+    the scene. The next answer covers all these messages.
     """
 
     def __init__(self, socket: WebSocket) -> None:
@@ -117,7 +117,7 @@ class _Conversation:
         self._due.set()
 
     async def run(self) -> None:
-        """Read and answer until one of the two tasks ends."""
+        """Run the two tasks until one of them ends, then close the stream."""
         listening = asyncio.create_task(self._listen())
         answering = asyncio.create_task(self._answer())
         closing = None
@@ -142,7 +142,8 @@ class _Conversation:
         bucket = TokenBucket(READING_SHARE, READING_BURST)
         settings = self._settings
         while True:
-            # Before `open`, the timeout is short: an idle connection occupies one of the streams.
+            # Before the message `open`, the timeout is short, because each connection counts
+            # towards the maximum number of streams.
             patience = settings.stream_idle if self._is_open else settings.client_timeout
             try:
                 async with asyncio.timeout(patience):
@@ -156,11 +157,11 @@ class _Conversation:
             began = thread_time()
             await self._hear(event)
             cost = max(LEAST_COST, thread_time() - began)
-            # A packet may hold many messages. Let other tasks run between them.
+            # A packet may hold many messages. The sleep lets other tasks run between the messages.
             await asyncio.sleep(bucket.take(cost))
 
     async def _hear(self, event: Mapping[str, Any]) -> None:
-        """Carry out one message, or send a problem."""
+        """Process one message. If this fails, send a problem."""
         kind, seq, outcome = "-", None, SUCCESS
         try:
             value, kind, seq = _parsed(event)
@@ -179,7 +180,7 @@ class _Conversation:
             return
         is_first = isinstance(command, Open)
         if is_first == self._is_open:
-            raise _unfit("the first message must be open, and later messages must not be open")
+            raise _unfit("the first message must have type open, and later messages another type")
         self._check_deadline(command)
         self._scene.take(command, self._request())
         if is_first:
@@ -225,7 +226,10 @@ class _Conversation:
             await self._send(written(message).decode())
 
     def _request(self) -> Request:
-        """Return a request on the current snapshot, so that a promoted model answers at once."""
+        """Return a request on the current snapshot of the models.
+
+        So the next answer already uses the new target of an alias.
+        """
         timeout = self._scene.timeout_ms or self._settings.request_timeout_ms
         return self._runtime.request(monotonic() + timeout / 1e3, self._request_id, self._record)
 
@@ -235,7 +239,7 @@ class _Conversation:
         await self._send(message.model_dump_json(exclude_none=True))
 
     async def _send(self, text: str) -> None:
-        """Send a message; a client that does not read it in time counts as disconnected."""
+        """Send a message. If the client does not read it in time, it counts as disconnected."""
         try:
             async with asyncio.timeout(self._settings.client_timeout):
                 await self._socket.send_text(text)
@@ -244,7 +248,10 @@ class _Conversation:
 
 
 def _parsed(event: Mapping[str, Any]) -> tuple[Any, str, int | None]:
-    """Return a message, its type ("-" if missing or unknown) and its number, if that is valid."""
+    """Parse a message. Return its value, its type and its sequence number.
+
+    The type is "-" if it is missing or unknown. The number is None if it is missing or invalid.
+    """
     text = event.get("text")
     if text is None:
         raise ProblemError(catalogue.UNSUPPORTED_MEDIA_TYPE, "Send JSON in text frames.")

@@ -1,7 +1,7 @@
-"""Traces for OpenTelemetry: the spans of FastAPI, off by default.
+"""Traces for OpenTelemetry: FastAPI creates the spans. Traces are off by default.
 
-Only traces are exported. Metrics go to Prometheus (`app/serving/metrics.py`). Log records would
-carry exception messages to another system.
+The service exports only traces. Prometheus reads the metrics (`app/serving/metrics.py`). The
+service exports no log records, because they contain exception messages.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from fastapi.telemetry import TelemetryConfig
 from app import __version__
 
 _SERVICE: Final = "scene-boltzmann"
-# Machines poll these paths every few seconds. Their spans would outnumber all other spans.
+# Orchestrators and Prometheus poll these paths every few seconds, and pages load static files.
+# Spans of these requests would outnumber all other spans.
 _UNTRACED: Final = ("/health", "/v2/health", "/metrics", "/static")
-# FastAPI copies these attributes from the request without a check.
+# FastAPI copies these attributes unchecked from the request, so they may contain private data.
 _MADE_UP: Final = ("url.path", "url.query", "http.request.method_original")
 _REDACTED: Final = "REDACTED"
 
 
 def configuration(*, enabled: bool) -> TelemetryConfig:
-    """Return the telemetry configuration of `FastAPI`; if off, no provider is looked up.
+    """Return the telemetry configuration for `FastAPI`.
 
     The variables of OpenTelemetry (``OTEL_EXPORTER_OTLP_ENDPOINT`` and others) set the destination
     of the spans. `Settings` has checked that the packages are installed.
@@ -36,7 +37,7 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
     from opentelemetry.sdk.trace import Span, SpanProcessor, TracerProvider
 
     class Redaction(SpanProcessor):
-        """Redact attributes with text from the client; `http.route` still names the route."""
+        """Redact attributes with text from the client. `http.route` still names the route."""
 
         def on_start(self, span: Span, parent_context: Context | None = None) -> None:
             for name in _MADE_UP:
@@ -51,7 +52,7 @@ def configuration(*, enabled: bool) -> TelemetryConfig:
         tracing=True,
         metrics=False,
         logs=False,
-        # The exporter starts with the application, in the worker process.
+        # The exporter starts together with the application, in the worker process.
         auto_configure=True,
         tracer_provider=provider,
         exclude=_is_untraced,

@@ -1,7 +1,8 @@
-"""Compiled kernels of one Gibbs chain over contexts and objects.
+"""Compiled kernels of one Gibbs chain over hidden units and objects.
 
-`chains` has the formulas. Each function works on one chain and receives its random numbers, uniform
-on [0, 1), so a chain is independent of other chains. `beta` is 1 / temperature.
+The module `chains` has the formulas. Each function works on one chain. It receives random numbers
+for this chain, uniform on [0, 1). So a chain is independent of other chains. `beta` is
+1 / temperature.
 """
 
 from __future__ import annotations
@@ -12,7 +13,10 @@ from app.compiling import compiled, compiled_in_any_order, inlined
 from app.inference.elementary import exp, log, logistic
 
 PROPOSALS = 8
-"""Number of blocks in which h1 is proposed if relations are observed."""
+"""Number of blocks of h1 in a Metropolis–Hastings update.
+
+With observed relations, a sweep proposes new values for one block of h1 after the other.
+"""
 
 
 @inlined
@@ -22,14 +26,14 @@ def _softplus(x):
 
 @compiled
 def _bernoulli(logits, beta, uniform, on):
-    """Sample on = 1 with probability sigmoid(beta logits)."""
+    """Set each on[i] to 1 with probability sigmoid(beta logits[i]), else to 0."""
     for i in range(len(logits)):
         on[i] = uniform[i] < logistic(beta * logits[i])
 
 
 @compiled
 def _add_rows(rows, on, total):
-    """Add the rows where on (n,) is 1 to total, four rows at a time."""
+    """Add each row with on[row] = 1 to total, four rows at a time. on has the shape (n,)."""
     which, count = np.empty(len(on), np.int64), 0
     for i in range(len(on)):
         which[count] = i
@@ -47,16 +51,18 @@ def _add_rows(rows, on, total):
 
 @compiled
 def sweeps(w, bias, always, held, held2, observed, beta, uniform, on, h1, h2):
-    """Run Gibbs sweeps over h1 (H1,), h2 (H2,) and on (V,), uint8, in place.
+    """Run Gibbs sweeps that change the arrays h1, h2 and on in place.
 
     Args:
         w: `chains.Arrays`.
         bias: (H1,) bias of h1.
-        always, held, held2: (V,), (H1,), (H2,) uint8, classes and hidden units that stay on.
+        always: (V,) uint8, 1 for classes that stay present.
+        held, held2: (H1,) and (H2,) uint8, 1 for hidden units that stay on.
         observed: observed relations, `chains.Observed`.
         beta: 1 / temperature.
         uniform: (sweeps, V + 2 H1 + H2 + PROPOSALS) random numbers.
-        on, h1, h2: presence of the classes and states of the hidden units; changed in place.
+        on: (V,) uint8, presence of the classes.
+        h1, h2: (H1,) and (H2,) uint8, states of the hidden units.
     """
     V, H1 = w.W.shape
     H2 = len(h2)
@@ -85,7 +91,10 @@ def sweeps(w, bias, always, held, held2, observed, beta, uniform, on, h1, h2):
 
 @compiled
 def _propose(w, x, held, observed, beta, h1, blocks, uniform):
-    """Update h1 given objects and observed relations: propose block by block from p(h1 | v)."""
+    """Update h1 given objects and observed relations, by Metropolis–Hastings.
+
+    Proposals come from the conditional of h1 without relations, block by block.
+    """
     H1 = len(x)
     proposal, block = np.empty(H1, np.uint8), np.empty(H1, np.int64)
     _bernoulli(x, beta, uniform, proposal)
@@ -118,7 +127,7 @@ def _propose(w, x, held, observed, beta, h1, blocks, uniform):
 
 @compiled
 def _observed_weight(through, observed, beta, terms):
-    """Compute log p(observed r | v, h1)."""
+    """Compute the log-probability of the observed relations, log p(r | v, h1)."""
     _observed_logits(through.reshape(-1, observed.z.shape[1]), observed, terms)
     for e in range(len(terms)):
         logit = beta * terms[e]

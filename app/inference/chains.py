@@ -1,19 +1,19 @@
 """Sampling of scenes by Gibbs chains, each with its own random stream.
 
-For machines in the local form. A chain starts at a stored scene and makes its sweeps over h1, h2
-and v. With observed relations, h1 is sampled by Metropolis–Hastings. Relations are sampled once, at
-the end, because in the local form they do not act on the other units.
+The module supports machines in the local form. A chain starts at a stored scene and makes sweeps
+over h1, h2 and v. With observed relations, a chain samples h1 by Metropolis–Hastings. It samples
+relations once, at the end, because in the local form they do not act on the other units.
 
-The stored scene is sampled with these weights given the evidence,
+The start of a chain is a random stored scene. Its weight, given the evidence, is
 
     log w = sum_{i given} log p(v_i = 1 | h1) + sum_{k held} log p(h1_k = 1)
             - 6 [sampled under another room type than t],
 
-with h1 at its mean given the scene. If the store has no scene of room type t, the last term is
-h1·Q[t].
+where h1 is the mean of the hidden units given the stored scene, and t is the requested room type.
+If the machine stores no scene of room type t, the last term is h1·Q[t].
 
 A sweep takes microseconds and releases the interpreter's lock. The result of a chain depends only
-on its conditions and its stream, not on other chains.
+on its conditions and its random stream.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ Mask = NDArray[np.bool_]
 Bits = NDArray[np.uint8]
 
 OTHER_ROOM = np.float32(6.0)
-"""Reduction of the log weight of a stored scene of another room type."""
+"""Reduction of the log weight of stored scenes whose room type differs from the requested one."""
 
-# Number of sweeps whose random numbers are generated together.
+# A chain generates the random numbers of this many sweeps in one call.
 _AT_ONCE = 64
 
 
 def random_stream(seed: int, place: int) -> np.random.Generator:
-    """Return the random stream of a seed and a place; all streams are independent.
+    """Return one of the independent random streams of a seed.
 
     Args:
-        seed: any number from 0.
+        seed: integer from 0.
         place: number of the stream, from 0.
     """
     sequence = np.random.SeedSequence(seed, spawn_key=(place,))
@@ -54,7 +54,7 @@ def random_stream(seed: int, place: int) -> np.random.Generator:
 
 
 class Arrays(NamedTuple):
-    """Weights for the compiled kernels; other names as in `weights.layout`.
+    """Weights for the compiled kernels. `weights.layout` explains the attributes not listed here.
 
     Attributes:
         WT: (H1, V), transpose of W.
@@ -72,12 +72,13 @@ class Arrays(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """Observed relations, on or off: E units.
+    """E observed relation units, each on or off.
 
     Attributes:
-        a: (E,) row of the factors: the relation, or 0 if the units do not share factors.
-        z: (E, K') factors of each unit; constant during a chain.
-        base: (E,) logit of each unit without h1; constant during a chain.
+        a: (E,) index of the relation, or 0 if the units do not share factors. It selects a row of
+            `Arrays.directions`.
+        z: (E, K') factors of each unit. They are constant during a chain.
+        base: (E,) logit of each unit without the contribution of h1. It is constant during a chain.
         r: (E,) 1 if the relation holds, else 0.
     """
 
@@ -92,11 +93,11 @@ class Conditions:
     """The fixed conditions of a chain.
 
     Attributes:
-        classes: (n,) int64, ascending, distinct classes that stay present.
+        classes: (n,) int64, distinct indices of the classes that stay present, ascending.
         log_counts: (n,) log of the number of instances of each class.
-        given: observed relations between these classes; None without observed relations.
-        held, held2: distinct units of h1 and h2 that stay on.
-        room: index of the room type; None if unknown.
+        given: observed relations between these classes, or None without observed relations.
+        held, held2: distinct indices of the units of h1 and h2 that stay on.
+        room: index of the room type, or None if unknown.
     """
 
     classes: Places
@@ -112,8 +113,8 @@ class Drawn:
     """The final state of a chain.
 
     Attributes:
-        classes: (n,) int64, present classes, ascending.
-        h1, h2: hidden units that are on, ascending.
+        classes: (n,) int64, indices of the present classes, ascending.
+        h1, h2: indices of the hidden units that are on, ascending.
         logits: (A, n, n) logits of the relations between the classes at temperature 1.
         r: (A, n, n) bool, relations that are on. Relations of a class to itself are on only if
             observed.
@@ -131,15 +132,15 @@ class SceneChains:
 
     Args:
         weights: weights of the machine.
-        units: relation units of the machine; built if missing.
+        units: relation units of the machine. With None, the class builds them.
 
     Raises:
-        ValueError: the machine is not supported; see `fits`.
+        ValueError: the class does not support the machine; see `fits`.
     """
 
     def __init__(self, weights: Weights, units: RelationUnits | None = None) -> None:
         if not self.fits(weights):
-            raise ValueError("compiled chains need the local form in float32")
+            raise ValueError("compiled chains need a machine in the local form and in float32")
         self.machine = weights
         self.units = units or weights.spec.kind.units(weights)
         W, J, H1 = weights["W"], weights["J"], weights.spec.H1
@@ -161,7 +162,7 @@ class SceneChains:
 
     @staticmethod
     def fits(weights: Weights) -> bool:
-        """Return whether this module supports the machine: local form, float32."""
+        """Return whether this module supports the machine: it needs the local form in float32."""
         return weights.spec.is_local and weights["W"].dtype == np.float32
 
     def given(self, conditions: Conditions, temperature: float = 1.0) -> ConditionedChains:
@@ -185,7 +186,10 @@ class SceneChains:
 
 
 class ConditionedChains:
-    """Chains under the same conditions, each with its own stream; see `SceneChains.given`."""
+    """Chains under the same conditions. Each chain has its own random stream.
+
+    `SceneChains.given` creates this object.
+    """
 
     def __init__(self, chains: SceneChains, conditions: Conditions, temperature: float) -> None:
         self._chains, self._machine, self._w = chains, chains.machine, chains.arrays
@@ -240,7 +244,14 @@ class ConditionedChains:
         return self.move(on | self._always, h1, h2, steps, stream)
 
     def move(self, on: Bits, h1: Bits, h2: Bits, steps: int, stream: np.random.Generator) -> Drawn:
-        """Continue a chain from presence (V,) and hidden units, which change in place."""
+        """Continue a chain from a state, change the state in place, and return the final state.
+
+        Args:
+            on: (V,) presence of the classes.
+            h1, h2: (H1,) and (H2,) states of the hidden units.
+            steps: number of sweeps.
+            stream: random stream of this chain.
+        """
         numbers = len(on) + 2 * len(h1) + len(h2) + kernels.PROPOSALS
         while steps > 0:
             uniform = stream.random((min(steps, _AT_ONCE), numbers), np.float32)
@@ -255,23 +266,23 @@ class ConditionedChains:
         return Drawn(classes, np.flatnonzero(h1), np.flatnonzero(h2), logits, r)
 
     def _context_bias(self, classes: Places, beta: float = 1.0) -> tuple[Floats, Floats]:
-        """Return x of h1 given present classes, (H1,), and means of the second layer, (H2,)."""
+        """Return the logits x of h1 given present classes, (H1,), and the means of h2, (H2,)."""
         base = self._bias + self._machine["W"][classes].sum(0)
         x, m2 = self._machine.with_second_layer(base[None], beta)
         return x[0].astype(np.float32), m2[0]
 
     def _logits(self, classes: Places, h1: Bits) -> Floats:
-        """Return the logits between classes with one instance each, (A, n, n)."""
+        """Return the logits of the relations between classes with one instance each, (A, n, n)."""
         n, A = len(classes), self._machine.spec.A
         ends = _present(classes, *all_pairs(n), np.zeros(n, np.float32))
         mean, _ = self._chains.units.normal(h1[None].astype(np.float32), ends, known=True)
         return mean.reshape(A, n, n)
 
     def _relations(self, classes: Places, logits: Floats, stream: np.random.Generator) -> Mask:
-        """Sample r (A, n, n) between different classes; observed units keep their value.
+        """Sample the relations r (A, n, n) between different classes.
 
-        Relations of a class to itself are off unless observed, because no other unit depends on
-        them.
+        Observed units keep their value. Relations of a class to itself are off unless observed,
+        because other units do not depend on them.
         """
         r = np.zeros(logits.shape, np.bool_)
         free = ~np.broadcast_to(np.eye(len(classes), dtype=np.bool_), r.shape)
@@ -297,13 +308,14 @@ class ConditionedChains:
             b·v + sum_k softplus(x_k) + log p(kept | v, h1)
 
         The first two terms are log p(v) + log Z. The last term is the log-probability of the
-        relations given the sampled context. A second layer enters by its mean field m: x contains
-        J m, and c2·m and the entropy of m are added. This is a lower bound on the sum over h2.
+        relations given the sampled h1. With a second layer, m is the mean field of h2. Then x
+        contains J m, and the score also contains c2·m and the entropy of m. This score is a lower
+        bound on the log of the sum over h2.
 
         Args:
             drawn: the sampled scene.
-            shown: (n,) classes that count as present.
-            kept: (A, n, n) relations that count as on.
+            shown: (n,) bool, True for classes that count as present.
+            kept: (A, n, n) bool, True for relations that count as on.
         """
         listed = drawn.classes[shown]
         x, m = self._context_bias(listed)
@@ -322,6 +334,6 @@ def _marked(size: int, where: Places) -> Bits:
 
 
 def _present(classes: Places, i: Places, j: Places, log_counts: Floats) -> Ends:
-    """Return the ends at some positions, with presence 1."""
+    """Return `Ends` for pairs (i, j) of indices into ``classes``, with presence 1."""
     one = np.ones(i.shape, np.float32)
     return Ends(classes[i], classes[j], log_counts[i], log_counts[j], one, one)

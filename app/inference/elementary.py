@@ -1,7 +1,7 @@
-"""sigmoid and softplus of arrays; exp, log and logistic in single precision, for compiled kernels.
+"""sigmoid and softplus for arrays; exp, log and logistic in float32 for compiled kernels.
 
-Kernels would call the functions of the C library for one number at a time. The functions here are
-plain arithmetic, so the compiler can apply them to a whole vector register. Their errors are below
+Functions of the C library take one number at a time. The exp and log of this module are plain
+arithmetic, so the compiler can apply them to a whole vector register. Their errors are below
 2 units in the last place (`tests/machines/test_elementary.py`).
 
 Source: range reduction and minimax polynomials of Moshier's Cephes library (`expf`, `logf`).
@@ -24,9 +24,9 @@ Floats = NDArray[np.floating[Any]]
 _f = np.float32
 _i = np.int32
 
-# exp() clips its argument to these bounds, so that the result is neither 0 nor infinite.
+# exp() clips its argument to these bounds. So the result is positive and finite.
 _LEAST, _LARGEST = _f(-87.0), _f(88.0)
-# ln 2 in two parts, so that multiples of the first part are exact.
+# The two parts add up to ln 2. The first part has few digits, so that its multiples are exact.
 _LN2_HIGH, _LN2_LOW = _f(0.693359375), _f(-2.12194440e-4)
 _SQRT_HALF_BITS = _i(0x3F3504F3)
 _MANTISSA_BITS = _i(0x007FFFFF)
@@ -34,7 +34,7 @@ _ONE_BITS = _i(0x3F800000)
 
 
 def sigmoid(x: Floats) -> Floats:
-    """Compute 1 / (1 + e^-x); x is clipped at -80, because e^89 exceeds float32."""
+    """Compute 1 / (1 + e^-x). Clip x at -80, because e^89 exceeds float32."""
     found: Floats = np.exp(np.minimum(-x, 80))
     found += 1
     return np.reciprocal(found, out=found)
@@ -47,7 +47,7 @@ def softplus(x: Floats) -> Floats:
 
 
 @intrinsic
-def _float_of_bits(_, bits):  # noqa: ARG001 - the compiler passes it
+def _float_of_bits(_, bits):  # noqa: ARG001 - the compiler passes ``bits``
     def generate(_context, builder, _signature, args):
         return builder.bitcast(args[0], ir.FloatType())
 

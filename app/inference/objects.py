@@ -1,14 +1,15 @@
-"""Fast log-odds of classes: exp(W) is precomputed, and many factors share one log.
+"""Fast log-odds of classes.
 
-The contribution of the context to the log-odds of a class is a sum of logs,
+The hidden units contribute a sum of logs to the log-odds of class i, called the gain of the class:
 
     gain_i = sum_k [softplus(x_k + W_ik) - softplus(x_k)]
            = sum_k log(sigmoid(-x_k) + sigmoid(x_k) exp(W_ik))
 
-and every factor lies between 1 and exp(W_ik). So the factors of a group are multiplied before one
-log is taken, as long as the product stays within float32. Both terms of a factor are positive, so
-digits do not cancel. The form 1 + sigmoid(x) (exp(W) - 1) would be 0 for large x and W below -17.
-For weights in float64, or too large for float32, each log is taken separately.
+The module computes exp(W) once. Every factor (the argument of a log) lies between 1 and exp(W_ik).
+So the module multiplies a group of factors and takes one log of the product, if the product stays
+within float32. Both terms of a factor are positive, so digits do not cancel. The form
+1 + sigmoid(x) (exp(W) - 1) would be 0 for large x and W below -17.
+If the weights are float64 or too large for float32, the module takes each log separately.
 """
 
 from __future__ import annotations
@@ -25,17 +26,19 @@ Floats = NDArray[np.floating[Any]]
 Singles = NDArray[np.float32]
 Places = NDArray[np.int64]
 
-# Maximum |log| of a product; float32 covers exp(±87).
+# Maximum |log| of a product of factors; float32 covers exp(±87).
 _LOG_RANGE = 80.0
-# With a larger W, sigmoid(x) can underflow to 0 although sigmoid(x) exp(W) is not negligible.
+# Maximum |W| for products of factors. With a larger W, sigmoid(x) can underflow to 0 although
+# sigmoid(x) exp(W) is still large.
 _LARGEST_WEIGHT = 64.0
-# Maximum number of factors per log; with more, the products dominate the time.
+# Maximum number of factors per log. With more factors, the products take most of the time.
 _LARGEST_GROUP = 25
-# Maximum number of classes per tile, so that the factors of a tile fit into the second-level cache.
+# Maximum number of classes per tile. A tile is a block of classes whose exp(W) fits into the
+# second-level cache.
 _TILE = 800
-# The width of a tile is a multiple of this, to fill whole vector registers.
+# The width of a tile is a multiple of this number, so that it fills whole vector registers.
 _LANES = 16
-# Number of hidden units whose factors are multiplied in parallel.
+# Number of parallel products in `_gain`. Each product multiplies every 32nd factor.
 _SIDE_BY_SIDE = 32
 _LN2 = np.float32(0.6931471805599453)
 _ONE = np.float32(1.0)
@@ -44,9 +47,9 @@ _MOST_LOGIT = np.float32(80.0)
 
 
 def group_size(W: Floats) -> int:
-    """Return how many factors between 1 and exp(W) may be multiplied before taking a log.
+    """Return the maximum number of factors between 1 and exp(W) in one float32 product.
 
-    0 means that products in float32 are not safe.
+    The result is 0 if products in float32 are not safe.
     """
     largest = float(np.abs(W).max()) if W.size else 0.0
     if W.dtype == np.float64 or largest > _LARGEST_WEIGHT:
@@ -55,17 +58,18 @@ def group_size(W: Floats) -> int:
 
 
 class ContextScorer:
-    """Scorer of all classes for a machine with constant weights.
+    """Compute the gains of all classes for a machine with constant weights.
 
-    Each row of the result is computed separately with the same operations, so its bits do not
-    depend on the other rows.
+    The scorer computes each row of the result separately with the same operations. So the bits of
+    a row do not depend on the other rows.
 
     Args:
         W: (V, H1) weights between classes and hidden units.
 
     Attributes:
-        group: see `group_size`.
-        exp_w: (tiles, H1, classes of a tile) exp(W); only set if ``group`` is not 0.
+        group: number of factors per product, see `group_size`.
+        exp_w: (tiles, H1, classes of a tile) exp(W). The attribute exists only if ``group`` is
+            not 0.
 
     Raises:
         ValueError: W contains NaN or infinity.
@@ -81,16 +85,19 @@ class ContextScorer:
         if self.group:
             tiles = -(-self.V // _TILE)
             width = -(-self.V // (tiles * _LANES)) * _LANES
-            # The padding of the last tile has factors of 1.
+            # The padding of the last tile is 1, which leaves the products unchanged.
             exp_w = np.ones((tiles * width, self.H1), dtype=np.float32)
             np.exp(W, out=exp_w[: self.V])
             tiled = exp_w.reshape(tiles, width, self.H1).swapaxes(1, 2)
             self.exp_w = np.ascontiguousarray(tiled)
 
     def gain(self, x: Floats) -> Floats:
-        """Return sum_k [softplus(x_k + W_ik) - softplus(x_k)], (..., V), for x (..., H1).
+        """Return the gain of each class, sum_k [softplus(x_k + W_ik) - softplus(x_k)], (..., V).
 
         The result has the precision of W.
+
+        Args:
+            x: (..., H1) logits of the hidden units.
 
         Raises:
             ValueError: the shape of x is not (..., H1).
@@ -109,7 +116,10 @@ class ContextScorer:
 
 @inlined
 def _set_halves(x, off, on):
-    """Set off = sigmoid(-x) and on = sigmoid(x) from one exponential, without a difference."""
+    """Set off = sigmoid(-x) and on = sigmoid(x).
+
+    One exponential gives both. 1 - sigmoid(x) would lose digits.
+    """
     for k in range(len(x)):
         fall = exp(min(-x[k], _MOST_LOGIT))
         on[k] = _ONE / (_ONE + fall)
@@ -118,13 +128,14 @@ def _set_halves(x, off, on):
 
 @compiled
 def gains(x, exp_w, group, classes):
-    """Return the gains of all V classes for contexts x (M, H1), (M, V).
+    """Return the gains of all V classes for M rows of logits, (M, V).
 
-    After each group, the exponent of the product is stored separately; one log is taken at the end.
+    After each group, the function moves the exponent of the product to an integer. So one log at
+    the end is enough.
 
     Args:
         x: (M, H1) logits of the hidden units.
-        exp_w, group: see `ContextScorer`.
+        exp_w, group: attributes of `ContextScorer`.
         classes: number of classes V.
     """
     (tiles, units, width), M = exp_w.shape, len(x)
@@ -139,7 +150,7 @@ def gains(x, exp_w, group, classes):
             product[:], exponents[:] = _ONE, np.int32(0)
             for start in range(0, units, group):
                 end = min(start + group, units)
-                # Two factors at a time need half as many reads and writes of the product.
+                # Two factors at a time halve the number of reads and writes of the product.
                 for k in range(start, end - 1, 2):
                     a1, b1, row1 = offs[k], ons[k], tile[k]
                     a2, b2, row2 = offs[k + 1], ons[k + 1], tile[k + 1]
@@ -159,13 +170,16 @@ def gains(x, exp_w, group, classes):
 
 @compiled
 def _gain(off, on, growth, group, product):
-    """Return sum_k log((off + on growth) / (off + on)), growth = e^W (H1,); overwrite product."""
+    """Return sum_k log((off + on growth) / (off + on)), where growth (H1,) is e^W.
+
+    ``product`` is a buffer.
+    """
     size, total = len(off), np.float32(0.0)
     for first in range(0, size, group * _SIDE_BY_SIDE):
         product[:] = _ONE
         last = min(first + group * _SIDE_BY_SIDE, size)
         for start in range(first, last, _SIDE_BY_SIDE):
-            # Slices, because the compiler vectorises loops whose index begins at 0.
+            # The loop runs over slices, because the compiler vectorises loops that begin at 0.
             end = min(start + _SIDE_BY_SIDE, last)
             a, b, c = off[start:end], on[start:end], growth[start:end]
             for lane in range(len(a)):
@@ -179,13 +193,13 @@ def _gain(off, on, growth, group, product):
 
 @compiled
 def gains_without(y, share, W, group):
-    """Return the gain of each class at y (H1,) without the class's own share, (n,).
+    """Return the gain of each class, (n,), after its own share is removed from the logits y.
 
     Args:
         y: (H1,) logits of the hidden units.
         share: (n, H1) contribution of each class and its relations to y.
         W: (n, H1) weights of the classes.
-        group: see `ContextScorer`.
+        group: attribute of `ContextScorer`.
     """
     found, growth = np.empty(len(W), np.float32), _exps(W)
     off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
@@ -197,15 +211,17 @@ def gains_without(y, share, W, group):
 
 @compiled
 def gains_without_others(y, share, W, rows, common, index, group):
-    """Return the gain of some classes without their own share and without each other class, (N, n).
+    """Return the gain of class i without its own share and without the share of class j, (N, n).
+
+    Each row is a class i of ``rows``, and each column is a class j.
 
     Args:
         y: (H1,) logits of the hidden units.
         share: (n, H1) contribution of each class and its relations to y.
         W: (n, H1) weights of the classes.
-        rows: (N,) positions of the classes whose gain is returned.
-        common, index: see `RelationUnits.common`.
-        group: see `ContextScorer`.
+        rows: (N,) row i in ``share`` of each class whose gain is computed.
+        common, index: results of `RelationUnits.common`.
+        group: attribute of `ContextScorer`.
     """
     n, size = share.shape
     found, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
@@ -220,7 +236,8 @@ def gains_without_others(y, share, W, rows, common, index, group):
             for k in range(size):
                 both[k] = left[k] * down[k]
             if index[i, j] >= 0:
-                # Both shares contain the relations between the two classes: remove them only once.
+                # Both shares contain the relations between the two classes, but they must be
+                # removed only once.
                 again = twice[index[i, j]]
                 for k in range(size):
                     both[k] *= again[k]
@@ -230,13 +247,15 @@ def gains_without_others(y, share, W, rows, common, index, group):
 
 @compiled
 def reasons_for_absent(y, share, W, group):
-    """Return the change of each absent class's gain by each present class, (N, n).
+    """Return how much each present class changes the gain of each absent class, (N, n).
+
+    The change is the gain with the present class minus the gain without it.
 
     Args:
         y: (H1,) logits of the hidden units.
         share: (n, H1) contribution of each present class to y.
         W: (N, H1) weights of the absent classes.
-        group: see `ContextScorer`.
+        group: attribute of `ContextScorer`.
     """
     n, growth = len(share), _exps(W)
     found, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
@@ -264,14 +283,17 @@ def _exps(x):
 
 @compiled
 def resampled(weight, against, classes, presence, closed, count):
-    """Resample N samples systematically by their weights given a scene; return (M,) ascending.
+    """Resample N samples by their weights given a scene (systematic resampling).
 
     Args:
-        weight: (N,) log weights for a scene without listed classes.
-        against: (V, N) odds against each class in each sample, e^-l for log-odds l.
-        classes, presence: (n,) listed classes and their presence.
-        closed: 1 - c, for the coverage c.
+        weight: (N,) log weights of the samples before the listed classes count.
+        against: (V, N) odds against each class in each sample: e^-l for log-odds l.
+        classes, presence: (n,) indices of the listed classes and their presence.
+        closed: 1 - c, where c is the coverage.
         count: number M of samples to return.
+
+    Returns:
+        (M,) indices of the chosen samples, ascending.
     """
     weight, below = weight.copy(), np.empty(len(weight))
     for i in range(len(classes)):
@@ -294,19 +316,20 @@ def resampled(weight, against, classes, presence, closed, count):
 
 @compiled
 def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
-    """Return the log-odds of the mean probability of each class over M completions, (V,).
+    """Average the probability of each class over M completions and return its log-odds, (V,).
 
-    A completion adds each usable class whose odds against it, in the sample of the completion, are
-    below ``most``.
+    A completion is the scene with some unlisted classes added. Each completion belongs to one
+    sample. It adds the usable classes whose odds against them in this sample are below ``most``.
 
     Args:
         y: (H1,) logits of h1 without unlisted classes.
-        picked: (M,) sample of each completion.
+        picked: (M,) index of the sample of each completion.
         against: (V, N) odds against each class in each sample.
-        most: (V, M) upper limit of these odds.
+        most: (V, M) limit for ``against``: the completion adds a class with odds below it.
         usable: (V,) bool, classes that a completion may add.
-        bias: (V,) log-odds of each class without context.
-        W, exp_w, group: see `ContextScorer`.
+        bias: (V,) log-odds of each class without the hidden units.
+        W: (V, H1) weights between classes and hidden units.
+        exp_w, group: attributes of `ContextScorer`.
     """
     (V, size), M = W.shape, len(picked)
     completed, added = np.empty((M, size), np.float32), np.zeros((M, V), np.bool_)
@@ -325,13 +348,14 @@ def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
         _set_halves(completed[m], off, on)
         for i in range(V):
             if added[m, i]:
-                # softplus(y) - softplus(y - W) is the gain without the class itself.
+                # `completed` already contains W[i]. The gain of the class is therefore
+                # softplus(y) - softplus(y - W).
                 row = W[i]
                 for k in range(size):
                     fall[k] = exp(-row[k])
                 gain[m, i] = -_gain(off, on, fall, group, product)
         for i in range(V):
-            # Both probabilities from one exponential, without a difference.
+            # One exponential gives p and 1 - p. The difference 1 - p would lose digits.
             odds = exp(min(max(-bias[i] - gain[m, i], -_MOST_LOGIT), _MOST_LOGIT))
             p = _ONE / (_ONE + odds)
             here[i] += p

@@ -1,6 +1,7 @@
-"""Compiled kernels of relation units: residual look-up, mean field, implications.
+"""Compiled kernels of relation units: look-up of residual weights, mean field, implications.
 
-`relations` has the formulas; `training/machines/implications.py` has those of the implications.
+The module `relations` has the formulas. `training/machines/triway.py` has the formulas of the
+implications.
 """
 
 from __future__ import annotations
@@ -11,19 +12,22 @@ from app.compiling import compiled, compiled_in_any_order, inlined
 from app.inference.elementary import exp, log, logistic
 
 SPREAD, SHIFT = 2654435761, 16
-"""The bucket of a pair is (key * SPREAD) >> SHIFT, modulo the number of buckets."""
+"""Constants of a hash table: bucket of a pair = (key * SPREAD) >> SHIFT, modulo the table size."""
 
 _DAMPING = np.float32(0.8)
-# Relations that imply each other are sampled in 2 * _GROUPS groups.
+# `draw_in_groups` samples the relations in 2 * _GROUPS groups.
 _GROUPS = 4
-# Maximum number of neighbours that count: further neighbours add little information.
+# Maximum number of neighbours that a degree feature counts. More neighbours add little information.
 _MOST = np.float32(3.0)
 
 
 @compiled
 def pair_rows(start, keys, pairs):
-    """Return the row of each pair (E,), i V + j; unknown pairs get the last row, which is zero."""
-    # Buckets are faster than binary search, whose branches the processor cannot predict.
+    """Return the row of each pair of classes in the table of residual weights, (E,).
+
+    A pair (i, j) has the key i V + j. The row of an unknown pair is the last row, which is zero.
+    """
+    # Buckets are faster than binary search, because the processor cannot predict its branches.
     found = np.empty(len(pairs), np.int64)
     for e in range(len(pairs)):
         pair = pairs[e]
@@ -41,9 +45,9 @@ def unit_terms(w, g, a, ends):
 
     Args:
         w: `relations.SharedArrays`.
-        g: (A, K); the products g[a_e]·z_e are part of the logits.
-        a: (E,) relations.
-        ends: `relations.Ends`, (E,) each.
+        g: (A, K) weights of z_e: each logit contains the product g[a_e]·z_e.
+        a: (E,) indices of the relations.
+        ends: `relations.Ends` with arrays of shape (E,).
     """
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
     i, j, log_i, log_j = ends.i, ends.j, ends.log_i, ends.log_j
@@ -66,12 +70,12 @@ def pair_terms(w, first, ends, z, base):
 
     Args:
         w: `relations.SharedArrays`.
-        first: first of the R relations.
-        ends: `relations.Ends`, (B, P) each.
-        z: (B, K, P') receives the factors z_e; P' is at least P.
-        base: (B, R, P') receives the other terms.
+        first: index of the first of the R consecutive relations.
+        ends: `relations.Ends` with arrays of shape (B, P).
+        z: (B, K, P') array for the factors z_e. P' is at least P.
+        base: (B, R, P') array for the other terms.
     """
-    # Local names, because each access through the tuple would count a reference.
+    # Local names are faster: each access through the tuple would change a reference count.
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
     for b in range(len(z)):
         subjects, objects, log_i, log_j = ends.i[b], ends.j[b], ends.log_i[b], ends.log_j[b]
@@ -92,8 +96,8 @@ def spreads(C, q):
     """Return √3 σ = √(3 q'C q) of logits, (B, R, P).
 
     Args:
-        C: (B, R, r (r + 1) / 2) lower half of C; entries off the diagonal are doubled.
-        q: (B, R, r, P) coordinates of each pair.
+        C: (B, R, r (r + 1) / 2) lower half of each matrix C, with entries off the diagonal doubled.
+        q: (B, R, r, P) coordinates q of each pair; see `relations.SharedUnits`.
     """
     B, R, r, P = q.shape
     found, row = np.empty((B, R, P), np.float32), np.empty(P, np.float32)
@@ -116,17 +120,23 @@ def spreads(C, q):
 
 
 _ROOT_3 = np.float32(3.0**0.5)
-# Maximum √3 σ for which three nodes are enough.
+# Maximum √3 σ for which quadrature with three nodes is accurate enough.
 _NARROW = np.float32(0.75 * 3.0**0.5)
-# Trapezoidal rule for larger σ: step of the positive nodes in units of σ, and their weights
-# relative to the weight of node 0.
+# Trapezoidal rule for larger σ: distance between the nodes in units of σ, and the weights of the
+# positive nodes relative to the weight of node 0.
 _STEP = np.float32(0.25)
 _TAIL = np.exp(-0.5 * (0.25 * np.arange(1, 21)) ** 2).astype(np.float32)
 
 
 @compiled
 def log_odds(means, spreads, least):
-    """Replace means (E,) by log-odds; see `relations.to_log_odds`. Spreads are √3 σ."""
+    """Replace means (E,) by log-odds in place; see `relations.to_log_odds`.
+
+    Args:
+        means: (E,) means of the logits.
+        spreads: (E,) √3 σ of the logits.
+        least: lower limit of the log-odds.
+    """
     wide = np.flatnonzero(spreads >= _NARROW)
     some = _wide_log_odds(means[wide], spreads[wide])
     one, four = np.float32(1.0), np.float32(4.0)
@@ -165,11 +175,12 @@ def _wide_log_odds(means, spreads):
 
 @compiled
 def accumulate(keys, weights, rows, size):
-    """Sum weighted rows by key, (size, K); rows with key -1 are ignored.
+    """Return the sum of the weighted rows of each key, (size, K). Ignore rows with key -1.
 
     Args:
-        keys: (E,), or (2E,) for two keys per row.
-        weights, rows: (E,) and (E, K).
+        keys: (E,) key of each row, or (2E,) for two keys per row.
+        weights: (E,) weight of each row.
+        rows: (E, K) rows to sum.
         size: number of keys.
     """
     found = np.zeros((size, rows.shape[1]), np.float32)
@@ -184,7 +195,7 @@ def accumulate(keys, weights, rows, size):
 
 @compiled
 def expanded(G, a, z):
-    """Compute U_e = G[a_e]'z_e, (E, H1)."""
+    """Compute the weights U_e = G[a_e]'z_e between each unit and h1, (E, H1)."""
     found = np.zeros((len(a), G.shape[2]), np.float32)
     for e in range(len(a)):
         into, shared, factors = found[e], G[a[e]], z[e]
@@ -203,7 +214,7 @@ def _set_means(x, out):
 
 @compiled_in_any_order
 def _products(rows, m, out):
-    """Compute out = rows m."""
+    """Write the product of the matrix ``rows`` and the vector m to ``out``."""
     for e in range(len(rows)):
         row, total = rows[e], np.float32(0.0)
         for k in range(len(row)):
@@ -213,7 +224,7 @@ def _products(rows, m, out):
 
 @compiled_in_any_order
 def _selected_products(rows, a, through, out):
-    """Compute out_e = rows_e · through[a_e]."""
+    """Write the products rows_e · through[a_e] to ``out``."""
     for e in range(len(rows)):
         row, other, total = rows[e], through[a[e]], np.float32(0.0)
         for k in range(len(row)):
@@ -223,13 +234,15 @@ def _selected_products(rows, a, through, out):
 
 @compiled
 def normal_without_itself(y, U, base, slopes):
-    """Return mean and √3 σ of the logits of units (E,), each at y without its own slope.
+    """Return mean and √3 σ of the logits of E units, (E,) each.
+
+    The function removes slope_e U_e, the contribution of the unit itself, from y.
 
     Args:
         y: (H1,) logits of h1.
         U: (E, H1) weights of the units.
-        base: (E,) logits without U_e·h1.
-        slopes: (E,) slopes of the units.
+        base: (E,) logits of the units without U_e·h1.
+        slopes: (E,) slopes of the units; see `RelationUnits.fixed_point`.
     """
     mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
     rest, m = np.empty_like(y), np.empty_like(y)
@@ -259,9 +272,10 @@ def fixed_point(x, G, a, base, z, r, gate, sweeps):
 
     Args:
         x: (H1,) logits of h1 given the objects.
-        G: (A, K, H1), U_e = G[a_e]'z_e; empty if z (E, H1) is U itself.
-        a, base, z: see `relations.Units`.
-        r, gate: (E,) values of the relations, and presence of both ends.
+        G: (A, K, H1) shared weights: U_e = G[a_e]'z_e. If G is empty, z (E, H1) is U itself.
+        a, base, z: attributes of `relations.Units`.
+        r: (E,) 1 if the relation holds, else 0.
+        gate: (E,) presence of both ends of the relation.
         sweeps: number of iterations.
     """
     E, (A, K, _) = len(a), G.shape
@@ -307,13 +321,15 @@ def _add_rows(weights, rows, out):
 def _no_steps(relations, n):
     """Return the empty step tables of a scene without relations.
 
-    A step follows a relation: step a leads from subject to object, step A + a leads back.
+    A step leads from one class to another along a relation that holds. A step of kind a leads from
+    the subject to the object of relation a. A step of kind A + a leads back.
 
     Returns:
-        degree: (2A, n) number of steps of each kind from each class.
-        near: (2A, n, n) targets of these steps.
-        seen: (n, n, 2A) for paths of two steps, by first step: bit set of the second steps.
-        paths: (n, n, A) shift of each relation between two classes by the paths between them.
+        degree: (2A, n) number of steps of each kind that start at each class.
+        near: (2A, n, n) classes at which these steps end.
+        seen: (n, n, 2A) paths of two steps between two classes. The last axis is the kind of the
+            first step. The value is a bit set of the kinds of the second step.
+        paths: (n, n, A) change of the logit of each relation by the paths between its two classes.
     """
     steps = 2 * relations
     degree, near = np.zeros((steps, n), np.int64), np.empty((steps, n, n), np.int64)
@@ -323,8 +339,8 @@ def _no_steps(relations, n):
 
 @compiled
 def _hold(known, weight, a, i, j):
-    """Add relation a between classes i and j: count its two steps and the new paths."""
-    # Plain indices, because a slice costs more than the few numbers read from it.
+    """Add relation a between classes i and j to the step tables, with its steps and new paths."""
+    # The loops use plain indices, because a slice would cost more time.
     degree, near, seen, paths = known
     steps = len(degree)
     both = (a, i, j), (steps // 2 + a, j, i)
@@ -335,7 +351,7 @@ def _hold(known, weight, a, i, j):
         for d in range(steps):
             for at in range(degree[d, y]):
                 _add_path(seen, paths, weight, x, near[d, y, at], c, d)
-            # Targets of step d from x lead to x by the opposite step.
+            # If step d leads from x to a class, the opposite step leads from this class to x.
             back = (d + steps // 2) % steps
             for at in range(degree[d, x]):
                 _add_path(seen, paths, weight, near[d, x, at], y, back, c)
@@ -352,19 +368,19 @@ def _add_path(seen, paths, weight, x, y, first, second):
 
 @compiled
 def _implied(known, weight, direct):
-    """Return the shift of each relation by all relations that hold, (n, n, A).
+    """Return how much the relations that hold change the logit of each relation, (n, n, A).
 
     Args:
-        known: tables of `_no_steps`.
-        weight: (F, A) implication weights.
-        direct: whether the relations of a pair shift each other.
+        known: step tables of the relations that hold; see `_no_steps`.
+        weight: (F, A) implication weights; see `RelationUnits.implication_weights`.
+        direct: whether relations between the same two classes change each other's logits.
     """
     degree, near, _, paths = known
     (steps, n), A = degree.shape, weight.shape[1]
     shift, degrees = paths.copy(), weight[steps + steps * steps :]
     out, into = np.zeros((n, A), np.float32), np.zeros((n, A), np.float32)
     for c in range(steps):
-        # A step into a class is the opposite step out of the class.
+        # The number of steps of kind c that end at a class is its number of opposite steps.
         back = (c + A) % steps
         for x in range(n):
             for b in range(A):
@@ -382,7 +398,7 @@ def _implied(known, weight, direct):
                 for b in range(A):
                     if direct:
                         shift[x, y, b] += weight[c, b]
-                    # The degrees must not count the step between these two classes.
+                    # A degree feature of x and y must not count the step between x and y.
                     if degree[c, x] <= _MOST:
                         shift[x, y, b] -= degrees[c, b]
                     if degree[back, y] <= _MOST:
@@ -392,15 +408,16 @@ def _implied(known, weight, direct):
 
 @compiled
 def implied(weight, n, a, i, j):
-    """Return the shifts of all relations by relations that hold, (2, n, n, A).
+    """Return how much the relations that hold change the logit of each relation, (2, n, n, A).
 
-    The first entry contains all shifts. In the second, the relations of a pair do not shift each
-    other.
+    In part 0 of the first axis, all relations count. In part 1, relations between the same two
+    classes do not change each other's logits.
 
     Args:
-        weight: (F, A), see `RelationUnits.implication_weights`.
+        weight: (F, A) implication weights; see `RelationUnits.implication_weights`.
         n: number of classes in the scene.
-        a, i, j: (E,) relations that hold between different classes.
+        a, i, j: (E,) indices of the relations that hold, and of their subject and object classes.
+            The two classes differ.
     """
     known = _no_steps(weight.shape[1], n)
     for e in range(len(a)):
@@ -412,16 +429,18 @@ def implied(weight, n, a, i, j):
 
 @compiled
 def draw_in_groups(weight, logits, free, uniform, other, r):
-    """Sample relations that imply each other: group after group, given all earlier groups.
+    """Sample relations that imply each other, group after group.
 
-    The groups are random; a(i, j) and a(j, i) are always in different groups.
+    Each group is sampled given the relations of all earlier groups. The groups are random, but
+    a(i, j) and a(j, i) are always in different groups.
 
     Args:
-        weight: (F, A), see `RelationUnits.implication_weights`.
-        logits: (A, n, n) logits without implications.
-        free: (A, n, n) relations to sample; the others keep their value.
-        uniform, other: (A, n, n) random numbers in [0, 1), for relations and for groups.
-        r: (A, n, n) receives the samples.
+        weight: (F, A) implication weights; see `RelationUnits.implication_weights`.
+        logits: (A, n, n) logits of the relations without implications.
+        free: (A, n, n) bool, True for relations to sample. Other relations keep their value.
+        uniform: (A, n, n) random numbers in [0, 1) that decide the relations.
+        other: (A, n, n) random numbers in [0, 1) that decide the groups.
+        r: (A, n, n) bool, the relations. The function writes the samples into it.
     """
     A, n, _ = r.shape
     known, group = _no_steps(A, n), np.full(r.shape, -1, np.int64)
@@ -429,7 +448,7 @@ def draw_in_groups(weight, logits, free, uniform, other, r):
         for i in range(n):
             for j in range(n):
                 if free[a, i, j]:
-                    # One random number for both directions decides which direction comes first.
+                    # a(i, j) and a(j, i) share one random number, which decides their order.
                     later = other[a, min(i, j), max(i, j)] < 0.5
                     half = _GROUPS if later == (i < j) else 0
                     group[a, i, j] = half + np.int64(2 * _GROUPS * other[a, i, j]) % _GROUPS

@@ -1,13 +1,12 @@
 """Probabilities of relations: p(r_e = 1) = E[sigmoid(ℓ_e(h1))] with ℓ_e(h1) = base_e + U_e·h1.
 
-The logit is a sum of many small independent terms. It is approximated by a normal variable with
+The logit ℓ_e is a sum of many small independent terms. This module treats it as normal, with
 
     mean base_e + U_e·m   and variance   σ_e² = sum_k U_ek² m_k (1 - m_k)
 
-for the means m of h1. The mean of its sigmoid is computed by quadrature, with the errors in
-docs/decisions/inference.md. The variant defines the units, with their base and U: each of the
-`FreeUnits` has its own row of U, and `SharedUnits` compute U from factors. All variants share the
-other code.
+where m are the means of h1. Quadrature gives the mean of sigmoid(ℓ_e). For its errors, see
+docs/decisions/inference.md. The variant of the machine defines base and U: each unit of `FreeUnits`
+has its own row of U, and `SharedUnits` computes U from factors. All variants share the other code.
 """
 
 from __future__ import annotations
@@ -31,52 +30,53 @@ Places = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SWEEPS: Final = 10
-"""Iterations of a mean field: enough to converge on the shipped machines. The number is fixed, so
-that answers are reproducible."""
+"""Number of iterations of a mean field. The shipped machines converge in this number. It is fixed,
+so that answers are reproducible."""
 
 NO_UNIT: Final = np.float32(-30.0)
 """Lower limit of the log-odds of a relation."""
 
 NEVER: Final = np.float32(-1e4)
-"""Logit of a relation without a unit; the relation is off at any temperature."""
+"""Logit of a relation without a unit. Such a relation is off at any temperature."""
 
 Table = tuple[NDArray[np.int32], NDArray[np.int32]]
 
 NOTHING: Final[Floats] = np.zeros((0, 0, 0), dtype=np.float32)
 
-# Pairs are padded to a multiple of this, to fill whole vector registers.
+# The number of pairs is padded to a multiple of this number, to fill whole vector registers.
 _WHOLE: Final = 32
 
-# Mean variance of a logit that the kept directions F_a may neglect. A probability changes by about
+# Maximum mean variance of a logit that `_directions` may neglect. A probability changes by about
 # 1/20 of the neglected variance. `indoor-triway` keeps 11 of 33 directions. All 33 would double the
 # time of /relations and change p by at most 0.005.
 _LEFT_OUT: Final = 4e-3
 
 
 def to_log_odds(mean: Floats, spread: Floats) -> Floats:
-    """Return the log-odds of E[sigmoid(ℓ)] for normal logits ℓ; at least `NO_UNIT`.
+    """Return the log-odds of the mean of sigmoid(ℓ) for normal logits ℓ. The minimum is `NO_UNIT`.
 
-    For σ < 0.75, three nodes are used: 0 and ±√3 σ, with weights 4 : 1 : 1. The error in p is at
-    most 0.0003. With u = e^-|mean| and q = e^spread, the sigmoids are u/(1 + u), uq/(1 + uq) and
-    u/(q + u), which cannot overflow. For larger σ, up to 10 and more, the trapezoidal rule is used.
+    For σ < 0.75, the quadrature has three nodes: 0 and ±√3 σ, with weights 4 : 1 : 1. The error in
+    p is at most 0.0003. With u = e^-|mean| and q = e^spread, the sigmoids are u/(1 + u),
+    uq/(1 + uq) and u/(q + u). These forms cannot overflow. For larger σ, such as 10, the function
+    uses the trapezoidal rule.
 
     Args:
         mean: means of the logits.
         spread: √3 σ of the logits.
     """
     found = mean.ravel().astype(np.float32)
-    # Contiguous, because numba would compile the kernel again for another memory layout.
+    # ravel() makes the arrays contiguous: numba would compile the kernel again for another layout.
     kernels.log_odds(found, spread.ravel(), NO_UNIT)
     return found.reshape(mean.shape)
 
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """Observed relations, on or off: E units between the n classes of a scene.
+    """E observed relation units between the n classes of a scene, each on or off.
 
     Attributes:
-        a: (E,) relations.
-        i, j: (E,) positions of subject and object class in the scene.
+        a: (E,) indices of the relations.
+        i, j: (E,) indices of subject and object class, from 0 to n - 1.
         r: (E,) 1 if the relation holds, else 0.
         g: (E,) presence of both ends.
     """
@@ -89,13 +89,13 @@ class Given:
 
 
 class Units(NamedTuple):
-    """The existing units among requested relations.
+    """The requested relations for which the machine has a unit.
 
     Attributes:
         place: (E,) index of each unit in the request.
-        a: (E,) relations.
-        base: (E,) ℓ_e without U_e·h1.
-        z: (E, K') factors: U_e = G[a]'z_e. If G is empty, z_e is U_e itself.
+        a: (E,) indices of the relations.
+        base: (E,) logit ℓ_e without U_e·h1.
+        z: (E, K') factors of each unit: U_e = G[a]'z_e. If G is empty, z_e is U_e itself.
     """
 
     place: Places
@@ -106,20 +106,20 @@ class Units(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """The context of a scene, given its observations.
+    """The hidden units of a scene, given its observed objects and relations.
 
     Attributes:
-        classes: (n,) int64, distinct.
+        classes: (n,) int64, distinct indices of the classes in the scene.
         presence: (n,) presence of each class.
         log_counts: (n,) log of the number of instances of each class.
         x: (H1,) logits of h1 given the objects.
         y: (H1,) logits of h1 given objects and relations, for questions about relations.
-        given: observed relations; None without observed relations.
-        units: units of `given`.
-        slopes: slopes of `units`, for questions about relations.
+        given: observed relations, or None without observed relations.
+        units: relation units of `given`.
+        slopes: slopes of `units`, for questions about relations; see `RelationUnits.fixed_point`.
         object_y, object_slopes: y and slopes for questions about objects.
-        through: (n, H1) contribution of each class to y through the second layer; None with one
-            layer.
+        through: (n, H1) contribution of each class to y through the second layer, or None for a
+            machine with one layer.
     """
 
     classes: Places
@@ -135,13 +135,16 @@ class Context:
     through: Floats | None
 
     def ends(self, i: Places, j: Places) -> Ends:
-        """Return the ends at positions i and j."""
+        """Return `Ends` for the pairs (i, j) of indices into `classes`."""
         p, n = self.presence, self.log_counts
         return Ends(self.classes[i], self.classes[j], n[i], n[j], p[i], p[j])
 
 
 class Ends(NamedTuple):
-    """Subject and object classes, logs of their counts, and their presence; all of one shape."""
+    """Both ends of some pairs: subject and object class, log of their counts, and their presence.
+
+    All arrays have the same shape.
+    """
 
     i: Places
     j: Places
@@ -152,15 +155,15 @@ class Ends(NamedTuple):
 
 
 class Between(NamedTuple):
-    """The logits between the n classes of a scene, and the effects of observed relations.
+    """The logits of all relations between the n classes, and the effects of observed relations.
 
     Without observed relations, slopes, shift and apart are empty.
 
     Attributes:
-        mean, spread: (A, n, n) of the logits; see `RelationUnits.normal`.
-        slopes: (A, n, n) slopes of observed relations; 0 for other relations.
-        shift: (A, n, n) shift of each logit by implications of the observed relations.
-        apart: (A, n, n) the same shift without the observed relations of the pair itself.
+        mean, spread: (A, n, n) mean and √3 σ of the logits; see `RelationUnits.normal`.
+        slopes: (A, n, n) slopes of observed relations, and 0 for other relations.
+        shift: (A, n, n) change of each logit by implications of the observed relations.
+        apart: (A, n, n) like `shift`, but without observed relations between the same two classes.
     """
 
     mean: Floats
@@ -174,11 +177,11 @@ class SharedArrays(NamedTuple):
     """Weights of a Triway's units for the compiled kernels.
 
     Attributes:
-        S, O: (V, K + 1); the last column is 1.
-        s, o: (V, A).
-        n: (A, 2).
-        start, key: see `pair_rows`.
-        residual: (pairs + 1, A) residual weights w'; the last row is 0.
+        S, O: (V, K + 1) factors of subject and object class. The last column is 1.
+        s, o: (V, A) weights of subject and object class.
+        n: (A, 2) weights of the log counts of both ends.
+        start, key: look-up table of `pair_rows`.
+        residual: (pairs + 1, A) residual weights w'. The last row is 0.
     """
 
     S: Floats
@@ -195,8 +198,8 @@ class RelationUnits(ABC):
     """The relation units of a machine.
 
     Attributes:
-        G: (A, K', H1) weights shared by the units of a relation; empty if each unit has its own
-            row of U.
+        G: (A, K', H1) weights that all units of a relation share. G is empty if each unit has its
+            own row of U.
     """
 
     G: Floats
@@ -206,62 +209,66 @@ class RelationUnits(ABC):
 
     @abstractmethod
     def select(self, a: Places, ends: Ends) -> Units:
-        """Return the units of relations a (E,) between the ends."""
+        """Return the units of relations a (E,) between ``ends``, if the machine has these units."""
 
     @abstractmethod
     def normal(
         self, means: Floats, ends: Ends, only: int | None = None, *, known: bool = False
     ) -> tuple[Floats, Floats]:
-        """Return mean and √3 σ of the logits of pairs, both (B, R, P).
+        """Return mean and √3 σ of the logits of R relations for P pairs, both (B, R, P).
 
         A relation without a unit has the mean `NEVER`.
 
         Args:
             means: (B, H1) means of h1.
-            ends: (B, P) pairs.
-            only: one relation (R = 1), or None for all (R = A).
-            known: whether all means are 0 or 1, so that the variance is 0.
+            ends: both ends of each pair, (B, P).
+            only: index of one relation (R = 1), or None for all relations (R = A).
+            known: whether all means are 0 or 1. The variance is then 0.
         """
 
     def rows(self, units: Units) -> Floats:
-        """Return U of units, (E, H1)."""
+        """Return the rows U_e of units, (E, H1)."""
         if not len(self.G):
             return units.z
         found: Floats = kernels.expanded(self.G, units.a, units.z)
         return found
 
     def rows_of(self, a: Places, i: Places, j: Places) -> Floats:
-        """Return U of relations a between classes i and j, (E, H1), for relations with a unit."""
+        """Return the rows U_e of relations a between classes i and j, (E, H1).
+
+        Relations without a unit have no row.
+        """
         none = np.zeros(len(a), np.float32)
         return self.rows(self.select(a, Ends(i, j, none, none, none, none)))
 
     def fixed_point(
         self, x: Floats, given: Given, ends: Ends, sweeps: int = SWEEPS
     ) -> tuple[Floats, Units, Floats]:
-        """Compute the mean field given relations: y (H1,), the units and their slopes.
+        """Compute the mean field given observed relations.
 
-        The iteration starts at y = x, with m = sigmoid(y) and g the presence of both ends:
+        The result is y (H1,), the units of the observed relations, and their slopes. The iteration
+        starts at y = x. m = sigmoid(y) are the means of h1, and g is the presence of both ends:
 
             y = x + sum_e slope_e U_e,   slope_e = g_e (r_e - sigmoid(base_e + U_e·m))
         """
         units = self.select(given.a, ends)
         G, z = self.G, units.z
         if 2 * len(z) < G.shape[0] * G.shape[1]:
-            # With few units, rows of U are cheaper than the shared rows G.
+            # With few units, products with rows of U are faster than products with G.
             G, z = NOTHING, self.rows(units)
         r, g = given.r[units.place], given.g[units.place]
         y, slopes = kernels.fixed_point(x, G, units.a, units.base, z, r, g, sweeps)
         return y, units, slopes
 
     def between(self, context: Context) -> Between:
-        """Return the logits between the classes of a scene."""
+        """Return the logits of all relations between the classes of a scene."""
         n = len(context.classes)
         mean, spread = self.normal(sigmoid(context.y)[None], context.ends(*all_pairs(n)))
         shape = self._A, n, n
         return Between(mean.reshape(shape), spread.reshape(shape), *self.said(context))
 
     def said(self, context: Context) -> tuple[Floats, Floats, Floats]:
-        """Return `slopes`, `shift` and `apart` of `Between`."""
+        """Return the values `slopes`, `shift` and `apart` of `Between`."""
         given, units, n = context.given, context.units, len(context.classes)
         if given is None or units is None:
             return NOTHING, NOTHING, NOTHING
@@ -271,7 +278,13 @@ class RelationUnits(ABC):
         return slopes, *self.implied(context.x, n, given)
 
     def implied(self, x: Floats, n: int, given: Given) -> tuple[Floats, Floats]:
-        """Return `shift` and `apart` of `Between`; x are the logits of h1 given the objects."""
+        """Return the values `shift` and `apart` of `Between`.
+
+        Args:
+            x: (H1,) logits of h1 given the objects.
+            n: number of classes in the scene.
+            given: observed relations.
+        """
         weight = self.implication_weights(x)
         if not len(weight):
             return NOTHING, NOTHING
@@ -281,9 +294,10 @@ class RelationUnits(ABC):
         return shift, apart
 
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
-        """Return the weight of each feature of observed relations for each relation, (F, A).
+        """Return how much each feature of the observed relations changes each logit, (F, A).
 
-        The result is empty for a machine without implications.
+        The result is empty for a machine without implications. See `training/machines/triway.py`
+        for the features.
         """
         del x, beta
         return NOTHING.reshape(0, 0)
@@ -291,8 +305,8 @@ class RelationUnits(ABC):
     def log_odds(self, between: Between) -> Floats:
         """Return the log-odds of all relations between the classes, (A, n, n).
 
-        The effect of an observed relation on itself is removed to first order: a small slope
-        changes ℓ_e(m) by slope_e σ_e².
+        An observed relation changes its own logit ℓ_e(m) by about slope_e σ_e². The method
+        subtracts this change, which is correct to first order.
         """
         mean, spread = between.mean, between.spread
         if len(between.slopes):
@@ -304,14 +318,16 @@ class RelationUnits(ABC):
     def without_itself(
         self, context: Context, a: Places, i: Places, j: Places, slopes: Floats, shift: Floats
     ) -> Floats:
-        """Return the log-odds of some relations, (E,), each without its own slope in y (exact).
+        """Return the log-odds of some relations, (E,), without their effect on themselves.
+
+        Unlike `log_odds`, the method removes slope_e U_e from y, which is exact.
 
         Args:
             context: context of the scene.
-            a: (E,) relations.
-            i, j: (E,) positions of their ends.
+            a: (E,) indices of the relations.
+            i, j: (E,) indices of their subject and object class in the scene.
             slopes: (E,) slopes of the relations.
-            shift: (A, n, n) shift of `Between`, or empty.
+            shift: (A, n, n) value `shift` of `Between`, or empty.
         """
         units = self.select(a, context.ends(i, j))
         mean, spread = kernels.normal_without_itself(
@@ -325,23 +341,33 @@ class RelationUnits(ABC):
 
     @abstractmethod
     def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
-        """Return the log-odds of pairs (P,) without the pair's observed relations, (2, A, P)."""
+        """Return the log-odds of the relations of some pairs, (2, A, P).
+
+        The observed relations of a pair do not count as evidence for the pair itself.
+
+        Args:
+            context: context of the scene.
+            between: logits between the classes of the scene.
+            i, j: (P,) indices of the two classes of each pair in the scene. Part 0 of the result
+                is the direction from i to j, and part 1 is the direction from j to i.
+        """
 
     def placement_log_odds(
         self, context: Context, candidates: Places, anchors: Places, only: int | None = None
     ) -> tuple[Floats, Floats]:
-        """Return the log-odds of relations between absent candidates and anchors.
+        """Return the log-odds of relations between absent candidate classes and anchor classes.
 
-        Each candidate is treated as present.
+        The method treats each candidate as present.
 
         Args:
             context: context of the scene.
-            candidates: (N,) classes.
-            anchors: (m,) positions of classes in the scene.
-            only: one relation (R = 1), or None for all (R = A).
+            candidates: (N,) indices of the candidate classes.
+            anchors: (m,) indices of the anchor classes in the scene.
+            only: index of one relation (R = 1), or None for all relations (R = A).
 
         Returns:
-            (N, R, m) from candidate to anchor, and (N, R, m) from anchor to candidate.
+            Log-odds with the candidate as subject, (N, R, m), and with the anchor as subject,
+            (N, R, m).
         """
         m = len(anchors)
         shape = len(candidates), 2 * m
@@ -368,10 +394,11 @@ class RelationUnits(ABC):
         return found
 
     def common(self, context: Context) -> tuple[Floats, Places]:
-        """Return the contribution of the relations between two classes to y.
+        """Return the contribution of the observed relations of each pair of classes to y.
 
         Returns:
-            (P, H1) contributions, and (n, n) row of each pair of classes; -1 without relations.
+            (P, H1) contributions, and (n, n) row of each pair of classes in the contributions. The
+            row is -1 for a pair without observed relations.
         """
         n = len(context.classes)
         given, units = context.given, context.units
@@ -389,11 +416,11 @@ class RelationUnits(ABC):
         return found, np.maximum(index, index.T)
 
     def _sums(self, units: Units, keys: Places, slopes: Floats, size: int) -> Floats:
-        """Sum slope_e U_e over the units of each key, (size, H1); key -1 is ignored.
+        """Sum slope_e U_e over the units of each key, (size, H1). Ignore units with key -1.
 
         Args:
-            units: the units.
-            keys: (E,), or (2, E) for two keys per unit.
+            units: E relation units.
+            keys: (E,) key of each unit, or (2, E) for two keys per unit.
             slopes: (E,) slopes of the units.
             size: number of keys.
         """
@@ -408,16 +435,16 @@ class RelationUnits(ABC):
 
 
 class FreeUnits(RelationUnits):
-    """Units of the triples in the training scenes, each with its own row of U.
+    """One unit for each triple (relation, subject class, object class) of the training scenes.
 
     ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1
 
-    Other triples do not have a unit: they do not act as evidence. Their log-odds are `NO_UNIT`.
+    Other triples have no unit, so they do not act as evidence. Their log-odds are `NO_UNIT`.
 
     Args:
         weights: weights of the machine.
         U: (T, H1) weights between units and h1.
-        g: (T, 2) weights of the presence of both ends; None for zeros.
+        g: (T, 2) weights of the presence of both ends. None means zeros.
     """
 
     def __init__(self, weights: Weights, U: Floats, g: Floats | None = None) -> None:
@@ -462,7 +489,7 @@ class FreeUnits(RelationUnits):
         return mean, spread
 
     def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
-        """See `RelationUnits`; exact."""
+        """See `RelationUnits`. The result is exact."""
         del between
         ends = context.ends(np.stack([i, j], 1), np.stack([j, i], 1))
         y = np.tile(context.y, (len(i), 1))
@@ -478,9 +505,9 @@ class FreeUnits(RelationUnits):
 class SharedUnits(RelationUnits):
     """A unit for every triple, with shared weights and a sparse residual; see `Triway`.
 
-    With z_e = (S_i * O_j, 1): U_e = G[a]'z_e, where G[a] consists of the rows of M[a] and P[a]. The
-    variance of a logit is q'C q. Here q = Y[a] z_e are coordinates in the directions F_a of largest
-    variance, and C = F_a diag(m (1 - m)) F_a'.
+    The factors are z_e = (S_i * O_j, 1), and U_e = G[a]'z_e. The rows of G[a] are the rows of M[a],
+    followed by P[a]. The variance of a logit is q'C q. The vector q = Y[a] z_e has the coordinates
+    of U_e in the directions F_a of largest variance, and C = F_a diag(m (1 - m)) F_a'.
     """
 
     def __init__(self, weights: Weights) -> None:
@@ -503,7 +530,7 @@ class SharedUnits(RelationUnits):
         self._g = np.concatenate([weights["R"], weights["d"][:, None]], 1)
         F, self._Y = _directions(weights)
         self._F = F.reshape(-1, F.shape[2])
-        # Products of two directions, for the lower half of C; off the diagonal they are doubled.
+        # Products of two directions give the lower half of C. Entries off the diagonal are doubled.
         p, q = np.tril_indices(F.shape[1])
         self._FF = _columns(F[:, p] * F[:, q] * np.where(p == q, 1, 2)[:, None])
         self._GT = _columns(self.G)
@@ -537,7 +564,7 @@ class SharedUnits(RelationUnits):
         return mean[:, :, :P], spread[:, :, :P]
 
     def _of(self, asked: slice, rows: Floats, columns: Floats) -> Floats:
-        """Return the products of rows (B, H1) with the columns of R relations, (B, R, n)."""
+        """Return the products of rows (B, H1) with the n columns of each relation, (B, R, n)."""
         n = columns.shape[1] // self._A
         found: Floats = rows @ columns[:, asked.start * n : asked.stop * n]
         return found.reshape(len(rows), -1, n)
@@ -545,7 +572,7 @@ class SharedUnits(RelationUnits):
     def implication_weights(self, x: Floats, beta: float = 1.0) -> Floats:
         """See `RelationUnits`.
 
-        beta (gamma_0 + sum_q z_q gamma_q),   z = B sigmoid(beta x)
+        The weights are beta (gamma_0 + sum_q z_q gamma_q) with z = B sigmoid(beta x).
         """
         if self._B is None:
             return super().implication_weights(x, beta)
@@ -554,10 +581,10 @@ class SharedUnits(RelationUnits):
         return weight.reshape(-1, self._A)
 
     def log_odds_apart(self, context: Context, between: Between, i: Places, j: Places) -> Floats:
-        """See `RelationUnits`; to first order.
+        """See `RelationUnits`. The result is correct to first order.
 
-        ℓ_e(m) changes by sum_e' slope_e' cov(ℓ_e, ℓ_e'), cov = sum_k U_ek U_e'k m_k (1 - m_k).
-        The sum runs over the observed units e' of the pair in both directions.
+        The observed units e' of the pair, in both directions, change ℓ_e(m) by
+        sum_e' slope_e' cov(ℓ_e, ℓ_e'), where cov = sum_k U_ek U_e'k m_k (1 - m_k).
         """
         A, P = self._A, len(i)
         start, end = np.concatenate([i, j]), np.concatenate([j, i])
@@ -565,7 +592,7 @@ class SharedUnits(RelationUnits):
         if len(between.slopes):
             m, classes = sigmoid(context.y), context.classes
             z = self._w.S[classes[start]] * self._w.O[classes[end]]
-            # (2, P, A, r): both directions of each pair.
+            # q has the shape (2, P, A, r). The first axis is the direction within a pair.
             q = (z @ self._Y.reshape(len(self._F), -1).T).reshape(2, P, A, -1)
             slopes = between.slopes[:, start, end].T.reshape(2, P, A, 1).copy()
             # For a class with itself, both directions are the same unit.
@@ -581,26 +608,26 @@ class SharedUnits(RelationUnits):
 
 @lru_cache(maxsize=128)
 def all_pairs(n: int) -> tuple[Places, Places]:
-    """Return the first and second position of all pairs of n classes, (1, n²) each."""
+    """Return the indices of the first and the second class of all pairs of n classes, (1, n²)."""
     every = np.arange(n)
     return np.repeat(every, n)[None], np.tile(every, n)[None]
 
 
 def _columns(matrices: Floats) -> Floats:
-    """Convert rows of all relations (A, n, H1) to columns (H1, A n), for faster products."""
+    """Convert the n rows of each relation (A, n, H1) to columns (H1, A n), for faster products."""
     return np.ascontiguousarray(matrices.reshape(-1, matrices.shape[2]).T)
 
 
 def _asked(relations: int, only: int | None) -> slice:
-    """Return the slice of all relations, or of one; a slice avoids a copy."""
+    """Return the slice of one relation, or of all relations for None. A slice avoids a copy."""
     return slice(0, relations) if only is None else slice(only, only + 1)
 
 
 def _pair_table(weights: Weights) -> tuple[Table, tuple[Places, Places]]:
-    """Build the look-up table of `pair_rows` for the pairs of classes with a triple weight.
+    """Build the look-up table of `pair_rows`, with each pair of classes that has a triple weight.
 
     Returns:
-        Buckets and keys; and the row of the pair and the relation of each triple.
+        The table (buckets and keys), and for each triple the row of its pair and its relation.
     """
     size = weights.spec.V**2
     triples = weights.triple_keys
@@ -616,10 +643,11 @@ def _pair_table(weights: Weights) -> tuple[Table, tuple[Places, Places]]:
 
 
 def _directions(weights: Weights) -> tuple[Floats, Floats]:
-    """Return the directions F (A, r, H1), and Y (A, r, K + 1) with q = Y z, z = (S_i * O_j, 1).
+    """Return F (A, r, H1) and Y (A, r, K + 1), see `SharedUnits`.
 
-    F are the directions of largest variance of U_e·h1. The frequencies of classes and the variance
-    of h1 come from the stored scenes of the machine.
+    F are the directions of largest variance of U_e·h1. Y gives the coordinates q = Y z of a unit
+    with z = (S_i * O_j, 1). The frequencies of classes and the variance of h1 come from the stored
+    scenes of the machine.
     """
     spec = weights.spec
     rows = np.concatenate([weights["P"][:, None], weights["M"]], 1).astype(np.float64)

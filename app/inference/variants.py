@@ -1,6 +1,6 @@
 """The variants of the machine, and the specification of its sizes.
 
-A class here defines each variant by its arrays and its relation units. The service needs no other
+Each variant is a class that defines the arrays and the relation units. The service needs no other
 information about a variant. To add a variant, write a class and add it to `VARIANTS`.
 """
 
@@ -22,12 +22,15 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def feature_count(relations: int) -> int:
-    """Return F = 2A + (2A)² + 4A, the number of features of observed relations."""
+    """Return the number of features of observed relations, F = 2A + (2A)² + 4A."""
     return 2 * relations * (2 * relations + 3)
 
 
 class RBM:
-    """ℓ_t = d_t + U_t·h1 for the T triples of the training scenes; other triples have no unit."""
+    """RBM: it has a relation unit for each of the T triples of the training scenes.
+
+    The logit of unit t is ℓ_t = d_t + U_t·h1.
+    """
 
     factorised: ClassVar[bool] = False
     two_layers: ClassVar[bool] = False
@@ -45,7 +48,7 @@ class RBM:
 
 
 class GBM(RBM):
-    """ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1, with a second hidden layer."""
+    """GBM: it has a second hidden layer and the logits ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1."""
 
     two_layers = True
 
@@ -83,7 +86,9 @@ class ProductRBM(RBM):
 
 
 class Triway:
-    """A unit for every triple, ℓ_e = w_e + U_e·h1, with shared weights and a sparse residual w'.
+    """Triway: it has a unit for every triple, with shared weights and a sparse residual w'.
+
+    The logit of unit e is ℓ_e = w_e + U_e·h1, with
 
     w_e = d_a + s[a,i] + o[a,j] + sum_k S[i,k] R[a,k] O[j,k] + n[a]·(log n_i, log n_j) + w'_e
     U_e = P[a] + sum_k S[i,k] M[a,k] O[j,k]
@@ -129,17 +134,17 @@ class MachineSpec:
 
     Attributes:
         variant: ``rbm``, ``gbm``, ``triway``, or ``product_rbm`` (RBM with the Triway's U).
-        V: object classes (visible units v).
+        V: number of object classes (visible units v). All sizes below are numbers too.
         A: canonical relations.
         H1: hidden units of the first layer.
-        H2: hidden units of the second layer; 0: no second layer.
-        C: room types; a known room type shifts the biases of h1.
+        H2: hidden units of the second layer. 0 means no second layer.
+        C: room types. A known room type changes the biases of h1.
         K: rank of the shared tri-way and relation-context weights (Triway, product RBM).
-        G: rank of the context's effect on implications between relations (Triway, local form);
-            0: no implications.
-        T: relation units with their own weight: all units of RBM and GBM, the sparse residual of
-            the Triway.
-        N: stored persistent-chain samples at which new chains start; 0: no stored samples.
+        G: rank of the effect of h1 on implications between relations (Triway, local form). 0 means
+            no implications.
+        T: relation triples with their own weight. In RBM and GBM, each unit has such a weight. In
+            the Triway, the sparse residual has them.
+        N: stored persistent-chain samples. New chains start at them. 0 means no stored samples.
         form: ``seed`` (the energy of the paper) or ``local`` (locally normalised relations).
     """
 
@@ -170,7 +175,9 @@ class MachineSpec:
         if kind.factorised and self.K < 1:
             raise ValueError(f"a {self.variant} machine needs a rank K of at least 1, not {self.K}")
         if self.G and not (kind.implications and self.is_local):
-            raise ValueError(f"G must be 0 unless the machine is a local triway, not {self.G}")
+            raise ValueError(
+                f"G is {self.G}, but only a triway in the local form may have a G above 0"
+            )
         if self.H2 and not kind.two_layers:
             raise ValueError(f"an RBM has one hidden layer, so H2 must be 0, not {self.H2}")
 
@@ -190,7 +197,11 @@ class MachineSpec:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> MachineSpec:
-        """Build a specification from `to_dict`; raise ValueError for unknown or missing names."""
+        """Build a specification from the result of `to_dict`.
+
+        Raises:
+            ValueError: a name is unknown or missing, or a value is invalid.
+        """
         known = {field.name for field in fields(cls)}
         if unknown := sorted(set(values) - known):
             raise ValueError(f"unknown fields in a machine spec: {unknown}")

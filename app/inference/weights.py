@@ -1,10 +1,11 @@
 """The weights of a trained machine: their layout for all variants, and the hidden layers.
 
-The hidden layers given objects, with the second layer at its mean field:
+Given the objects, the logits x of h1 and the means m1 and m2 of the hidden layers are:
 
     x = c1 + Q[t] + v'W + J m2,   m1 = sigmoid(beta x),   m2 = sigmoid(beta (c2 + m1'J))
 
-The iteration starts at m2 = sigmoid(beta c2); beta is 1 / temperature. With one layer, x is exact.
+A mean-field iteration computes m2. It starts at m2 = sigmoid(beta c2). beta is 1 / temperature.
+With one hidden layer, x is exact.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from app.inference.relations import SWEEPS
 from app.inference.variants import MachineSpec
 
 WORD = 32
-"""Bits per word of the packed stored scenes."""
+"""Number of bits in a word of the packed stored scenes."""
 
 
 def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
     """Return the type (float or int) and the shape of each array of a machine.
 
-    All variants have these arrays; `variants` adds those of a variant.
+    All variants have the arrays below. The classes in `variants` add the arrays of each variant.
 
         b (V,), c1 (H1,), c2 (H2,), W (V, H1), J (H1, H2), Q (C, H1)
-        triples (T, 3) triples (a, i, j) with their own weight, sorted
-        fantasies (N, ceil(V / 32)) stored scenes as bits
-        fantasy_rooms (N,) room types of the stored scenes; -1: unknown
+        triples (T, 3): triples (a, i, j) with their own weight, sorted
+        fantasies (N, ceil(V / 32)): stored scenes as bits
+        fantasy_rooms (N,): room types of the stored scenes, or -1 if unknown
     """
     V, H1, H2 = spec.V, spec.H1, spec.H2
     floats: dict[str, tuple[int, ...]] = {
@@ -47,14 +48,14 @@ def layout(spec: MachineSpec) -> dict[str, tuple[type, tuple[int, ...]]]:
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """The arrays of a machine, by the names of `layout`; they never change.
+    """The constant arrays of a machine. `layout` lists their names.
 
     Attributes:
         spec: sizes and form of the machine.
-        arrays: floats in one precision, integers as int32.
+        arrays: maps names to arrays. All float arrays have one precision, and integers are int32.
 
     Raises:
-        ValueError: an array is missing, unexpected or of a wrong shape; or the triples are outside
+        ValueError: an array is missing, unexpected or of a wrong shape, or the triples are outside
             (A, V, V), repeated or not sorted.
     """
 
@@ -67,7 +68,8 @@ class Weights:
         for name in sorted(expected.keys() | found.keys()):
             if found.get(name) != expected.get(name):
                 raise ValueError(
-                    f"{name} is {found.get(name, 'missing')}, must be {expected.get(name, 'none')}"
+                    f"array {name} has the shape {found.get(name)}, but the spec needs "
+                    f"{expected.get(name)} (None means no such array)"
                 )
         table = self["triples"].astype(np.int64)
         if (table < 0).any() or (table >= [self.spec.A, self.spec.V, self.spec.V]).any():
@@ -80,18 +82,18 @@ class Weights:
 
     @property
     def triple_keys(self) -> NDArray[np.int64]:
-        """(T,) key (a V + i) V + j of each triple; ascending."""
+        """(T,) key (a V + i) V + j of each triple, ascending."""
         relation, subject, object_ = self["triples"].astype(np.int64).T
         keys: NDArray[np.int64] = (relation * self.spec.V + subject) * self.spec.V + object_
         return keys
 
     @property
     def scenes(self) -> NDArray[np.float32]:
-        """(N, V) presence of the classes in the stored scenes; unpacked at each access."""
+        """(N, V) presence of the classes in the stored scenes. Each access unpacks them again."""
         return unpack_scenes(self["fantasies"], self.spec.V)
 
     def room_bias(self, room: int | None) -> NDArray[Any]:
-        """Return c1 + Q[t], (H1,); or c1, if the room type or Q is missing."""
+        """Return the bias of h1, (H1,): c1 + Q[t], or c1 if the room type or Q is missing."""
         bias: NDArray[Any] = self["c1"]
         return bias if room is None or not self.spec.C else bias + self["Q"][room]
 
@@ -110,7 +112,7 @@ class Weights:
 
 
 def unpack_scenes(packed: NDArray[np.int32], classes: int) -> NDArray[np.float32]:
-    """Unpack scenes stored as bits, (N, words), to the presence of classes, (N, V)."""
+    """Convert scenes stored as bits, (N, words), to the presence of the classes, (N, V)."""
     octets = packed.astype("<i4").view(np.uint8).reshape(len(packed), -1)
     bits = np.unpackbits(octets, axis=1, bitorder="little", count=classes)
     return bits.astype(np.float32)

@@ -1,4 +1,4 @@
-"""The table of aliases: one small JSON file, replaced as a whole.
+"""The table of aliases: one small JSON file. Each change replaces the whole file.
 
 Format: {"default": {"name": "...", "version": "..." or null for the latest version}}
 """
@@ -22,7 +22,7 @@ _TABLE: Final = TypeAdapter(dict[ModelName, AliasTarget])
 
 
 def read_aliases(path: Path) -> dict[str, AliasTarget]:
-    """Return the target of each alias; empty if the file does not exist.
+    """Return the target of each alias. The result is empty if the file does not exist.
 
     Raises:
         StoreError: `invalid_aliases` if the file is not a valid table of aliases.
@@ -46,6 +46,9 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
 
 
 def write_aliases(path: Path, aliases: Mapping[str, AliasTarget], *, prefix: str) -> None:
-    """Replace the table; `prefix` marks the temporary file that a crash may leave behind."""
+    """Replace the table of aliases.
+
+    The name of the temporary file starts with `prefix`. A crash may leave this file behind.
+    """
     table = dict(sorted(aliases.items()))
     replace_file(path, _TABLE.dump_json(table, indent=2) + b"\n", prefix=prefix)

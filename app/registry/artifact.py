@@ -1,4 +1,4 @@
-"""One version of a model: written once, verified at every read."""
+"""Artifacts: each holds one version of a model. Each read verifies the artifact."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from app.scene.scene import Scene
 from app.scene.vocabulary import Vocabulary
 
 _DTYPES: Final = {float: "float32", int: "int32"}
-_UNSUPPORTED: Final = "the service needs a machine of the local form, with W between -64 and 64"
+_UNSUPPORTED: Final = "the service needs a machine in the local form, with W between -64 and 64"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,13 @@ class Artifact:
         weights: weights of the machine.
         vocabulary: names of its V object classes and C room types.
         calibration: conversion of log-odds into probabilities.
-        digest: SHA-256 of the manifest's bytes, hexadecimal. It changes if any file changes.
-        card: the model card, Markdown.
+        digest: SHA-256 of the manifest's bytes, hexadecimal. It changes if a file changes.
+        card: the model card in Markdown.
         path: directory of the artifact.
-        offsets: metric offsets between related objects, if the training scenes had poses.
-        oracle: function that returns the posterior of a scene, for machines without closed form;
-            used in training only.
+        offsets: offsets in metres between related objects, or None if the training scenes had no
+            poses.
+        oracle: function that returns the posterior of a scene, for machines without closed form.
+            Only training uses it.
     """
 
     manifest: Manifest
@@ -63,22 +64,22 @@ class Artifact:
 
     @cached_property
     def spec(self) -> MachineSpec:
-        """The shape of the machine."""
+        """Sizes and form of the machine."""
         return self.weights.spec
 
     @cached_property
     def scorer(self) -> ContextScorer:
-        """Scorer of all object classes; built on first access."""
+        """Scorer of all object classes. The first access builds it."""
         return ContextScorer(self.weights["W"])
 
     @cached_property
     def closed_form(self) -> ClosedForm:
-        """Log-odds in closed form; built on first access."""
+        """Log-odds in closed form. The first access builds them."""
         return ClosedForm(self.weights)
 
     @cached_property
     def completions(self) -> Completions | None:
-        """Posterior of unlisted classes; None for machines without stored samples."""
+        """Posterior of unlisted classes, or None for machines without stored samples."""
         if not Completions.fits(self.weights):
             return None
         return Completions(self.weights, self.vocabulary.structure, self.scorer)
@@ -90,18 +91,18 @@ class Artifact:
 
     @cached_property
     def popularity(self) -> NDArray[np.float64] | None:
-        """(V,) log-odds of each class in a training scene; None if the calibration lacks them."""
+        """(V,) log-odds that a training scene has the class. None if the calibration lacks them."""
         found = self.calibration.popularity
         return np.array(found) if found else None
 
     @cached_property
     def empty_gain(self) -> NDArray[np.float32]:
-        """(V,) contribution of the context to the log-odds of each class in an empty scene."""
+        """(V,) contribution of h1 to the log-odds of each class in an empty scene."""
         gain: NDArray[np.float32] = self.scorer.gain(self.weights["c1"])
         return gain
 
     def context_rows(self) -> NDArray[np.float32]:
-        """(T, H1) input of each relation triple with its own weight to the context units."""
+        """Return the weights between each triple and h1, (T, H1), for triples with own weights."""
         relation, subject, object_ = self.weights["triples"].astype(np.int64).T.copy()
         return self.spec.kind.units(self.weights).rows_of(relation, subject, object_)
 
@@ -121,13 +122,13 @@ def write_artifact(
     """Write an artifact into a new directory and sync it to disk.
 
     Args:
-        directory: the new directory; its parent must exist.
+        directory: the new directory. Its parent must exist.
         description: the manifest without its entries about files.
-        state: the arrays of `layout`, and optionally `Offsets.tensors()`.
+        state: maps names to arrays: the arrays of `layout`, and optionally `Offsets.tensors()`.
         storage_dtype: dtype of floating-point tensors with two or more axes; see `pack`.
 
     Raises:
-        ArtifactError: an artifact cannot store a tensor; see `pack`.
+        ArtifactError: the artifact format cannot store a tensor; see `pack`.
         OSError: the file system refused an operation.
     """
     weights, tensors = pack(state, storage_dtype)
@@ -156,12 +157,14 @@ def load_artifact(
 
     Args:
         directory: directory with exactly the three files of an artifact.
-        previous: an artifact loaded before. If the digest of the verified files is unchanged,
-            `previous` itself is returned instead of a second copy.
-        max_weights_bytes: maximum size of the weights file, checked before it is read.
+        previous: an artifact loaded before. If the verified files have its digest, the function
+            returns `previous` instead of a second copy.
+        max_weights_bytes: maximum size of the weights file. The function checks the size before it
+            reads the file.
 
     Raises:
-        ArtifactError: code and reason of the first error found.
+        ArtifactError: the artifact is invalid. The exception has the code and the reason of the
+            first error found.
     """
     files = read_verified(directory, max_weights_bytes)
     if previous is not None and previous.digest == files.digest:

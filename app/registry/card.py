@@ -18,49 +18,53 @@ _RESEARCH_WARNING = """\
 > trained only on freely licensed scenes do not carry this warning."""
 
 _INTENDED_USE = """\
-For a robot that has recognised the objects of a scene like the scenes of the sources below. The
-model answers four questions: Which spatial relations hold between the objects? Which object is
-missing, and where would it stand? Which object does not belong? What does such a scene look
-like?"""
+A robot recognises the objects of a scene and asks the model about them. The scene should resemble
+the scenes of the data sources below. The model answers four questions: Which spatial relations hold
+between the objects? Which object is missing, and where would it be? Which object does not belong?
+What does a similar scene look like?"""
 
 _MEASURED = """\
-Measured on test scenes of each source, which training and calibration did not use. Brackets hold
-95 % intervals. The manifest has the number of answers behind each figure."""
+The figures come from test scenes of each source. Training and calibration did not use these scenes.
+Brackets contain 95 % confidence intervals. The manifest has the number of answers behind each
+figure."""
 
 _FINAL_FIT = """\
-The figures belong to a first fit without the test scenes. The weights here come from a second fit
-of the same configuration to nine tenths of all scenes. Its calibration used the other tenth."""
+The figures below measure a first training run without the test scenes. The published weights come
+from a second training run with the same configuration on nine tenths of all scenes. The calibration
+of the second run used the other tenth."""
 
 _PROBABILITIES = """\
-The probabilities are calibrated on validation scenes. A perfect calibration has ECE 0 and Brier
-skill 1; at Brier skill 0, the base rate would do as well. The probabilities mean:
+The probabilities are calibrated on validation scenes. Perfect probabilities have an expected
+calibration error (ECE) of 0 and a Brier skill of 1. A Brier skill of 0 means that the base rate is
+equally good. The probabilities mean:
 
 - relations: the relation holds between the two objects
 - placements: the relation holds between the missing object and an object of the scene
-- missing: the class is in the scene although it was not listed; at a place: the class is in the
-  scene and stands at this place
+- missing: the class is in the scene although it was not listed; in answers about a place: the class
+  is in the scene and at this place
 - outliers: the object is an intruder, if half of the scenes contain an intruder; at the default
   threshold, about 10 % of the unchanged scenes of the hardest large source raise an alarm
 - misplaced: the relation is false, if half of the scenes contain an altered relation"""
 
 _OFFSETS = """\
-Offsets of placements, by relation. Coverage is the share of objects inside the ellipse (in the
-plane) or the ellipsoid that mean and standard deviations predict for 80 % of them. The distance
-is that from the mean, compared with a mean that depends on the relation alone."""
+The rows "Offsets" measure the offsets of placements by relation. Mean and standard deviations
+predict an ellipse (in the plane) or an ellipsoid for 80 % of the objects. Coverage is the share of
+objects inside it. The distance is the distance of an object from the mean. It is compared with the
+distance from a mean that depends on the relation alone."""
 
 _LIMITS = """\
-- The model knows classes, not instances. It says whether a class belongs to a scene, but not how
-  many objects of the class belong there.
+- The model scores classes, not instances. It predicts whether a class belongs to a scene, but not
+  how many objects of the class belong there.
 - Annotators list only a few relations of each scene. An unlisted relation counts as wrong in
   R-precision although it may be true.
-- Left and front refer to the viewer's axes. For sources without a viewer, training chose one, and
-  these two relations depend on that choice.
-- Offsets say where an object usually stands. They ignore free space, and the size and heading of
+- Left and front refer to the viewer's axes. If a source has no viewer, training chose one. Both
+  relations depend on this choice.
+- Offsets predict where an object usually is. They ignore free space, and the size and heading of
   the other object.
-- The model does not know labels outside its vocabulary. It accepts structure and vague labels
+- The model does not know labels outside its vocabulary. It accepts structural and vague labels
   (floor, sky, object), but never proposes them.
-- The figures do not apply to scenes unlike the scenes of the sources above. They do not apply
-  either if the robot saw only a small part of the scene.
+- The figures do not apply if a scene differs from the scenes of the sources above, or if the robot
+  saw only a small part of the scene.
 - A probability is a statistical statement about such scenes, not a safety check. Do not let a
   robot move an object, or leave it in place, because of this answer alone."""
 

@@ -1,4 +1,4 @@
-"""The description of a model by its trainer, without weights and files."""
+"""The description of a model, as training writes it: metadata without weights and files."""
 
 from __future__ import annotations
 
@@ -33,21 +33,22 @@ Floats = NDArray[np.floating[Any]]
 
 ItemT = TypeVar("ItemT")
 Many = Annotated[tuple[ItemT, ...], FailFast()]
-"""A tuple whose validation stops at the first invalid item; a million errors take gigabytes."""
+"""A tuple whose validation stops at the first invalid item. A million errors would take gigabytes
+of memory."""
 
 
 def _in_utc(moment: datetime) -> datetime:
     try:
         return moment.astimezone(UTC)
     except OverflowError:
-        raise ValueError("must be in the years 1 to 9999 in UTC") from None
+        raise ValueError("the time must be in the years 1 to 9999 in UTC") from None
 
 
 Timestamp = Annotated[AwareDatetime, AfterValidator(_in_utc)]
 
 
 def to_json(value: Any) -> str:
-    """Return one line of strict JSON; raise ValueError for NaN and infinity."""
+    """Return a value as one line of JSON. Raise ValueError for NaN and infinity."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
@@ -60,7 +61,7 @@ class Frozen(BaseModel):
 class CountSlope(Frozen):
     """Calibration of a logit z: log-odds = intercept + slope·z + log_count·log n.
 
-    The meaning of n depends on the question; for outliers, n is the number of classes in the scene.
+    The meaning of n depends on the question. For outliers, n is the number of classes in the scene.
     """
 
     intercept: float = 0.0
@@ -68,7 +69,7 @@ class CountSlope(Frozen):
     log_count: float = 0.0
 
     def log_odds(self, z: Floats, n: int | NDArray[np.integer[Any]]) -> Floats:
-        """Return the log-odds (N,) of logits z (N,); n is a number or an array (N,)."""
+        """Return the log-odds of logits z, both (N,). n is a number or an array (N,)."""
         found: Floats = self.intercept + self.log_count * np.log(n) + self.slope * z
         return found
 
@@ -78,7 +79,8 @@ class PairSlope(CountSlope):
 
     It adds log_classes·log(number of classes in the scene) to the formula of `CountSlope`, because
     annotators list a smaller share of the relations in a larger scene. n is the number of instance
-    pairs of both classes. Each bend (at, change) adds change·(x - at) to a sum x > at.
+    pairs of both classes. The result x then runs through a piecewise-linear curve: each bend (at,
+    change) adds change·(x - at) if x is above ``at``.
     """
 
     log_classes: float = 0.0
@@ -89,7 +91,7 @@ PairSlopes = Annotated[Many[PairSlope], Field(max_length=len(CANONICAL))]
 
 
 class Slope(Frozen):
-    """intercept + slope·z."""
+    """Calibration of a logit z without counts: log-odds = intercept + slope·z."""
 
     intercept: float = 0.0
     slope: float = 1.0
@@ -102,7 +104,7 @@ _RETIRED = frozenset(
 
 
 class Thresholds(Frozen):
-    """Minimum probability of an alarm, by sensitivity."""
+    """Minimum probability of an alarm for each sensitivity."""
 
     low: Annotated[float, Field(ge=0, le=1)] = 0.5
     medium: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -110,12 +112,14 @@ class Thresholds(Frozen):
 
 
 class EvidenceWeights(Frozen):
-    """Weights of observed relations in the context, by kind of evidence and of question.
+    """Weights with which observed relations act on the hidden units.
 
     Attributes:
-        relations_on_objects, relations_on_relations: weights of relations that a request states,
-            for questions about objects and about relations.
-        poses_on_objects, poses_on_relations: the same for relations derived from poses.
+        relations_on_objects: weight of relations that a request states, for questions about
+            objects.
+        relations_on_relations: weight of these relations for questions about relations.
+        poses_on_objects: weight of relations derived from poses, for questions about objects.
+        poses_on_relations: weight of these relations for questions about relations.
     """
 
     relations_on_objects: Annotated[float, Field(ge=0, le=1)] = 1.0
@@ -125,32 +129,35 @@ class EvidenceWeights(Frozen):
 
 
 class Calibration(Frozen):
-    """Calibration: conversion of a machine's log-odds into probabilities.
+    """The conversion of a machine's log-odds into probabilities.
 
-    The defaults change only the log-odds of unlisted classes; see `coverage`.
+    With the default values, only `coverage` changes log-odds: those of unlisted classes.
 
     Attributes:
-        coverage: probability that a class in the scene is listed; a request may override it.
-        coverage_weight: weight of the partial posterior in the log-odds, chosen on validation
-            scenes. The rest is the closed form with unlisted classes absent.
-        missing: calibration of the posterior log-odds of an unlisted class; n is the number of
+        coverage: probability that a request lists a class of the scene. A request may override it.
+        coverage_weight: weight of the log-odds under partial coverage, chosen on validation scenes.
+            The remaining weight belongs to the closed form, where unlisted classes are absent.
+        missing: calibration of the posterior log-odds of an unlisted class. n is the number of
             listed classes.
         evidence: weights of observed relations.
-        popularity: (V,) log-odds of each class in a training scene; empty: equal for all classes.
-        popularity_weight: alpha; the prior of an intruder is proportional to popularity^alpha.
+        popularity: (V,) log-odds that a training scene has the class. If empty, all classes are
+            equal.
+        popularity_weight: exponent alpha. The prior of an intruder is proportional to
+            popularity^alpha.
         outlier_thresholds: minimum probability of an outlier.
-        short_list_thresholds: outlier thresholds for scenes of 1, 2, ... classes without structure;
-            larger scenes use `outlier_thresholds`.
+        short_list_thresholds: outlier thresholds for scenes of 1, 2, ... classes, without
+            structural classes. Larger scenes use `outlier_thresholds`.
         misplaced_thresholds: minimum probability of a misplaced relation.
-        smallest: (C + 1,) number of classes that 90 % of the real rooms of each type reach; the
-            last entry is for all rooms together. Empty: no minimum.
-        room_fit: (C,) value of log p(v | room type) / p(v), up to a constant, that 85 % of the
-            real rooms of each type reach. Empty: no minimum.
+        smallest: (C + 1,) minimum number of classes in a generated room of each type. 90 % of the
+            real rooms reach it. The last entry is for all rooms. If empty, there is no minimum.
+        room_fit: (C,) minimum of log p(v | room type) / p(v), up to a constant, for a generated
+            room of each type. 85 % of the real rooms reach it. If empty, there is no minimum.
         outlier: calibration from the log-odds of presence to the log-odds of an intruder.
-        relation: one entry per canonical relation.
-        relation_given: entries for scenes with observed relations; if empty, `relation`.
-        placement: entries for a missing object at its most probable places; if empty, `relation`.
-        asked_place: entries for the place that a request names; if empty, `placement`.
+        relation: one entry for each canonical relation.
+        relation_given: entries for scenes with observed relations. If empty, `relation` applies.
+        placement: entries for a missing object at its most probable places. If empty, `relation`
+            applies.
+        asked_place: entries for the place that a request names. If empty, `placement` applies.
         misplaced: calibration from the log-odds of a relation to the log-odds that it is false.
     """
 
@@ -187,7 +194,7 @@ class Calibration(Frozen):
 
 
 class ClassEntry(Frozen):
-    """One object class; `size` is its typical extent (x, y, z) in metres."""
+    """One object class. `size` is its typical extent (x, y, z) in metres."""
 
     label: Text
     aliases: Many[Text] = ()
@@ -206,13 +213,15 @@ class VocabularyEntry(Frozen):
     @model_validator(mode="after")
     def _is_a_vocabulary(self) -> Self:
         if self.relations != CANONICAL[: len(self.relations)]:
-            raise ValueError(f"relations must be the first of {CANONICAL}, in this order")
+            raise ValueError(
+                f"relations must be the first entries of {CANONICAL}, in the same order"
+            )
         self._words = Vocabulary.from_dict(self.model_dump(mode="json", exclude={"relations"}))
         return self
 
     @classmethod
     def of(cls, vocabulary: Vocabulary, relations: int = len(CANONICAL)) -> Self:
-        """Return the entry of a vocabulary, for a machine of A = ``relations`` relations."""
+        """Return the entry of a vocabulary for a machine with A = ``relations`` relations."""
         return cls.model_validate({**vocabulary.to_dict(), "relations": CANONICAL[:relations]})
 
     def vocabulary(self) -> Vocabulary:
@@ -221,7 +230,7 @@ class VocabularyEntry(Frozen):
 
 
 class DataSource(Frozen):
-    """One source of training scenes: its name, size, digest and terms."""
+    """One source of training scenes: its name, number of scenes, digest and terms of use."""
 
     source: Text
     scenes: Count
@@ -231,7 +240,10 @@ class DataSource(Frozen):
 
 
 class Metric(Frozen):
-    """One measured figure with its 95 % interval over n units (scenes, removed objects, ...)."""
+    """One measured figure with its 95 % confidence interval [low, high].
+
+    n is the number of measured units, such as scenes or removed objects.
+    """
 
     task: Text
     source: Text
@@ -257,10 +269,10 @@ class Description(Frozen):
         spec: `MachineSpec.to_dict()`.
         vocabulary: V object classes, A relations and C room types, in the order of the units.
         calibration: conversion of log-odds into probabilities.
-        training: configuration and seed of the training, free JSON.
+        training: configuration and seed of the training, as JSON without a schema.
         data: sources of the training scenes.
         metrics: figures measured on held-out scenes.
-        terms: licence of the weights.
+        terms: terms of use of the weights.
         libraries: versions of the libraries used in training.
     """
 
@@ -300,12 +312,18 @@ class Description(Frozen):
             ),
         ):
             if self.spec.get(name) != length:
-                raise ValueError(f"{length} {what}, but {name} = {self.spec.get(name)} in the spec")
+                raise ValueError(
+                    f"the description has {length} {what}, but the spec has "
+                    f"{name} = {self.spec.get(name)}"
+                )
         if (rooms := self.spec.get("C", 0)) not in (0, len(words.room_types)):
-            raise ValueError(f"{len(words.room_types)} room types, but C = {rooms} in the spec")
+            raise ValueError(
+                f"the vocabulary has {len(words.room_types)} room types, but the spec has "
+                f"C = {rooms}"
+            )
         return self
 
     @property
     def variant(self) -> str:
-        """rbm, gbm or triway."""
+        """Variant of the machine, such as triway."""
         return str(self.spec.get("variant"))

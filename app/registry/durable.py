@@ -1,7 +1,7 @@
 """Writing files so that a crash leaves either the old state or the new state.
 
-A rename is atomic for readers. To survive a power cut, it also needs the file's bytes on disk
-before the rename, and the directory's entry on disk afterwards. The calls of fsync ensure both.
+A rename is atomic for readers. To survive a power failure, the file's bytes must be on disk before
+the rename, and the directory entry after it. The calls of fsync ensure both.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Create a new file and sync its bytes to disk; raise FileExistsError if it exists."""
+    """Create a new file and sync its bytes to disk. Raise FileExistsError if it exists."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     with os.fdopen(descriptor, "wb") as file:
         file.write(data)
@@ -30,7 +30,10 @@ def sync_directory(path: Path) -> None:
 
 
 def make_directory(path: Path) -> None:
-    """Create a directory and its missing parents, and sync them to disk; it may already exist."""
+    """Create a directory and its missing parents, and sync them to disk.
+
+    An existing directory is left unchanged.
+    """
     if path.is_dir():
         return
     make_directory(path.parent)
@@ -45,7 +48,11 @@ def rename(source: Path, target: Path) -> None:
 
 
 def replace_file(path: Path, data: bytes, *, prefix: str) -> None:
-    """Replace the contents of a file atomically; `prefix` marks the temporary file beside it."""
+    """Replace the contents of a file atomically.
+
+    The new contents are first in a temporary file in the same directory. Its name starts with
+    `prefix`.
+    """
     temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}")
     try:
         write_file(temporary, data)

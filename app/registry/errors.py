@@ -1,4 +1,4 @@
-"""Errors of the registry: each has a code for programs and a reason for people."""
+"""Errors of the registry. Each error has a machine-readable code and a reason in words."""
 
 from __future__ import annotations
 
@@ -82,7 +82,10 @@ class StoreError(RegistryError):
 
 
 def cause(error: OSError) -> str:
-    """Return the message of the operating system, without the path that str(error) would show."""
+    """Return the message of the operating system for an error.
+
+    Unlike str(error), the message contains no path.
+    """
     if error.errno == errno.ELOOP:
         return "the path contains a symbolic link, which the store does not follow"
     return os.strerror(error.errno) if error.errno is not None else "input/output error"

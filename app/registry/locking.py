@@ -1,4 +1,4 @@
-"""A lock for one writer at a time, across processes."""
+"""A lock between processes, so that only one process writes at a time."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def exclusive(path: Path, timeout: float) -> Iterator[None]:
     The kernel releases the lock when the process ends, even after a crash.
 
     Args:
-        path: the lock file; created if missing, and never removed.
-        timeout: seconds to wait for another holder.
+        path: the lock file. The function creates it if it is missing, and never removes it.
+        timeout: time in seconds to wait for another process that holds the lock.
 
     Raises:
         StoreError: `locked`, if another process still holds the lock after ``timeout``.
@@ -40,7 +40,7 @@ def _wait(descriptor: int, timeout: float) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() >= deadline:
-                waited = f"another writer has held the store for {timeout:g} s"
+                waited = f"another process has held the lock of the store for {timeout:g} s"
                 raise StoreError("locked", waited) from None
             time.sleep(0.01)
         else:

@@ -1,8 +1,8 @@
 """The manifest of an artifact: the description of the model and the checksums of its files.
 
-A manifest is a JSON object with one top-level member per line. Its last line is the SHA-256 of all
-bytes before it. The checksum reveals a truncated or altered manifest before it is parsed. The
-checksums of the other files are then trustworthy too.
+A manifest is a JSON object with one top-level member per line. The last member is the SHA-256 of
+all bytes before it. This checksum reveals a truncated or altered manifest before it is parsed. It
+also protects the checksums of the other files, because the manifest contains them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from app.registry.offsets import PREFIX
 
 FORMAT: Final = 2
 READABLE: Final = (1, FORMAT)
-"""Format 1 does not support offsets; in format 2 they are optional."""
+"""Readable formats. Format 1 has no offsets. In format 2, offsets are optional."""
 MAX_TENSORS: Final = 10_000
 WEIGHTS: Final = "model.safetensors"
 CARD: Final = "card.md"
@@ -59,7 +59,7 @@ class Manifest(Description):
     @classmethod
     def _names_every_file(cls, files: dict[str, FileEntry]) -> dict[str, FileEntry]:
         if set(files) != {WEIGHTS, CARD}:
-            raise ValueError(f"must name exactly {WEIGHTS} and {CARD}")
+            raise ValueError(f"the files must be exactly {WEIGHTS} and {CARD}")
         return files
 
     def to_bytes(self) -> bytes:
@@ -75,7 +75,8 @@ class Manifest(Description):
         """Parse the contents of a manifest file.
 
         Raises:
-            ArtifactError: `truncated`, `checksum_mismatch`, `unknown_format`, `invalid_manifest`.
+            ArtifactError: with code `truncated`, `checksum_mismatch`, `unknown_format` or
+                `invalid_manifest`.
         """
         trailer = _TRAILER.search(data)
         if trailer and hashlib.sha256(data[: trailer.start()]).hexdigest().encode() != trailer[1]:
@@ -83,7 +84,10 @@ class Manifest(Description):
         members = _parse(data, complete=trailer is not None)
         if not _is_known_format(members.get("format")):
             known = " and ".join(map(str, READABLE))
-            raise ArtifactError("unknown_format", f"{MANIFEST}: this release reads formats {known}")
+            raise ArtifactError(
+                "unknown_format",
+                f"{MANIFEST} has an unknown format; this release reads only formats {known}",
+            )
         if not trailer:
             raise ArtifactError("invalid_manifest", f"{MANIFEST} does not end with its checksum")
         del members["checksum"]

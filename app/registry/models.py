@@ -1,4 +1,4 @@
-"""The loaded store: an immutable snapshot that a service replaces as a whole."""
+"""The loaded store: an immutable snapshot of all models. A refresh replaces the whole snapshot."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ _logger = logging.getLogger("app.registry")
 
 @dataclass(frozen=True, slots=True)
 class ArtifactFailure:
-    """The reason for a refused version; unlike an exception, it holds no frames or weights."""
+    """The reason why a version was refused.
+
+    Unlike an exception, this object does not keep stack frames or weights in memory.
+    """
 
     code: ArtifactCode
     reason: str
@@ -37,9 +40,9 @@ class ModelSet:
     """The state of a store at one moment.
 
     Attributes:
-        entries: artifact or failure of each published (name, version).
-        aliases: target of each alias.
-        failure: reason why the store or its aliases could not be read; None if they were read.
+        entries: maps each published (name, version) to its artifact or its failure.
+        aliases: maps each alias to its target.
+        failure: reason why the store or its aliases could not be read, or None.
     """
 
     entries: Mapping[tuple[str, str], Artifact | ArtifactFailure]
@@ -48,7 +51,7 @@ class ModelSet:
 
     @cached_property
     def versions(self) -> Mapping[str, tuple[str, ...]]:
-        """Versions of each model, ascending, including refused versions."""
+        """Maps each model to its versions, ascending, including refused versions."""
         found: dict[str, list[str]] = {}
         for name, version in sorted(self.entries, key=lambda key: (key[0], version_key(key[1]))):
             found.setdefault(name, []).append(version)
@@ -56,7 +59,7 @@ class ModelSet:
 
     @cached_property
     def failures(self) -> Mapping[tuple[str, str], ArtifactFailure]:
-        """The refused versions, with reasons."""
+        """Maps each refused (name, version) to its reason."""
         return MappingProxyType(
             {key: e for key, e in self.entries.items() if isinstance(e, ArtifactFailure)}
         )
@@ -64,11 +67,11 @@ class ModelSet:
     def resolve(self, reference: str) -> Artifact:
         """Return the model that an alias, `name` or `name@version` points at.
 
-        An older version never replaces a refused version.
+        If this version was refused, the method does not fall back to an older version.
 
         Raises:
             ArtifactError: the version was refused.
-            StoreError: see `resolve_reference`; or the store could not be read.
+            StoreError: see `resolve_reference`, or the store could not be read.
         """
         try:
             key = resolve_reference(
@@ -86,7 +89,7 @@ class ModelSet:
 
     @cached_property
     def default_failure(self) -> str | None:
-        """The reason why the default model is not usable; None if it is usable."""
+        """The reason why the default model is not usable, or None if it is usable."""
         try:
             self.resolve("default")
         except RegistryError as error:
@@ -102,14 +105,15 @@ class ModelSet:
 def load_model_set(store: Store, previous: ModelSet | None = None) -> ModelSet:
     """Load and verify every version of a store.
 
-    Errors in the store are part of the result, not raised: refused versions, unreadable aliases or
-    a missing store. Artifacts of `previous` with an unchanged digest are reused after their files
-    have been verified again.
+    The function raises no exception for errors in the store, such as refused versions, unreadable
+    aliases or a missing store. The result contains these errors. The function verifies all files
+    again. It reuses artifacts of `previous` whose digest is unchanged.
     """
     failure: StoreFailure | None = None
     aliases: Mapping[str, AliasTarget]
     try:
-        # Before the versions: an alias is written after its target, so the list has each target.
+        # Aliases are read before versions. Writers publish a version before its alias, so the list
+        # of versions contains the target of each alias.
         aliases = store.aliases()
     except StoreError as error:
         aliases, failure = {}, StoreFailure(error.code, error.reason)
@@ -137,8 +141,9 @@ def _load(
     except StoreError as error:  # the version was removed after it was listed
         return ArtifactFailure("missing_file", error.reason)
     except Exception as error:
-        # Including MemoryError: other versions may need less memory.
+        # This includes MemoryError, because other versions may need less memory.
         _logger.exception("%s@%s could not be loaded", name, version)
         return ArtifactFailure(
-            "unexpected_error", f"loading failed with {type(error).__name__}; the log says why"
+            "unexpected_error",
+            f"loading failed with {type(error).__name__}; the log has the details",
         )

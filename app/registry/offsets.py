@@ -1,8 +1,8 @@
-"""Offsets between related objects in metres, by relation and pair of classes.
+"""Offsets between related objects in metres, for each relation and pair of classes.
 
 An offset is the vector from the centre of a relation's object to the centre of its subject, in the
-viewer's axes (x away from the viewer, y left, z up). The table holds canonical relations only. The
-offset of the opposite relation is the negative offset with both classes exchanged.
+viewer's axes (x away from the viewer, y left, z up). The tables contain only canonical relations.
+The opposite relation, with both classes exchanged, has the negative offset.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ Table = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
 
 PREFIX: Final = "offsets."
-"""Prefix of the names of offset tensors, which share a file with the machine's tensors."""
+"""Prefix of the names of offset tensors. They are in the same file as the machine's tensors."""
 
 NOTHING: Final = -1
-"""Value instead of a number of scenes, if the relation never occurred in training."""
+"""Number of scenes that `Offsets.find` returns if the relation never occurred in training."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,9 @@ class Offsets:
     Attributes:
         relation: (A, 6) mean and variance of x, y and z for any two classes.
         relation_scenes: (A,) number of training scenes with the relation.
-        subject, object: (A, V, 6) additions of a class at this end to mean and variance.
-        pair: (P,) pairs that training scenes contain, (a V + subject) V + object, ascending.
+        subject, object: (A, V, 6) terms that each class adds to mean and variance, as subject and
+            as object of the relation.
+        pair: (P,) key (a V + subject) V + object of each pair in the training scenes, ascending.
         pair_offset: (P, 6) mean and standard deviation of each pair.
         pair_scenes: (P,) number of training scenes with the pair in this relation.
     """
@@ -59,7 +60,7 @@ class Offsets:
         """Rebuild the offsets of a machine with A relations and V classes from `tensors()`.
 
         Raises:
-            ArtifactError: `wrong_shape`, `invalid_tensor`.
+            ArtifactError: `wrong_shape` or `invalid_tensor`.
         """
         shapes = {
             "relation": (A, 6),
@@ -74,7 +75,10 @@ class Offsets:
             shape = shapes.get(name.removeprefix(PREFIX))
             found = tensors[name].shape if name in tensors else None
             if found != shape:
-                raise ArtifactError("wrong_shape", f"tensor '{name}' is {found}, must be {shape}")
+                raise ArtifactError(
+                    "wrong_shape",
+                    f"tensor '{name}' has the shape {found}, but the shape must be {shape}",
+                )
         offsets = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
         if complaint := offsets._complaint(A * V * V):
             raise ArtifactError("invalid_tensor", f"offsets: {complaint}")
@@ -83,9 +87,9 @@ class Offsets:
     def _complaint(self, most: int) -> str | None:
         counted = (self.relation_scenes, self.pair, self.pair_scenes)
         if not all(np.issubdtype(array.dtype, np.integer) for array in counted):
-            return "pairs and scenes must be integers"
+            return "pair, pair_scenes and relation_scenes must be integers"
         if (np.diff(self.pair) <= 0).any() or (self.pair[:1] < 0).any():
-            return "pairs must be in ascending order"
+            return "the keys in pair must be non-negative and in ascending order"
         if (self.pair[-1:] >= most).any():
             return "a pair has a class outside the vocabulary"
         if (self.relation_scenes < 0).any() or (self.pair_scenes < 1).any():
@@ -101,12 +105,14 @@ class Offsets:
         """Return the offsets of n pairs of classes in given relations.
 
         Args:
-            relation, subject, other: (n,) canonical relations and classes.
+            relation: (n,) indices of canonical relations.
+            subject, other: (n,) indices of the subject and object classes.
 
         Returns:
             (n, 6) mean and standard deviation, and (n,) number of training scenes with the pair.
-            The number is 0 if the offset comes from the relation and the two classes separately,
-            and `NOTHING` if the relation never occurred in training.
+            For a pair without training scenes, the offset comes from the relation and the two
+            classes separately, and the number is 0. If the relation never occurred in training,
+            the number is `NOTHING`.
         """
         found: tuple[NDArray[np.float64], NDArray[np.int64]]
         found = look_up(self.tables, relation, subject, other)
@@ -114,7 +120,7 @@ class Offsets:
 
     @cached_property
     def tables(self) -> tuple[NDArray[Any], ...]:
-        """The arrays in the order of `look_up`."""
+        """The arrays in the order that `look_up` expects."""
         return (
             *(self.relation, self.relation_scenes, self.subject, self.object),
             *(self.pair, self.pair_offset, self.pair_scenes),

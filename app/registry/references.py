@@ -1,7 +1,7 @@
-"""Names, versions and aliases: their spelling, their order, and the target of a reference.
+"""Names, versions and aliases: the valid spellings, the order of versions, and references.
 
 A reference is an alias, `name` (the latest version of the model) or `name@version`. Every valid
-name is also a safe file name: lower case, without separators or a leading dot.
+name is also a safe file name: it is in lower case, without separators or a leading dot.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ def is_version(text: str) -> bool:
 
 def _require_name(text: str) -> str:
     if not is_name(text):
-        raise ValueError("must have 1 to 64 characters a-z, 0-9, '_', '-'; first and last a-z, 0-9")
+        raise ValueError(
+            "must have 1 to 64 characters a-z, 0-9, '_' or '-', and must start and end with a-z "
+            "or 0-9"
+        )
     return text
 
 
@@ -45,7 +48,7 @@ Version = Annotated[str, AfterValidator(_require_version)]
 
 
 class AliasTarget(BaseModel):
-    """The target of an alias: one version, or the latest version (`version` null)."""
+    """The target of an alias: one version, or the latest version if `version` is null."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -57,7 +60,7 @@ class AliasTarget(BaseModel):
 
 
 def check_name(text: str, what: str = "model name") -> str:
-    """Return text, or raise StoreError (`invalid_reference`)."""
+    """Return text if it is a valid name, else raise StoreError (`invalid_reference`)."""
     try:
         return _require_name(text)
     except ValueError as error:
@@ -65,7 +68,7 @@ def check_name(text: str, what: str = "model name") -> str:
 
 
 def check_version(text: str) -> str:
-    """Return text, or raise StoreError (`invalid_reference`)."""
+    """Return text if it is a valid version, else raise StoreError (`invalid_reference`)."""
     try:
         return _require_version(text)
     except ValueError as error:
@@ -73,7 +76,7 @@ def check_version(text: str) -> str:
 
 
 def version_key(version: str) -> tuple[int, ...]:
-    """Sort key: versions are ordered number by number."""
+    """Return the sort key of a version: its three numbers."""
     return tuple(int(part) for part in version.split("."))
 
 
@@ -86,8 +89,10 @@ def resolve_reference(
 
     Args:
         reference: alias, `name`, or `name@version`.
-        aliases: targets by alias; an alias takes precedence over a model of the same name.
-        versions: returns the versions of a model, ascending; empty for an unknown model.
+        aliases: maps each alias to its target. An alias takes precedence over a model of the same
+            name.
+        versions: function that returns the versions of a model, ascending. For an unknown model,
+            it returns an empty sequence.
 
     Raises:
         StoreError: `invalid_reference`, `unknown_model`, `unknown_version` or `dangling_alias`.

@@ -1,4 +1,4 @@
-"""The relation entries of a calibration as arrays, for the compiled kernels."""
+"""The relation entries of a calibration, as arrays for the compiled kernels."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ Table = NDArray[np.float32]
 class RelationSlopes:
     """Calibration tables of the A canonical relations, each (A, 4 + 2K).
 
-    A row holds intercept, slope, log_count, log_classes and K bends.
+    Each row belongs to one relation. It contains intercept, slope, log_count, log_classes and K
+    bends of two numbers each.
 
     Attributes:
-        alone: for scenes without observed relations.
-        given: for scenes with observed relations.
-        placement: for a missing object at its most probable places.
-        asked_place: for a missing object at the place that a request names.
+        alone: table for scenes without observed relations.
+        given: table for scenes with observed relations.
+        placement: table for a missing object at its most probable places.
+        asked_place: table for a missing object at the place that a request names.
     """
 
     alone: Table
@@ -32,7 +33,7 @@ class RelationSlopes:
 
     @classmethod
     def of(cls, calibration: Calibration) -> RelationSlopes:
-        """Build the tables of a calibration; an empty kind uses the entries of another kind."""
+        """Build the tables of a calibration. `Calibration` says what replaces empty entries."""
         alone = calibration.relation
         placement = calibration.placement or alone
         return cls(

@@ -4,7 +4,7 @@
     <root>/aliases.json
 
 Readers need no lock, because writers publish a version or change an alias by one atomic rename.
-Writers hold a lock, so a temporary file that a writer finds comes from a crashed writer.
+Writers hold a lock. So if a writer finds a temporary file, it comes from a crashed writer.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Store:
 
     Args:
         root: directory of the store; the first publication creates it.
-        lock_timeout: seconds that a writer waits for another writer.
+        lock_timeout: time in seconds that a writer waits for another writer.
         max_weights_bytes: maximum size of a version's weights file.
     """
 
@@ -72,7 +72,7 @@ class Store:
     # -- reading --------------------------------------------------------------------------------
 
     def names(self) -> tuple[str, ...]:
-        """Return the sorted names of models with a version or an unreadable folder.
+        """Return the sorted names of models that have a version or an unreadable folder.
 
         Raises:
             StoreError: `unreadable` if the root is not a readable directory.
@@ -80,11 +80,11 @@ class Store:
         return tuple(name for name in self._folders() if self._may_hold_versions(name))
 
     def versions(self, name: str) -> tuple[str, ...]:
-        """Return the published versions of a model, ascending; empty for an unknown model.
+        """Return the published versions of a model, ascending. The result may be empty.
 
-        A folder without a manifest is unfinished and excluded, because the manifest is written
-        last. Any other entry with the name of a version is included, so that loading reports
-        broken versions.
+        The result leaves out a folder without a manifest, because writers write the manifest last.
+        It contains every other entry with the name of a version, so that `load` reports broken
+        versions.
 
         Raises:
             StoreError: `invalid_reference`, or `unreadable`.
@@ -132,8 +132,8 @@ class Store:
             previous: see `load_artifact`.
 
         Raises:
-            ArtifactError: the artifact is not valid; `wrong_place` if its manifest has another
-                name or version.
+            ArtifactError: the artifact is not valid. The code is `wrong_place` if its manifest has
+                another name or version.
             StoreError: `invalid_reference`, `unreadable`, or `unknown_version`.
         """
         if check_version(version) not in self.versions(name):
@@ -144,12 +144,16 @@ class Store:
         if (manifest.name, manifest.version) != (name, version):
             raise ArtifactError(
                 "wrong_place",
-                f"the manifest is that of {manifest.name}@{manifest.version}, not {name}@{version}",
+                f"the folder of {name}@{version} contains the manifest of "
+                f"{manifest.name}@{manifest.version}",
             )
         return artifact
 
     def state(self) -> StoreState:
-        """Return a value that changes with every version or alias, without reading the files."""
+        """Return a value that changes when a version or an alias changes.
+
+        The method reads only the metadata of the files.
+        """
         files = [self.root / _ALIASES]
         with suppress(StoreError):
             for name in self.names():
@@ -168,18 +172,18 @@ class Store:
         storage_dtype: StorageDtype = "float32",
         alias: str | None = None,
     ) -> Artifact:
-        """Publish a version for good, and optionally point an alias at it.
+        """Publish a version permanently, and optionally point an alias at it.
 
-        The artifact is written to a temporary folder and loaded from there, so that a version which
-        the service would refuse is never published. Then the folder is renamed, and the alias
-        changed.
+        The method writes the artifact to a temporary folder and loads it from there. So it never
+        publishes a version that the service would refuse. Then it renames the folder and changes
+        the alias.
 
         Args:
             description, state, storage_dtype: see `write_artifact`.
             alias: alias to point at this version.
 
         Returns:
-            The published artifact, as a reader loads it.
+            The published artifact, loaded from its files.
 
         Raises:
             ArtifactError: the artifact is not valid.
@@ -219,9 +223,10 @@ class Store:
         """Point an alias at a version, or at the latest version of a model.
 
         Args:
-            alias: the alias; created if missing.
+            alias: name of the alias. The method creates a missing alias.
             target: an existing version or model.
-            expected: required current target of the alias; None: the alias must not exist.
+            expected: required current target of the alias. None means that the alias must not
+                exist. "any" accepts every target.
 
         Raises:
             StoreError: `alias_conflict` if the current target is not ``expected``;
@@ -239,7 +244,8 @@ class Store:
         """Remove an alias.
 
         Raises:
-            StoreError: `unknown_model` if the alias does not exist; else see `set_alias`.
+            StoreError: `unknown_model` if the alias does not exist. For other codes, see
+                `set_alias`.
         """
         check_name(alias, "alias")
         with self._writing():
@@ -265,7 +271,7 @@ class Store:
     def _prepare_folder(self, name: str) -> Path:
         folder = self.root / name
         if os.path.lexists(folder) and not _is_directory(folder):
-            raise StoreError("unsafe_path", f"model '{name}' is not a directory")
+            raise StoreError("unsafe_path", f"the path of model '{name}' is not a directory")
         make_directory(folder)
         return folder
 
@@ -311,7 +317,7 @@ class Store:
 
 
 def _appearance(path: Path) -> tuple[int, ...]:
-    """Return inode, size and modification time; () for a missing file."""
+    """Return inode, size and modification time of a file, or () for a missing file."""
     try:
         status = path.lstat()
     except OSError:
@@ -331,7 +337,7 @@ def _is_unfinished(version: Path) -> bool:
 
 
 def _is_directory(path: Path) -> bool:
-    """Return whether a path is a directory; False for a link to a directory."""
+    """Return whether a path is a directory. A link to a directory does not count."""
     try:
         return stat.S_ISDIR(path.lstat().st_mode)
     except OSError:

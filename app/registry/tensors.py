@@ -1,4 +1,4 @@
-"""Stored weights: a safetensors file, in half precision if the trainer chose it."""
+"""Stored weights: a safetensors file with float32 or float16 weights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from app.registry.manifest import WEIGHTS, TensorEntry
 StorageDtype = Literal["float16", "float32"]
 
 MAX_HEADER_BYTES: Final = 2**20
-"""Maximum size of the header that lists the tensors; enough for about 10,000 tensors."""
+"""Maximum size in bytes of the header of the weights file. It can list about 10,000 tensors."""
 
 _DTYPES: Final = {
     "F16": "float16",
@@ -30,17 +30,17 @@ _DTYPES: Final = {
 def pack(
     state: Mapping[str, ArrayLike], storage_dtype: StorageDtype
 ) -> tuple[bytes, dict[str, TensorEntry]]:
-    """Return the tensors as a safetensors file, and their entries in the manifest.
+    """Return the contents of a safetensors file, and the manifest entries of its tensors.
 
     Args:
-        state: numpy arrays or CPU tensors by name. Floating-point arrays are stored as
+        state: maps names to numpy arrays or CPU tensors. Floating-point arrays are stored as
             `storage_dtype`, or as float32 if they have at most one axis (biases). Other arrays keep
             their dtype.
         storage_dtype: float16 halves the file, with a relative error of 2^-11 per weight.
 
     Raises:
-        ArtifactError: `not_finite`, also for a weight beyond the float16 maximum of 65,504;
-            `invalid_tensor` for a dtype that artifacts do not support.
+        ArtifactError: `not_finite` for NaN, infinity or a weight above the float16 maximum of
+            65,504; `invalid_tensor` for a dtype that artifacts do not support.
     """
     arrays = {name: _stored(name, value, storage_dtype) for name, value in sorted(state.items())}
     entries = {
@@ -51,11 +51,14 @@ def pack(
 
 
 def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray[Any]]:
-    """Return writable copies of the tensors of a safetensors file, floating-point as float32.
+    """Return writable copies of the tensors of a safetensors file.
+
+    Floating-point tensors become float32.
 
     Raises:
-        ArtifactError: `not_safetensors`; `too_large` for a header over the limit; `wrong_shape` if
-            names, dtypes or shapes differ from the manifest; `not_finite`.
+        ArtifactError: `not_safetensors` for another file format; `too_large` for a header over the
+            limit; `wrong_shape` if names, dtypes or shapes differ from the manifest; `not_finite`
+            for NaN or infinity.
     """
     # The file begins with the length of its header: 64 bits, little-endian.
     if MAX_HEADER_BYTES < int.from_bytes(data[:8], "little") <= len(data):
@@ -77,7 +80,7 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
 def require_equal(
     found: Mapping[str, object], expected: Mapping[str, object], holds: str, says: str
 ) -> None:
-    """Compare tensors by name; raise ArtifactError (`wrong_shape`) for the first difference."""
+    """Raise ArtifactError (`wrong_shape`) for the first tensor that differs from ``expected``."""
     for name in sorted(found.keys() | expected.keys()):
         if found.get(name) != expected.get(name):
             raise ArtifactError(
@@ -91,7 +94,7 @@ def _words(tensors: Mapping[str, object], name: str) -> str:
 
 
 def _stored(name: str, value: ArrayLike, storage_dtype: StorageDtype) -> NDArray[Any]:
-    # reshape(), because ascontiguousarray() turns shape () into (1,).
+    # ascontiguousarray() turns shape () into (1,). reshape() restores it.
     array = np.ascontiguousarray(value).reshape(np.shape(value))
     if np.issubdtype(array.dtype, np.floating):
         with np.errstate(over="ignore"):

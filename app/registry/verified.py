@@ -1,7 +1,7 @@
 """Reading the files of an artifact: each file is read once and checked against its checksum.
 
-Later steps parse the bytes that were hashed here, so replacing a file after the check has no
-effect. Symbolic links are not followed.
+Later steps parse the same bytes that this module hashed. So a file that changes after the check
+has no effect. The module does not follow symbolic links.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from app.registry.errors import ArtifactError, cause
 from app.registry.manifest import CARD, MANIFEST, WEIGHTS, FileEntry, Manifest
 
 MAX_MANIFEST_BYTES: Final = 4 * 2**20
-"""Maximum size of a manifest: enough for about 20,000 classes (162 kB for 785 classes)."""
+"""Maximum size of a manifest in bytes. A manifest of 785 classes has 162 kB."""
 MAX_CARD_BYTES: Final = 2**20
 MAX_WEIGHTS_BYTES: Final = 2**30
-"""Default maximum size of the weights file; an operator may choose another maximum."""
+"""Default maximum size of the weights file in bytes. SCENE_MAX_WEIGHTS_BYTES can change it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +30,9 @@ class VerifiedFiles:
     Attributes:
         manifest: the parsed manifest.
         digest: SHA-256 of the manifest's bytes, hexadecimal. It identifies all files, because the
-            manifest holds their checksums.
+            manifest contains their checksums.
         weights: bytes of the safetensors file.
-        card: the model card, Markdown.
+        card: the model card in Markdown.
     """
 
     manifest: Manifest
@@ -46,7 +46,8 @@ def read_verified(directory: Path, max_weights_bytes: int = MAX_WEIGHTS_BYTES) -
 
     Args:
         directory: directory of the artifact.
-        max_weights_bytes: maximum size of the weights file, checked before it is read.
+        max_weights_bytes: maximum size of the weights file. The function checks the size before it
+            reads the file.
 
     Raises:
         ArtifactError: a file is missing, unexpected, unreadable, too large, truncated or altered,
@@ -91,7 +92,7 @@ def _require_size(name: str, size: int, limit: int) -> None:
 
 
 def _read(folder: int, name: str, limit: int) -> bytes:
-    """Read at most limit + 1 bytes of a file; the extra byte shows that it is too long."""
+    """Read at most limit + 1 bytes of a file. An extra byte shows that the file is too long."""
     # Without O_NONBLOCK, opening a FIFO in place of the file would block forever.
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -105,7 +106,7 @@ def _read(folder: int, name: str, limit: int) -> bytes:
         if not stat.S_ISREG(status.st_mode):
             raise ArtifactError("unreadable", f"{name} is not a regular file")
         with os.fdopen(descriptor, "rb", closefd=False) as file:
-            # read() allocates its buffer at once, so the size of the real file bounds it.
+            # read() allocates its whole buffer first. The size of the file bounds the buffer.
             return file.read(min(status.st_size, limit) + 1)
     except OSError as error:
         raise ArtifactError("unreadable", f"{name}: {cause(error)}") from None

@@ -1,7 +1,8 @@
-"""From the instances of a scene to evidence about classes.
+"""Conversion of the instances of a scene to evidence about classes.
 
-Models know classes, and scenes contain instances. r[a, x, y] is on if *some* instance of class x
-stands in relation a to some instance of class y. An unlisted pair of instances never turns it off.
+Scenes contain instances, but models only know classes. Relation a between classes x and y is on if
+at least one instance of x has relation a to an instance of y. An unlisted pair of instances never
+turns it off.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ class ClassEvidence:
     """The n distinct classes of a scene and their observed relations.
 
     Attributes:
-        classes: (n,) int64, ascending, distinct.
+        classes: (n,) int64, distinct indices of the classes, ascending.
         counts: (n,) int64, number of instances of each class.
         confidence: (n,) float64 in (0, 1], probability that at least one instance exists.
-        holds: (A, n, n) bool, relations observed on. ``holds[a, x, y]``: classes[x] stands in
+        holds: (A, n, n) bool, relations observed on. ``holds[a, x, y]`` means that classes[x] has
             relation a to classes[y].
-        observed: (A, n, n) bool, relations observed on or off; ``holds`` implies ``observed``.
+        observed: (A, n, n) bool, relations observed on or off. ``holds`` implies ``observed``.
         room_type: index of the room type, or None.
     """
 
@@ -48,16 +49,16 @@ def pool_instances(
     observed: NDArray[np.bool_],
     room_type: int | None = None,
 ) -> ClassEvidence:
-    """Pool instances into classes by OR.
+    """Pool the instances of each class by a logical OR.
 
-    A relation between classes is on if it holds for one pair of instances. It is off if it was
-    observed for at least one pair and holds for none. Otherwise it is unobserved. The relations of
-    a class to itself stay unobserved if it has a single instance.
+    A relation between classes is on if it holds for at least one pair of instances. It is off if it
+    was observed for a pair, but is off for all observed pairs. Otherwise it is unobserved. If a
+    class has a single instance, its relations to itself stay unobserved.
 
     Args:
-        classes: (N,) class of each instance.
+        classes: (N,) index of the class of each instance.
         confidence: (N,) probability that the instance exists. Instances count as independent
-            detections: a class exists with probability 1 - prod(1 - confidence).
+            detections, so a class exists with probability 1 - prod(1 - confidence).
         holds: (A, N, N) relations that hold between instances.
         observed: (A, N, N) relations between instances that were observed, on or off.
         room_type: index of the room type, or None.
@@ -68,9 +69,9 @@ def pool_instances(
     size = len(classes)
     for name, array in (("holds", holds), ("observed", observed)):
         if array.shape != (A, size, size):
-            raise ValueError(f"{name} has shape {array.shape}, must be {(A, size, size)}")
+            raise ValueError(f"{name} must have the shape {(A, size, size)}, not {array.shape}")
     if confidence.shape != (size,):
-        raise ValueError(f"confidence has shape {confidence.shape}, must be {(size,)}")
+        raise ValueError(f"confidence must have the shape {(size,)}, not {confidence.shape}")
     labels = np.asarray(classes, dtype=np.int64)
     distinct, _, row, counts, present = pool_classes(labels, np.asarray(confidence, np.float64))
     on, seen = pooled(row, len(distinct), holds, observed)
@@ -84,8 +85,9 @@ def pool_classes(
     """Return the n distinct classes of N instances, ascending.
 
     Returns:
-        (n,) classes, (n,) first instance of each class, (N,) position of each instance's class,
-        (n,) number of instances, and (n,) probability that at least one instance exists.
+        (n,) classes, (n,) index of the first instance of each class, (N,) index of each instance's
+        class in the first array, (n,) number of instances, and (n,) probability that at least one
+        instance exists.
     """
     distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
     counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
@@ -107,7 +109,7 @@ def pooled(
     """Pool the relations of instances (A, N, N) into relations of classes (A, n, n).
 
     Args:
-        row: (N,) position of each instance's class.
+        row: (N,) index of each instance's class, from 0 to n - 1.
         n: number of classes.
         holds: (A, N, N) relations that hold.
         observed: (A, N, N) observed relations.
@@ -129,9 +131,9 @@ def pooled(
 def class_evidence(scene: Scene) -> ClassEvidence:
     """Return the evidence of a scene, without instances outside the vocabulary.
 
-    Relations derived from poses (``scene.poses``) are on or off for neighbours, and unobserved for
-    other pairs. Stated relations are on. All other relations are unobserved, or off if the stated
-    relations are complete.
+    If the scene has poses, ``scene.poses`` defines the relations: on or off for neighbours, and
+    unobserved for other pairs. Otherwise, stated relations are on. All other relations are off if
+    the stated relations are complete, and unobserved if not.
     """
     kept = [i for i, thing in enumerate(scene.objects) if thing.class_index is not None]
     size = len(kept)
@@ -144,7 +146,10 @@ def class_evidence(scene: Scene) -> ClassEvidence:
 
 
 def instance_evidence(scene: Scene) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the relations between the N instances that hold and that are observed, (A, N, N)."""
+    """Return which relations between the N instances hold, and which are observed.
+
+    Both arrays have the shape (A, N, N).
+    """
     if scene.poses is not None:
         return scene.poses.holds, scene.poses.observed
     size = len(scene.objects)

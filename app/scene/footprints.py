@@ -1,7 +1,7 @@
 """Overlap and gap of rotated rectangles, exact up to rounding.
 
-If the angle between two rectangles is a multiple of 90 degrees, intervals along the common axes
-are enough. Otherwise each rectangle is clipped along the edges of the other.
+If the angle between two rectangles is a multiple of 90 degrees, the module compares intervals along
+the common axes. Otherwise it clips each rectangle along the edges of the other.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from app.compiling import compiled
 
 Array = NDArray[np.float64]
 
-# Angle in radians below which two rectangles count as parallel. Clipping would count a shared edge
-# twice, but only parallel rectangles can share an edge.
+# Rectangles with a smaller angle between them (in radians) count as parallel. Parallel rectangles
+# can share an edge, and clipping would count such an edge twice.
 _PARALLEL: Final = 1e-6
 # Replaces an edge length of 0, to avoid division by zero.
 _SHORTEST: Final = 1e-150
@@ -35,8 +35,8 @@ def overlap_and_gap(
         yaw_a, yaw_b: (P,) rotations in radians.
 
     Returns:
-        (P,) area of the intersection as a share of the smaller area, and (P,) distance between the
-        rectangles, 0 if they touch.
+        (P,) overlap: area of the intersection divided by the smaller of the two areas.
+        (P,) gap: distance between the rectangles, or 0 if they touch.
     """
     share, gap = np.empty(len(yaw_a)), np.empty(len(yaw_a))
     rectangles = (centre_a, size_a, yaw_a, centre_b, size_b, yaw_b)
@@ -54,8 +54,8 @@ def _measure_pairs(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b, share, gap)
 
 @compiled
 def measure(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b):
-    """Compute overlap and gap of one pair; only x and y of centres and sizes are used."""
-    # In the axes of b, b is the box |x| <= half_b[0], |y| <= half_b[1] around the origin.
+    """Compute overlap and gap of one pair. Only x and y of centres and sizes count."""
+    # In its own axes, b is the box |x| <= half_b[0], |y| <= half_b[1] around the origin.
     offset = _turn_back(
         (centre_a[0] - centre_b[0], centre_a[1] - centre_b[1]), math.cos(yaw_b), math.sin(yaw_b)
     )
@@ -72,7 +72,7 @@ def measure(centre_a, size_a, yaw_a, centre_b, size_b, yaw_b):
     smaller = min(size_a[0] * size_a[1], size_b[0] * size_b[1])
     if smaller > 0.0:
         return area / smaller, gap
-    # A rectangle with an area of 0 counts as a point: it overlaps fully with what it touches.
+    # A rectangle with an area of 0 overlaps fully with a rectangle that it touches.
     return 1.0 if gap == 0.0 else 0.0, gap
 
 
@@ -97,12 +97,12 @@ def _skew(offset, half_a, cos, sin, half_b):
         end = _moved(_turn(end, cos, sin), offset)
         p, q = _inside(start, end, half_b)
         swept_a += p[0] * q[1] - p[1] * q[0]
-        # The shortest distance of disjoint convex polygons starts at a corner of one of them.
+        # The shortest line between two disjoint convex polygons ends at a corner of one of them.
         gap = min(gap, _distance(start, half_b))
     back = (-offset[0], -offset[1])
     for k in range(4):
         start, end = _corner(half_b, k), _corner(half_b, k + 1)
-        # Corners of b in the axes of a.
+        # Convert the corners of b to the axes of a.
         start = _turn_back(_moved(start, back), cos, sin)
         end = _turn_back(_moved(end, back), cos, sin)
         p, q = _inside(start, end, half_a)
@@ -142,8 +142,8 @@ def _inside(start, end, half):
 
     The two ends are equal if the edge lies outside the box.
     """
-    # The edges are skew to the box, so x or y is 0 only for an edge that rounding has made
-    # infinitely short. Such an edge adds no area.
+    # Edges are never parallel to the box. So x or y is 0 only if rounding has reduced the edge to a
+    # point. Such an edge adds no area.
     x, y = end[0] - start[0] or _SHORTEST, end[1] - start[1] or _SHORTEST
     one_x, other_x = (-half[0] - start[0]) / x, (half[0] - start[0]) / x
     one_y, other_y = (-half[1] - start[1]) / y, (half[1] - start[1]) / y

@@ -8,10 +8,10 @@ Vector = tuple[float, float, float]
 Axes = tuple[Vector, Vector, Vector]
 Quaternion = tuple[float, float, float, float]
 
-# Frames that are fixed to the world. They do not define the viewer, so a request needs a viewpoint.
+# Frames that are fixed to the world. They do not define a viewer, so the request needs a viewpoint.
 WORLD_FRAMES = frozenset({"map", "odom", "world"})
 
-# Maximum difference of a quaternion's length from 1 that counts as rounding.
+# Maximum difference between the length of a quaternion and 1 that counts as a rounding error.
 _NORM_TOLERANCE = 0.01
 
 
@@ -21,12 +21,12 @@ def is_optical(frame_id: str) -> bool:
 
 
 def is_world_fixed(frame_id: str) -> bool:
-    """Return whether a frame is fixed to the world ("map", "robot_1/odom"), not to a viewer."""
+    """Return whether a frame is fixed to the world, such as "map" or "robot_1/odom"."""
     return _plain(frame_id).rpartition("/")[2] in WORLD_FRAMES
 
 
 def _plain(frame_id: str) -> str:
-    # "MAP" and "map " also mean "map"; treated as body frames, they would give wrong relations.
+    # "MAP" and "map " also mean "map". As body frames, they would give wrong relations.
     return frame_id.strip().casefold()
 
 
@@ -37,16 +37,18 @@ def body_pose(
     *,
     optical: bool = False,
 ) -> tuple[Vector, Vector | None, float]:
-    """Convert a box of a frame to an upright box in body axes: position, size and yaw.
+    """Convert a box in a frame to an upright box in body axes. Return its position, size and yaw.
 
-    The axis of the box nearest to the vertical becomes z, and the extents are reordered to match.
-    So a box may lie on its side, or have a vertical y axis, as in optical frames. Any remaining
-    tilt is ignored. The optical axis is assumed to be horizontal.
+    The axis of the box that is nearest to the vertical becomes z. The extents change their order
+    accordingly. So the function also accepts a box on its side, or a box with a vertical y axis, as
+    in optical frames. It ignores the remaining tilt. It assumes that the optical axis is
+    horizontal.
 
     Args:
         position: centre in the frame.
-        size: extents along the box's own axes, or None.
-        orientation: quaternion (x, y, z, w) from the box's axes to the frame; None: not rotated.
+        size: extents along the box's own axes, or None if unknown.
+        orientation: quaternion (x, y, z, w) from the box's axes to the frame. None means that the
+            box is not rotated.
         optical: whether the frame has optical axes.
 
     Raises:
@@ -75,11 +77,11 @@ def viewer_axes(frame_id: str | None = None, yaw: float | None = None) -> Axes |
     """Return the viewer's axes (x away, y left, z up) as vectors of a frame.
 
     Args:
-        frame_id: name of the frame; None: body axes.
-        yaw: viewing direction in radians; None: along x.
+        frame_id: name of the frame, or None for body axes.
+        yaw: viewing direction in radians, or None for the direction of x.
 
     Returns:
-        The three axes; None for a world-fixed frame without a viewing direction.
+        The three axes, or None for a world-fixed frame without a viewing direction.
     """
     if frame_id is not None and yaw is None and is_world_fixed(frame_id):
         return None

@@ -1,22 +1,23 @@
-"""From poses to relations: the same rules for training and serving.
+"""Rules that derive relations from poses. Training and serving use the same rules.
 
-Viewer axes: x away from the viewer, y to the left, z up; metres and radians. Boxes stand upright.
-Their footprint is the rectangle of the horizontal extents, rotated by the yaw.
+Viewer axes point away from the viewer (x), to the left (y) and up (z). Units are metres and
+radians. Boxes are upright. The footprint of a box is the rectangle of its horizontal extents,
+rotated by the yaw.
 
-1. *on-top*(i, j): the footprints overlap by at least 30 % of the smaller one and the bottom of i is
-   within 5 cm of the top of j.
+1. *on-top*(i, j): the footprints overlap by at least 30 % of the smaller footprint, and the bottom
+   of i is within 5 cm of the top of j.
 2. *above*(i, j): the same overlap, and the bottom of i is more than 5 cm above the top of j.
-3. Otherwise, for neighbours, the larger of the offsets |dx|, |dy| between the centres decides:
-   *left* means larger y, *front* means nearer (smaller x). If that offset is under 10 cm, the pair
-   has no relation.
+3. Otherwise, for neighbours, the larger of the distances |dx| and |dy| between the centres decides:
+   *left* means larger y, and *front* means smaller x (nearer to the viewer). If the larger distance
+   is under 10 cm, neither relation holds.
 
 Neighbours are boxes whose footprints are at most 1 m apart. If a size is unknown, the centres must
-be at most 1.5 m apart in the horizontal plane. Two further rules exclude contradictions. Equal
-offsets count as sideways. If two thin boxes would each lie on the other, the box with the higher
-centre lies on the other; with equal centres, neither does.
+be at most 1.5 m apart in the horizontal plane. Two more rules exclude contradictions. If |dx| and
+|dy| are equal, |dy| decides. If rule 1 applies to two thin boxes in both directions, only the box
+with the higher centre is on top. If both centres have the same height, neither box is on top.
 
-Every relation of a pair of neighbours is observed, so a vertical relation implies that the
-horizontal relations are observed off. Without both sizes, vertical relations stay unobserved.
+All relations of a pair of neighbours are observed. So if a vertical relation holds, the horizontal
+relations are observed off. If a size is unknown, vertical relations stay unobserved.
 """
 
 from __future__ import annotations
@@ -58,8 +59,9 @@ class PoseRelations:
     """Relations between n instances, derived from poses.
 
     Attributes:
-        holds: (A, n, n) bool; ``holds[a, i, j]``: instance i stands in relation a to instance j.
-        observed: (A, n, n) bool, symmetric in i and j; ``holds`` implies ``observed``.
+        holds: (A, n, n) bool. ``holds[a, i, j]`` means that instance i has relation a to instance
+            j.
+        observed: (A, n, n) bool, symmetric in i and j. ``holds`` implies ``observed``.
     """
 
     holds: NDArray[np.bool_]
@@ -69,7 +71,7 @@ class PoseRelations:
 def to_viewer_frame(
     positions: Rows, viewpoint: Viewpoint, yaws: ArrayLike | None = None
 ) -> tuple[Array, Array]:
-    """Convert positions (n, 3) and yaws (n,) to the axes of ``viewpoint``; heights stay unchanged.
+    """Convert positions (n, 3) and yaws (n,) to the axes of ``viewpoint``. Keep the heights.
 
     Without ``yaws``, the boxes are aligned with the axes of the frame.
 
@@ -96,11 +98,11 @@ def derive_relations(
     """Derive the relations between n boxes by the rules of this module.
 
     Args:
-        positions: (n, 3) centres in viewer axes. A row with NaN means an unknown position; the
-            relations of this box stay unobserved.
+        positions: (n, 3) centres in viewer axes. A row with NaN means an unknown position. The
+            relations of this box then stay unobserved.
         sizes: (n, 3) extents before the rotation. A row with NaN means an unknown size.
-        yaws: (n,) rotation of each box about z in radians; zeros by default.
-        horizontal: False if the viewer is unknown; left and front then stay unobserved.
+        yaws: (n,) rotation of each box about z in radians. The default is 0.
+        horizontal: False if the viewer is unknown. Left and front then stay unobserved.
 
     Raises:
         ValueError: a shape is wrong, a value is infinite, or a size is not positive.
@@ -110,7 +112,7 @@ def derive_relations(
     extents = _array("sizes", sizes, (n, 3))
     turns = np.zeros(n) if yaws is None else _array("yaws", yaws, (n,))
     if not _are_finite(points, extents, turns):
-        raise ValueError("positions, sizes and yaws must not be infinite")
+        raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
     if not _are_positive(extents):
         raise ValueError("sizes must be positive")
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
@@ -121,7 +123,7 @@ def derive_relations(
 
 @compiled
 def _are_finite(points, extents, turns):
-    """Return whether no value is infinite and no yaw is NaN."""
+    """Return whether all values are finite. Points and extents may also be NaN."""
     for i in range(len(points)):
         for k in range(3):
             if math.isinf(points[i, k]) or math.isinf(extents[i, k]):
@@ -156,7 +158,7 @@ def _relate_all(points, extents, turns, horizontal, holds, observed):
             boxed, stacked = sized[i] and sized[j], False
             if not boxed:
                 neighbours = distance <= NEIGHBOUR_DISTANCE
-            # Measuring rectangles is slow: first check the circles around them.
+            # The circles around the rectangles are a fast first check. `measure` is slower.
             elif distance - radius[i] - radius[j] <= NEIGHBOUR_GAP:
                 share, gap = measure(
                     points[i], extents[i], turns[i], points[j], extents[j], turns[j]
@@ -195,7 +197,7 @@ def _relate(points, extents, i, j, boxed, stacked, horizontal, holds, observed):
 
 @compiled
 def _vertical(points, extents, i, j):
-    """Return the vertical relation of i to j; their footprints overlap."""
+    """Return the vertical relation of i to j, whose footprints overlap."""
     lift = (points[i, 2] - extents[i, 2] / 2) - (points[j, 2] + extents[j, 2] / 2)
     if lift > CONTACT:
         return ABOVE
@@ -218,5 +220,5 @@ def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     if array.size == 0 and 0 in shape:
         return array.reshape(shape)
     if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, must be {shape}")
+        raise ValueError(f"{name} must have the shape {shape}, not {array.shape}")
     return array

@@ -1,8 +1,8 @@
-"""Comparison of labels: one key for all spellings of a name.
+"""Comparison of labels: all spellings of a name have the same key.
 
 Detectors, annotators and programmers spell a name in many ways ("Trash_Cans", "trash can",
-"trashcan"). `label_key` removes differences of case, separators and a final plural, so that equal
-keys mean the same label. Alias tables handle synonyms ("tv", "television").
+"trashcan"). `label_key` removes the case, separators and a final plural. Two labels with the same
+key are the same label. Alias tables handle synonyms ("tv", "television").
 
 `head_of` returns the object in a phrase with "of": a "bottle of milk" is a bottle, and a "pair of
 shoes" is shoes.
@@ -17,8 +17,8 @@ from typing import Final
 
 _SEPARATORS: Final = re.compile(r"[\s_\-./'’‐-―]+")
 
-# Endings that are not plurals, or whose singular has another meaning or does not exist. They also
-# occur in compounds ("rain pants", "camera lens").
+# Words with these endings stay unchanged: they are not plurals, or their singular has another
+# meaning or does not exist. The endings also occur in compounds ("rain pants", "camera lens").
 _NOT_PLURAL_ENDINGS: Final = (
     *("ss", "us", "is"),
     *("clothes", "pants", "jeans", "shorts", "trousers", "tights", "overalls", "pyjamas"),
@@ -26,9 +26,9 @@ _NOT_PLURAL_ENDINGS: Final = (
     *("sunglasses", "eyeglasses", "readingglasses", "safetyglasses"),
     *("canvas", "lens", "thermos", "atlas", "christmas"),
 )
-# The same for whole words: "wine glasses" is a plural, but "glasses" alone means spectacles.
+# These whole words stay unchanged too: "glasses" means spectacles, but "wine glasses" is a plural.
 _NOT_PLURAL: Final = frozenset({"glasses", "gas", "news", "series", "vhs", "gps", "ups"})
-# Plurals outside the rules below, also recognised at the end of a compound ("bookshelves").
+# Irregular plurals. They also match at the end of a compound ("bookshelves").
 _IRREGULAR: Final = (
     ("shelves", "shelf"),
     ("knives", "knife"),
@@ -63,7 +63,7 @@ _IRREGULAR_ENDINGS: Final = tuple(plural for plural, _ in _IRREGULAR)
 
 
 _OF: Final = re.compile(r"[\s_\-.]+of[\s_\-.]+", re.IGNORECASE)
-# "bottle of milk" means the container; "pile of books" means the members of the collection.
+# "bottle of milk" means the container (bottle). "pile of books" means the members (books).
 _CONTAINERS: Final = frozenset(
     (
         *("bag", "basket", "bottle", "bowl", "box", "bucket", "can", "canister", "carton"),
@@ -77,7 +77,7 @@ _COLLECTIONS: Final = frozenset({"bunch", "pair", "piece", "pile", "row", "slice
 def head_of(label: str) -> str | None:
     """Return the object in a phrase: "bottle" for "bottle of milk", "books" for "pile of books".
 
-    Other labels give None.
+    The result is None for other labels.
     """
     parts = _OF.split(label, maxsplit=1)
     if len(parts) != 2:
@@ -89,10 +89,10 @@ def head_of(label: str) -> str | None:
 
 
 def singular(word: str) -> str:
-    """Return the singular of a folded English noun; other words are returned unchanged.
+    """Return the singular of an English noun in lower case. Return other words unchanged.
 
-    Covers regular endings (-ies, -ches, -shes, -xes, -sses, -oes, -s) and a short list of irregular
-    plurals. docs/decisions/data.md compares it with a general inflection library.
+    The function knows the regular endings (-ies, -ches, -shes, -xes, -sses, -oes, -s) and a short
+    list of irregular plurals. docs/decisions/data.md compares it with a general inflection library.
     """
     if word.endswith(_IRREGULAR_ENDINGS):
         for plural, single in _IRREGULAR:
@@ -114,25 +114,26 @@ def singular(word: str) -> str:
     return singular(stem)  # "childrens" is a double plural
 
 
-# Cached, because the models of a store mostly share their classes.
+# The cache saves work, because the models of a store have mostly the same classes.
 @lru_cache(maxsize=4096)
 def label_key(label: str) -> str:
-    """Return the key that all spellings of ``label`` share; idempotent.
+    """Return the key that all spellings of ``label`` share. The key of a key is the key itself.
 
-    The key ignores case, compatibility characters, separators (whitespace, ``_ - . / '``) and a
-    final plural: "Night-Stands", "night_stand" and "nightstand" have the key "nightstand". A label
-    that consists of separators only has the empty key.
+    The key ignores case, Unicode compatibility variants, separators (whitespace, ``_ - . / '``) and
+    a final plural: "Night-Stands", "night_stand" and "nightstand" have the key "nightstand". A
+    label that contains only separators has the empty key.
     """
     if label.isascii():
         return singular(_SEPARATORS.sub("", label.casefold()))
-    # Repeated, because a fold can enable another one: a separate accent joins its letter.
+    # The loop repeats the fold until the label is stable: after one fold, a separate accent can
+    # combine with its letter.
     while (folded := _fold_unicode(label)) != label:
         label = folded
     return label
 
 
 def split_words(label: str) -> tuple[str, ...]:
-    """Return the words of a label in the singular, folded as in `label_key`."""
+    """Return the words of a label in lower case and in the singular."""
     folded = unicodedata.normalize("NFKC", label).casefold()
     return tuple(singular(word) for word in _SEPARATORS.split(folded) if word)
 

@@ -1,12 +1,15 @@
-"""The known names nearest to an unknown name, by spelling and by common words.
+"""Search for the known names that are most similar to an unknown name.
 
     spelling   1 - edits / length of the longer name; two exchanged letters are one edit
-    words      same last word, plus the share of other common words: "coffee mug" is a "mug"
+    words      both names have the same last word: "coffee mug" is a "mug"; more words in common
+               raise the value
 
 The similarity of two names is the larger of the two values. A second search ignores words for
-size, colour and material: a "big lamp" is a "lamp". Word vectors are not used. The class with the
-largest cosine is right for only 40 % of held-out aliases, and a minimum cosine does not raise this
-to 85 % (GloVe 6B, 100 dimensions, 20,000 words).
+size, colour and material: a "big lamp" is a "lamp".
+
+The module does not use word vectors. The class with the largest cosine is right for only 40 % of
+held-out aliases. With a minimum cosine, the share stays below 85 % (GloVe 6B, 100 dimensions,
+20,000 words).
 """
 
 from __future__ import annotations
@@ -22,22 +25,22 @@ from app.scene.labels import split_words
 ACCEPTED: Final = 0.8
 """Minimum similarity at which the nearest name replaces an unknown name.
 
-It is the lowest multiple of 0.05 at which 90 % of the mappings are right. Measured on held-out
-aliases and misspelt names of the `indoor` vocabulary: 2724 of 2895 mappings are right. For held-out
-aliases alone: 572 of 727.
+It is the lowest multiple of 0.05 at which 90 % of the mappings are right. In the `indoor`
+vocabulary, 2724 of 2895 mappings of held-out aliases and misspelt names are right. For held-out
+aliases alone, 572 of 727 mappings are right.
 """
 
 LONGEST: Final = 64
-"""Maximum length, after folding, of a name whose spelling is compared.
+"""The search compares the spelling of names up to this length (after folding).
 
-The cost of a comparison grows with the length, and folding can turn one character into 18. All
-names of classes have fewer than 32 characters.
+The time of a comparison grows with the length, and folding can turn one character into 18. All
+class names have fewer than 32 characters.
 """
 
-_LEAST: Final = 0.6  # minimum similarity: "asdf" is not a misspelt "scarf"
-_BY_KIND: Final = 0.95  # factor for a name without its words for size, colour and material
-_BY_REST: Final = 0.9  # factor for another first letter, which people rarely mistype
-_FARTHER: Final = 0.1  # maximum distance of a suggestion from the best similarity
+_LEAST: Final = 0.6  # minimum similarity of a suggestion
+_BY_KIND: Final = 0.95  # factor if only the name without size, colour and material is similar
+_BY_REST: Final = 0.9  # factor if the first letters differ, because people rarely mistype them
+_FARTHER: Final = 0.1  # maximum difference between a suggestion and the best similarity
 
 
 _LOOKS: Final = frozenset(
@@ -58,7 +61,7 @@ class NameIndex:
     """Search for entries with similar names.
 
     Args:
-        names: (name, index of its entry); an entry may have several names.
+        names: pairs of a name and the index of its entry. An entry may have several names.
     """
 
     def __init__(self, names: Sequence[tuple[str, int]]) -> None:
@@ -82,7 +85,7 @@ class NameIndex:
         return tuple(Match(*entry) for entry in ranked if entry[1] >= least)
 
     def _similarities(self, words: Sequence[str]) -> dict[int, float]:
-        """Return the similarity of each entry with a similar name."""
+        """Map each entry with a similar name to its similarity."""
         best: dict[int, float] = {}
         if not words:
             return best
@@ -118,10 +121,10 @@ def _head(words: Sequence[str]) -> str:
 def _in_common(words: Sequence[str], known: Sequence[str], *, is_only: bool) -> float:
     """Return the similarity of two names with the same head word, by their common words.
 
-    A name with more words than the known name is probably a subclass ("coffee mug"). A name with
-    fewer words may be another subclass. A head word is ambiguous if several entries share it. If
-    one entry has it, 86 % of held-out aliases belong to that entry. If several have it, 59 % belong
-    to the entry of that name.
+    An unknown name with more words than the known name is probably a subclass ("coffee mug"). An
+    unknown name with fewer words may be another subclass. A head word is ambiguous if several
+    entries have it. If only one entry has the head word, 86 % of held-out aliases belong to this
+    entry. If several entries have it, 59 % belong to the entry whose name is the head word.
 
     Args:
         words: words of the unknown name.

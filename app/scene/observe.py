@@ -25,19 +25,21 @@ def observe(
 ) -> Scene:
     """Derive the relations of a scene from the poses of its objects.
 
-    Positions and yaws must be in body axes (`app.scene.frames.body_pose`). With a viewpoint, the
-    returned scene has them in viewer axes. Its ``relations`` list the relations that hold, and its
-    ``poses`` also contain relations observed off. A scene that states relations, or has no
-    positions, is returned unchanged. In a world-fixed frame (map, odom, world) without a viewpoint,
-    left and front are undefined, so only vertical relations are derived.
+    Positions and yaws must be in body axes (`app.scene.frames.body_pose`). If there is a viewpoint,
+    the returned scene has positions and yaws in viewer axes. The field ``relations`` of the result
+    lists the relations that hold. The field ``poses`` also contains relations observed off.
+
+    The function returns a scene unchanged if it states relations or has no positions. In a
+    world-fixed frame (map, odom, world) without a viewpoint, left and front are undefined. The
+    function then derives only vertical relations.
 
     Args:
         scene: the scene.
-        frame_id: the frame of the positions.
-        viewpoint: position and heading of the viewer in that frame; by default the origin, looking
-            along x.
-        typical_sizes: (V, 3) extents in metres by class, for objects without a size; NaN if unknown
-            (`Vocabulary.sizes`).
+        frame_id: name of the frame of the positions.
+        viewpoint: position and heading of the viewer in this frame. By default, the viewer is at
+            the origin and looks along x.
+        typical_sizes: (V, 3) extents of each class in metres, for objects without a size. NaN means
+            unknown (`Vocabulary.sizes`).
     """
     if scene.relations is not None or all(thing.position is None for thing in scene.objects):
         return scene

@@ -1,7 +1,7 @@
 """The eight spatial relations and their four canonical forms.
 
 A relation and its opposite are the same statement with exchanged ends: ``right(i, j)`` is
-``left(j, i)``. So only four are stored. All relation indices are indices into `CANONICAL`.
+``left(j, i)``. So scenes store only four relations. A relation index is an index into `CANONICAL`.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def opposite(relation: str) -> str:
 def canonicalise(subject: End, relation: str, anchor: End) -> tuple[int, End, End]:
     """Return a statement in canonical form: (relation index, subject, anchor).
 
-    For ``right``, ``behind``, ``under`` and ``below``, the ends are exchanged. They may have any
-    type.
+    For ``right``, ``behind``, ``under`` and ``below``, the function exchanges subject and anchor.
+    Both may have any type.
 
     Raises:
         ValueError: `RELATIONS` does not contain the relation.
@@ -67,8 +67,8 @@ def contradiction(
 ) -> tuple[tuple[int, End, End], tuple[int, End, End]] | None:
     """Return two canonical triples that contradict each other, or None.
 
-    ``left(i, j)`` and ``left(j, i)`` contradict each other between *objects*, but not between
-    classes with several instances.
+    The ends must be *objects*: ``left(i, j)`` and ``left(j, i)`` contradict each other. Between
+    classes with several instances, both can hold.
     """
     seen: set[tuple[int, End, End]] = set()
     for relation, subject, anchor in triples:

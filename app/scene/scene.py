@@ -13,18 +13,21 @@ from app.scene.relations import CANONICAL, contradiction
 Point = tuple[float, float, float]
 
 
-# Not frozen: creating a frozen instance takes four times as long, and scenes have dozens of them.
+# The class is not frozen, because the creation of a frozen instance takes four times as long. A
+# scene has dozens of objects.
 @dataclass(slots=True, unsafe_hash=True)
 class SceneObject:
-    """One object in a scene; treat it as immutable.
+    """One object in a scene. Do not change its attributes.
 
     Attributes:
         id: name of the object in this scene.
         label: label in the request.
-        class_index: class in the model's vocabulary; None for a label outside the vocabulary.
+        class_index: index of the class in the model's vocabulary, or None for a label outside the
+            vocabulary.
         confidence: probability in (0, 1] that the object exists.
-        position: centre (x, y, z) in metres, viewer axes (x away, y left, z up); None if unknown.
-        size: extents (x, y, z) in metres before the rotation; None if unknown.
+        position: centre (x, y, z) in metres in viewer axes (x away, y left, z up), or None if
+            unknown.
+        size: extents (x, y, z) in metres before the rotation, or None if unknown.
         yaw: rotation of the box about z in radians.
 
     Raises:
@@ -41,7 +44,9 @@ class SceneObject:
 
     def __post_init__(self) -> None:
         if self.class_index is not None and self.class_index < 0:
-            raise ValueError(f"class_index of {self.id!r} is negative: {self.class_index}")
+            raise ValueError(
+                f"class_index of {self.id!r} must not be negative, but is {self.class_index}"
+            )
         if not 0.0 < self.confidence <= 1.0:
             raise ValueError(f"confidence of {self.id!r} must be in (0, 1], not {self.confidence}")
         if self.position is not None and not _are_finite(self.position):
@@ -57,17 +62,19 @@ class Scene:
     """Objects and their relations.
 
     Attributes:
-        objects: the objects; ``relations`` refer to their indices in this tuple.
-        relations: canonical triples (relation, subject, object) that hold; None: not observed.
-        relations_complete: whether all relations missing from ``relations`` are off.
-        room_type: index of the room type in the model's vocabulary; None if unknown.
+        objects: the objects. ``relations`` refers to their indices in this tuple.
+        relations: canonical triples (relation, subject, object) that hold, or None if the relations
+            are unobserved.
+        relations_complete: whether all relations that are missing from ``relations`` are off.
+        room_type: index of the room type in the model's vocabulary, or None if unknown.
         poses: relations derived from poses (see `app.scene.observe`), including relations observed
-            off. They replace ``relations`` as evidence. ``relations`` must list the relations that
-            hold; this is not checked.
+            off. They replace ``relations`` as evidence. ``relations`` must then list the same
+            relations that hold. The class does not check this.
 
     Raises:
-        ValueError: two objects share an id; a triple has an invalid index, relates an object to
-            itself or contradicts another triple; or `relations_complete` is set without relations.
+        ValueError: two objects have the same id, or a triple is invalid, or `relations_complete` is
+            True without relations. A triple is invalid if it has an invalid index, relates an
+            object to itself or contradicts another triple.
     """
 
     objects: tuple[SceneObject, ...]
@@ -82,7 +89,7 @@ class Scene:
             raise ValueError("two objects of the scene have the same id")
         if self.relations is None:
             if self.relations_complete:
-                raise ValueError("relations_complete needs relations")
+                raise ValueError("relations_complete is True, but the scene has no relations")
         elif self.poses is None:
             for triple in self.relations:
                 relation, subject, anchor = triple
@@ -98,20 +105,22 @@ class Scene:
                 )
         if self.poses is not None and self.poses.holds.shape != (len(CANONICAL), n, n):
             raise ValueError(
-                f"poses have shape {self.poses.holds.shape}, must be {(len(CANONICAL), n, n)}"
+                f"poses must have the shape {(len(CANONICAL), n, n)}, not {self.poses.holds.shape}"
             )
 
     def _refuse(self, triple: tuple[int, int, int], n: int) -> NoReturn:
         relation, subject, anchor = triple
         if not 0 <= relation < len(CANONICAL):
-            raise ValueError(f"relation index {relation} is not in 0..{len(CANONICAL) - 1}")
+            raise ValueError(
+                f"a relation index must be from 0 to {len(CANONICAL) - 1}, not {relation}"
+            )
         for end in (subject, anchor):
             if not 0 <= end < n:
-                raise ValueError(f"object {end} of a relation is not in 0..{n - 1}")
+                raise ValueError(f"the object index {end} of a relation is not from 0 to {n - 1}")
         raise ValueError(f"{self.objects[subject].id!r} cannot be {CANONICAL[relation]} itself")
 
 
 def _are_finite(point: Sequence[float]) -> bool:
-    # Written without a loop: it runs twice for every object.
+    # A loop would be slower. This function runs twice for every object.
     finite = math.isfinite
     return len(point) == 3 and finite(point[0]) and finite(point[1]) and finite(point[2])

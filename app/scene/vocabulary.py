@@ -24,10 +24,10 @@ class ObjectClass:
 
     Attributes:
         label: canonical name.
-        aliases: synonyms; other spellings and plurals do not need an alias.
-        structure: whether the class is building structure or a vague name (floor, wall, object).
-            Scenes may contain such classes, but a model never proposes them.
-        size: typical extents (x, y, z) in metres, z vertical; None if unknown.
+        aliases: synonyms of the label. Other spellings and plurals do not need an alias.
+        structure: whether the class is a part of the building (floor, wall) or a vague name
+            (object). Scenes may contain such classes, but a model never proposes them.
+        size: typical extents (x, y, z) in metres, with z vertical, or None if unknown.
 
     Raises:
         ValueError: a name is empty, or the size is not three positive finite numbers.
@@ -49,11 +49,11 @@ class ObjectClass:
 
 
 class Vocabulary:
-    """An immutable, ordered set of object classes (V of them) and room types (C of them).
+    """The V object classes and C room types of a model, in a fixed order.
 
     Args:
-        objects: the classes; their order gives the class indices.
-        room_types: canonical room types; their order gives the room indices.
+        objects: the classes. Their order defines the class indices.
+        room_types: canonical room types. Their order defines the room indices.
 
     Raises:
         ValueError: the list of classes is empty, or two classes (or room types) have the same name
@@ -74,14 +74,14 @@ class Vocabulary:
                 claimed = self._by_key.setdefault(label_key(name), index)
                 if claimed != index:
                     raise ValueError(
-                        f"{name!r} names two object classes: {self._objects[claimed].label!r} "
-                        f"and {entry.label!r}"
+                        f"two object classes have the name {name!r}: "
+                        f"{self._objects[claimed].label!r} and {entry.label!r}"
                     )
                 self._by_spelling[name] = index
         self._room_by_key: dict[str, int] = {}
         for index, room in enumerate(self._room_types):
             if not label_key(room):
-                raise ValueError(f"empty room type {room!r}")
+                raise ValueError(f"a room type has an empty name: {room!r}")
             claimed = self._room_by_key.setdefault(label_key(room), index)
             if claimed != index:
                 raise ValueError(
@@ -104,17 +104,17 @@ class Vocabulary:
 
     @property
     def objects(self) -> tuple[ObjectClass, ...]:
-        """The object classes, by index."""
+        """The object classes in the order of their indices."""
         return self._objects
 
     @property
     def room_types(self) -> tuple[str, ...]:
-        """The room types, by index."""
+        """The room types in the order of their indices."""
         return self._room_types
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """The canonical labels, by class index."""
+        """The canonical labels in the order of the class indices."""
         return tuple(entry.label for entry in self._objects)
 
     @cached_property
@@ -125,7 +125,7 @@ class Vocabulary:
 
     @cached_property
     def structure(self) -> NDArray[np.bool_]:
-        """(V,) True for structure and vague classes, which a model never proposes. Read-only."""
+        """(V,) True for structural and vague classes, which a model never proposes. Read-only."""
         mask = np.array([entry.structure for entry in self._objects], dtype=np.bool_)
         mask.flags.writeable = False
         return mask
@@ -138,10 +138,10 @@ class Vocabulary:
         return sizes
 
     def index(self, label: str) -> int | None:
-        """Return the class of a label in any accepted spelling; None for an unknown label.
+        """Return the index of the class with this label, or None for an unknown label.
 
-        For an unknown phrase, the object in the phrase is looked up: "bottle of milk" is a bottle
-        (`head_of`).
+        Any spelling is accepted. For an unknown phrase, the method looks up the object in the
+        phrase: "bottle of milk" is a bottle (`head_of`).
         """
         found = self._by_spelling.get(label)
         if found is None:
@@ -151,7 +151,7 @@ class Vocabulary:
         return found
 
     def room_index(self, room: str) -> int | None:
-        """Return the room type in any spelling ("bed_room" is "bedroom"); None if unknown."""
+        """Return the index of a room type, or None if unknown. Any spelling is accepted."""
         return self._room_by_key.get(label_key(room))
 
     @cached_property
@@ -165,7 +165,7 @@ class Vocabulary:
     def nearest(self, label: str, limit: int = 3) -> tuple[Match, ...]:
         """Return plausible classes with names similar to ``label``, most similar first.
 
-        It compares with every name and alias, so it is much slower than `index`.
+        The method compares ``label`` with every name and alias. So it is much slower than `index`.
         """
         return self._names.nearest(label, limit)
 
@@ -194,13 +194,16 @@ class Vocabulary:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Build a vocabulary from `to_dict`; ``aliases``, ``structure`` and ``size`` are optional.
+        """Build a vocabulary from the result of `to_dict`.
+
+        ``aliases``, ``structure`` and ``size`` are optional.
 
         Raises:
-            ValueError: a field is missing, unknown or of the wrong type; also see `Vocabulary`.
+            ValueError: a field is missing, unknown or of the wrong type. `Vocabulary` lists more
+                reasons.
         """
         if not isinstance(values.get("objects"), list):
-            raise ValueError("a vocabulary must be a mapping with a list 'objects'")
+            raise ValueError("a vocabulary must have a list 'objects'")
         rooms = values.get("room_types", [])
         if not isinstance(rooms, list):
             raise ValueError(f"'room_types' must be a list, not {rooms!r}")
@@ -215,12 +218,12 @@ def _are_extents(size: Sequence[float]) -> bool:
 
 def _object_class(entry: Any) -> ObjectClass:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("label"), str):
-        raise ValueError(f"an object class must be a mapping with a 'label', not {entry!r}")
+        raise ValueError(f"an object class must be a mapping with a string 'label', not {entry!r}")
     if unknown := sorted(set(entry) - {"label", "aliases", "structure", "size"}):
         raise ValueError(f"unknown fields in object class {entry['label']!r}: {unknown}")
     aliases, structure = entry.get("aliases", []), entry.get("structure", False)
     if not isinstance(aliases, list) or not all(isinstance(name, str) for name in aliases):
-        raise ValueError(f"aliases of {entry['label']!r} must be strings, not {aliases!r}")
+        raise ValueError(f"aliases of {entry['label']!r} must be a string list, not {aliases!r}")
     if not isinstance(structure, bool):
         raise ValueError(f"structure of {entry['label']!r} must be a boolean, not {structure!r}")
     size = entry.get("size")

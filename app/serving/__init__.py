@@ -1,1 +1,1 @@
-"""Serving: read scenes, hold the loaded models and answer questions; independent of HTTP."""
+"""The serving layer, without HTTP: it reads scenes, loads models and answers questions."""

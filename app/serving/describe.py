@@ -39,7 +39,7 @@ def everything(models: ServedModels) -> ModelList:
 
 
 def model(models: ServedModels, reference: str) -> ModelSummary:
-    """Describe the model of a name or an alias, usable or refused.
+    """Describe the model with this name or alias, even if its versions were refused.
 
     Raises:
         UnknownModelError: no model or alias has this name.
@@ -48,7 +48,7 @@ def model(models: ServedModels, reference: str) -> ModelSummary:
 
 
 def version(models: ServedModels, reference: str, number: str) -> VersionDetails:
-    """Describe one version of the model of a name or an alias.
+    """Describe one version of the model with this name or alias.
 
     Raises:
         UnknownModelError: no model or alias has this name, or the model lacks this version.

@@ -1,4 +1,4 @@
-"""Errors of the serving layer, in terms of scenes and models, independent of HTTP."""
+"""Errors of the serving layer. They do not depend on HTTP."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from enum import Enum
 from scene_client.schemas import Failure
 
 Location = tuple[str | int, ...]
-"""Path to a value of a request: field names and list indices."""
+"""Path to a value in a request: its field names and list indices."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class Fault:
     Attributes:
         location: path to the invalid value, from the root of the request.
         message: description of the error, without a copy of the input.
-        suggestions: nearest known names, best first.
+        suggestions: known names that are most similar to an unknown name, best first.
     """
 
     location: Location
@@ -28,7 +28,7 @@ class Fault:
 
 
 class Reason(Enum):
-    """The kind of a request error; each kind has its own problem type."""
+    """The kind of a request error. Each kind has its own problem type."""
 
     INVALID = "invalid"
     UNKNOWN_LABELS = "unknown labels"
@@ -37,11 +37,11 @@ class Reason(Enum):
 
 
 class ServingError(Exception):
-    """Base class of the serving errors; the client may read their text."""
+    """Base class of the serving errors. The service may send their text to the client."""
 
 
 class RequestError(ServingError):
-    """The request matches the schema, but contradicts itself or does not suit the model."""
+    """The request matches the schema, but is contradictory or does not match the model."""
 
     def __init__(self, reason: Reason, faults: Sequence[Fault]) -> None:
         super().__init__(reason.value)
@@ -50,7 +50,7 @@ class RequestError(ServingError):
 
 
 class UnknownModelError(ServingError):
-    """The name of a model is neither an alias nor a model nor a version."""
+    """The requested alias, model or version does not exist."""
 
 
 class ModelUnavailableError(ServingError):
@@ -62,7 +62,7 @@ class NotReadyError(ServingError):
 
 
 class QueueFullError(ServingError):
-    """The queue of requests, or of the model's scenes, is full."""
+    """The queue of requests or the queue of the model's scenes is full."""
 
 
 class DeadlinePassedError(ServingError):
@@ -78,7 +78,7 @@ class DrainingError(ServingError):
 
 
 class AliasConflictError(ServingError):
-    """The alias does not point to the expected version, or a model has its name."""
+    """The alias does not point to the expected version, or a model has the name of the alias."""
 
 
 class ModelUnusableError(ServingError):
@@ -97,7 +97,7 @@ class RefreshRefusedError(ServingError):
     """The new state of the store would make a working version or alias unusable.
 
     Attributes:
-        failures: the refused versions and aliases, with reasons.
+        failures: the refused versions and aliases with their reasons.
     """
 
     def __init__(self, failures: Sequence[Failure]) -> None:

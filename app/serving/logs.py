@@ -20,16 +20,16 @@ def _masked(line: str, secrets: Sequence[str]) -> str:
 class JSONFormatter(logging.Formatter):
     """Write one JSON object per line: time, level, process, logger, message and request fields.
 
-    Two attributes of a record add fields: ``entry`` holds the fields of an access log line, and
-    ``request_id`` names the request that caused an internal error.
+    Two attributes of a log record add fields. ``entry`` contains the fields of an access log line.
+    ``request_id`` is the id of the request that caused an internal error.
 
     Args:
-        secrets: texts to mask everywhere, because an exception message may quote them.
+        secrets: texts to mask in every line, because an exception message may contain them.
     """
 
     def __init__(self, secrets: Sequence[str] = ()) -> None:
         super().__init__()
-        # Escaped as in a JSON string.
+        # The lines are JSON, so they contain the secrets in escaped form.
         self.secrets = [json.dumps(secret)[1:-1] for secret in secrets]
         self._second, self._text = -1, ""
 
@@ -55,7 +55,7 @@ class JSONFormatter(logging.Formatter):
 
 
 class PlainFormatter(logging.Formatter):
-    """Write text for people, with secrets masked."""
+    """Write records as plain text, with secrets masked."""
 
     def __init__(self, secrets: Sequence[str] = ()) -> None:
         super().__init__("%(asctime)s %(levelname)-8s %(process)d %(name)s: %(message)s")
@@ -67,7 +67,7 @@ class PlainFormatter(logging.Formatter):
 
 
 class NoHandshakes(logging.Filter):
-    """Drop the server's lines about WebSocket handshakes, which contain the requested path."""
+    """Drop uvicorn's log lines about WebSocket handshakes, because they contain the path."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether to write the record."""
@@ -77,15 +77,15 @@ class NoHandshakes(logging.Filter):
 def log_config(
     level: str, style: Literal["json", "plain"], secrets: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return a configuration of service and server for `logging.config.dictConfig`.
+    """Return the log configuration of the service and uvicorn for `logging.config.dictConfig`.
 
-    The access log of the server is off: it would contain raw paths, and the service writes its own
-    access log. Libraries log at `info` or above. At `debug` the server would log the headers of
+    The access log of uvicorn is off, because it would contain raw paths. The service writes its own
+    access log. Libraries log at `info` or above. At `debug`, uvicorn would log the headers of
     WebSocket handshakes, including keys.
 
     Args:
         level: log level of the service.
-        style: "json" for one JSON object per line, "plain" for text.
+        style: "json" for one JSON object per line, or "plain" for text.
         secrets: texts to mask.
     """
     known = logging.getLevelNamesMapping()
@@ -108,7 +108,7 @@ def log_config(
         "loggers": {
             "app": {"level": level.upper()},
             "uvicorn.access": {"level": "CRITICAL"},
-            # At "info" it would log each WebSocket that opens, fails or closes.
+            # At "info", this library would log each WebSocket that opens, fails or closes.
             "websockets": {"level": "WARNING"},
         },
     }

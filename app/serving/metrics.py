@@ -1,7 +1,8 @@
-"""Metrics for Prometheus, updated during the requests and formatted by `GET /metrics`.
+"""Metrics for Prometheus. Requests update them, and `GET /metrics` formats them.
 
-Clients cannot add label values: routes appear as templates, and models only while they are served.
-Each replica is one process and reports its own metrics; see docs/decisions/artifacts.md.
+Clients cannot create new label values: the label of a route is its template, and only served models
+have labels. Each replica is one process and reports its own metrics; see
+docs/decisions/artifacts.md.
 """
 
 from __future__ import annotations
@@ -38,15 +39,16 @@ _ROWS: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _MODEL: Final = ("model", "version")
 _INFO: Final = "scene_model_info"
 
-# Without a second series per counter for its creation time: Prometheus detects restarts itself.
+# By default, each counter has a second series with its creation time. Prometheus does not need it,
+# because it detects restarts itself.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 
 class Metrics:
-    """The metrics of one application; call its methods on the thread of the event loop only.
+    """The metrics of one application. Call its methods only on the thread of the event loop.
 
     Attributes:
-        registry: own registry, so that one process can hold several applications.
+        registry: registry of this application. One process can have several applications.
     """
 
     def __init__(self) -> None:
@@ -149,7 +151,7 @@ class Metrics:
         )
         self._infos: set[Info] = set()
         self._is_ready = False
-        # Cached: looking up a series by its labels takes longer than counting.
+        # The look-up of a series by its labels is slower than the count, so these dicts cache it.
         self._of_request: dict[tuple[str, str, str], Counter] = {}
         self._of_route: dict[str, Histogram] = {}
         self._of_model: dict[Key, dict[str, tuple[Histogram, Histogram, Histogram]]] = {}
@@ -200,11 +202,13 @@ class Metrics:
         """Count one answered request.
 
         Args:
-            route: template of the route, "-" if the path matches none.
-            method: HTTP method, "-" for a method that HTTP does not define.
-            outcome: "success", or the slug of the problem.
-            seconds: duration of the request; None for a stream, whose duration the client chooses.
-            serialised: seconds from the last answer of a model to the response; None without one.
+            route: template of the route, or "-" if no route has the requested path.
+            method: HTTP method, or "-" for a method that HTTP does not define.
+            outcome: "success" or the slug of the problem.
+            seconds: duration of the request, or None for a stream, whose duration the client
+                chooses.
+            serialised: seconds from the last answer of a model to the response, or None for a
+                request without an answer of a model.
         """
         key = (route, method, outcome)
         counter = self._of_request.get(key)
@@ -220,7 +224,7 @@ class Metrics:
             self._serialisation.observe(serialised)
 
     def entry_answered(self, question: str, outcome: str) -> None:
-        """Count one scene of a batch: answered, or refused with the problem `outcome`."""
+        """Count one scene of a batch. The outcome is "success" or the slug of the problem."""
         self._entries.labels(question, outcome).inc()
 
     def streams(self, count: int) -> None:
@@ -228,11 +232,11 @@ class Metrics:
         self._streams.set(count)
 
     def stream_message(self, kind: str, outcome: str) -> None:
-        """Count one stream message: accepted, or refused with the problem `outcome`.
+        """Count one message of a stream.
 
         Args:
-            kind: type of the message, "-" for an unknown type.
-            outcome: "success", or the slug of the problem.
+            kind: type of the message, or "-" for an unknown type.
+            outcome: "success" or the slug of the problem.
         """
         self._messages.labels(kind, outcome).inc()
 
@@ -240,8 +244,9 @@ class Metrics:
         """Count one answer on a stream.
 
         Args:
-            outcome: "success", or the slug of the problem.
-            superseded: number of older updates that the answer covers besides the newest.
+            outcome: "success" or the slug of the problem.
+            superseded: number of older updates that the answer covers in addition to the newest
+                update.
         """
         self._answers.labels(outcome).inc()
         self._superseded.inc(superseded)
@@ -249,13 +254,14 @@ class Metrics:
     def computed(self, key: Key, question: str, rows: int, waited: float, seconds: float) -> None:
         """Record one computed question.
 
-        Ignored if the model has been removed in the meantime: its series would appear again.
+        The method does nothing if the model is no longer served. Otherwise the removed series of
+        the model would appear again.
 
         Args:
             key: name and version of the model.
             question: name of the question.
             rows: number of scenes of the question.
-            waited: seconds before the computation.
+            waited: seconds that the question waited before its computation.
             seconds: duration of the computation.
         """
         series = self._of_model.get(key)
@@ -281,7 +287,7 @@ class Metrics:
 
 
 def _infos(models: ServedModels) -> Iterable[Info]:
-    """Yield the label values of each model, once per alias; the alias is "" if it has none."""
+    """Yield the label values of each model once per alias. Without an alias, the value is ""."""
     aliases: dict[Key, list[str]] = {key: [] for key in models.served}
     for alias in models.store.aliases:
         try:

@@ -1,7 +1,7 @@
-"""The served models: verified by the registry, warmed up here, replaced as a whole.
+"""The served models. The registry verifies them, and the service warms them up.
 
-A snapshot of the models never changes, so a request uses the same models from beginning to end. A
-refused version stays listed with its reason, and an older version never replaces it.
+A snapshot of the models never changes, so a request uses the same models from beginning to end. The
+snapshot lists each refused version with its reason. An older version never replaces it.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class ServedModel:
     """A model that has passed its warm-up.
 
     Attributes:
-        artifact: weights, vocabulary and calibration.
-        queue: the work of this model.
+        artifact: weights, vocabulary and calibration of the model.
+        queue: queue of the computations of this model.
     """
 
     artifact: Artifact
@@ -42,7 +42,7 @@ class ServedModel:
 
     @cached_property
     def reference(self) -> ModelReference:
-        """The name, version, variant and digest in answers."""
+        """The name, version, variant and digest of the model, as answers contain them."""
         manifest = self.artifact.manifest
         return ModelReference(
             name=manifest.name,
@@ -53,12 +53,12 @@ class ServedModel:
 
     @cached_property
     def key(self) -> Key:
-        """Name and version."""
+        """Name and version of the model."""
         return self.artifact.manifest.name, self.artifact.manifest.version
 
     @cached_property
     def vocabulary(self) -> Vocabulary:
-        """Object classes and room types."""
+        """Object classes and room types of the model."""
         return self.artifact.vocabulary
 
     @cached_property
@@ -82,8 +82,9 @@ class ServedModels:
 
     Attributes:
         store: snapshot of the registry.
-        served: models that have passed their warm-up, by (name, version).
-        warm_up_failures: verified models that failed their warm-up, with reasons.
+        served: maps (name, version) to each model that has passed its warm-up.
+        warm_up_failures: maps (name, version) to the reason for each verified model that failed its
+            warm-up.
     """
 
     store: ModelSet
@@ -91,7 +92,7 @@ class ServedModels:
     warm_up_failures: Mapping[Key, Failure]
 
     def resolve(self, reference: str) -> ServedModel:
-        """Return the model of an alias, `name` or `name@version`.
+        """Return the model that an alias, `name` or `name@version` points at.
 
         Raises:
             UnknownModelError: the alias, model or version does not exist.
@@ -120,19 +121,23 @@ class ServedModels:
 
     @cached_property
     def _resolved(self) -> dict[str, ServedModel]:
-        # Only valid references, whose number the store limits. Clients can invent invalid ones.
+        # The cache contains only valid references. The store limits their number, but clients can
+        # send any number of invalid references.
         return {}
 
     @cached_property
     def usable(self) -> frozenset[str]:
-        """Names without a failure: versions (``name@version``), aliases and "store"."""
+        """The versions (``name@version``) and aliases without a failure.
+
+        It contains "store" if the store could be read.
+        """
         versions = {f"{name}@{version}" for name, version in self.served}
         subjects = versions | self.store.aliases.keys() | {DEFAULT, "store"}
         return frozenset(subjects - self.failures.keys())
 
     @cached_property
     def generation(self) -> str:
-        """Digest of the served versions and aliases, equal in replicas with the same state."""
+        """Digest of the served versions and aliases. Replicas with the same state have the same."""
         versions = {"@".join(key): model.artifact.digest for key, model in self.served.items()}
         aliases = {alias: str(target) for alias, target in self.store.aliases.items()}
         text = json.dumps([versions, aliases], sort_keys=True)
@@ -140,7 +145,7 @@ class ServedModels:
 
     @cached_property
     def failures(self) -> Mapping[str, Failure]:
-        """Failures by subject: version (``name@version``), alias or "store"."""
+        """Maps each subject to its failure. A subject is ``name@version``, an alias or "store"."""
         found = {
             f"{name}@{version}": Failure(
                 subject=f"{name}@{version}", reason=refused.code, detail=refused.reason

@@ -1,7 +1,7 @@
-"""From a request to a scene: names to ids, labels to classes, poses to relations.
+"""Conversion of a request to a scene: it finds ids, classes of labels, and relations from poses.
 
-The reading collects all errors of a request before it raises, so that a client can correct all of
-them at once.
+The module collects all errors of a request before it raises an exception. So a client can correct
+all errors at once.
 """
 
 from __future__ import annotations
@@ -35,9 +35,12 @@ from scene_client.schemas import (
 )
 
 MAX_SUGGESTED: Final = 32
-"""Maximum number of look-ups of unknown labels in a scene, and of suggestions in a request."""
+"""Maximum number of look-ups of unknown labels per scene.
+
+It is also the maximum number of errors with suggestions per request.
+"""
 MAX_MAPPED: Final = 256
-"""Maximum number of unknown labels of a request that are mapped to the nearest class."""
+"""Maximum number of unknown labels per request that the service maps to the nearest class."""
 
 
 Triple = tuple[int, int, int]
@@ -45,11 +48,12 @@ Triple = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of the operator on one scene and its answer.
+    """Limits on one scene and its answer, from the settings.
 
     Attributes:
-        objects, relations: maximum numbers in a scene.
-        answer_bytes: maximum size of an answer.
+        objects: maximum number of objects in a scene.
+        relations: maximum number of relations in a scene.
+        answer_bytes: maximum size of an answer in bytes.
     """
 
     objects: int = 256
@@ -59,7 +63,11 @@ class Limits:
 
 @dataclass(slots=True)
 class Faults:
-    """The errors of a request found so far, by kind."""
+    """The errors of a request found so far.
+
+    Attributes:
+        found: maps each kind of error to its errors.
+    """
 
     found: dict[Reason, list[Fault]] = field(default_factory=dict)
 
@@ -70,10 +78,10 @@ class Faults:
         self.found.setdefault(reason, []).append(Fault(location, message, tuple(suggestions)))
 
     def raise_any(self) -> None:
-        """Raise the errors of the first kind found, in the order of `Reason`.
+        """Raise an exception if the request has errors.
 
         Raises:
-            RequestError: the request has an error.
+            RequestError: all errors of one kind: the first kind in `Reason` that has errors.
         """
         if not self.found:
             return
@@ -86,10 +94,11 @@ class Faults:
 class LookUps:
     """The look-ups of unknown labels in all scenes of one request.
 
-    Their number is limited: a look-up takes 0.2 ms, and a batch may have 10,000 unknown labels.
+    The object limits the number of look-ups, because a look-up takes 0.2 ms, and a batch may have
+    10,000 unknown labels.
 
     Attributes:
-        suggestions: number of errors with suggestions so far.
+        suggestions: number of errors that already have suggestions.
     """
 
     suggestions: int = 0
@@ -98,8 +107,9 @@ class LookUps:
     def nearest(
         self, vocabulary: Vocabulary, label: str, *, is_room: bool, limit: int
     ) -> tuple[Match, ...] | None:
-        """Return the entries nearest to an unknown label; None after ``limit`` look-ups."""
-        key = id(vocabulary), label, is_room  # the id stays valid: the request keeps its models
+        """Return the entries nearest to an unknown label, or None after ``limit`` look-ups."""
+        # id() stays unique, because the request keeps its models in memory.
+        key = id(vocabulary), label, is_room
         if key not in self._found:
             if len(self._found) >= limit:
                 return None
@@ -117,7 +127,7 @@ class Unknown:
         treatment: `SceneRequest.unknown_labels`.
         look_ups: look-ups of the whole request.
         ignored: names of the ignored objects.
-        mapped: nearest class by label.
+        mapped: maps each unknown label to its nearest class.
     """
 
     vocabulary: Vocabulary
@@ -134,13 +144,13 @@ class Unknown:
 
         Args:
             label: the unknown label.
-            name: name of its object, for the list of ignored names.
-            location: location of the label, for an error.
-            faults: receives an error if the label is refused.
+            name: name of the object with this label, for the list of ignored names.
+            location: location of the label in the request, for an error.
+            faults: list of errors. The method adds an error if it refuses the label.
             is_room: whether the label is a room type.
 
         Returns:
-            None if the label is ignored or refused.
+            Index of the class or room type, or None if the label is ignored or refused.
         """
         if self.treatment == "ignore":
             self.ignored.append(name)
@@ -160,8 +170,8 @@ class Unknown:
                 message = "this model does not have room types"
         if self.treatment == "nearest" and (label, is_room) not in self._looked_up:
             message += (
-                f"; the service looks up the nearest class of at most {MAX_SUGGESTED} labels of a "
-                f"scene and {MAX_MAPPED} labels of a batch"
+                f"; the service maps at most {MAX_SUGGESTED} unknown labels per scene and "
+                f"{MAX_MAPPED} per batch to the nearest class"
             )
         suggestions = [known[match.entry] for match in matches]
         if self.look_ups.suggestions >= MAX_SUGGESTED:
@@ -171,7 +181,7 @@ class Unknown:
         return None
 
     def copy(self) -> Unknown:
-        """Return a copy for a question with its own labels; the reading stays unchanged."""
+        """Return a copy for a question with more labels. The question changes only the copy."""
         return replace(self, ignored=[*self.ignored], mapped={**self.mapped})
 
     def _nearest(self, label: str, *, is_room: bool) -> tuple[Match, ...]:
@@ -189,16 +199,16 @@ class Unknown:
 
 @dataclass
 class Reading:
-    """The scene of a request in the classes of a model; constant after `read_scene`.
+    """The scene of a request, with the class indices of a model. Constant after `read_scene`.
 
     Attributes:
-        scene: known objects, their relations and the room type.
+        scene: objects with a known class, their relations and the room type.
         ids: ids of the scene's objects.
         unknown: unknown labels and their treatment.
-        left_out: (id, label) of the ignored objects.
-        observed: relations derived from poses; None without poses.
-        flipped: canonical triples of `scene` that the request stated in the opposite direction.
-        warnings: probable mistakes in the scene.
+        left_out: pairs (id, label) of the ignored objects.
+        observed: relations derived from poses, or None without poses.
+        flipped: canonical triples of `scene` that the request states by the opposite relation.
+        warnings: warnings about probable mistakes in the scene.
     """
 
     scene: Scene
@@ -211,11 +221,11 @@ class Reading:
 
     @cached_property
     def names(self) -> Names:
-        """Look-up of objects by id or label; built on first access."""
+        """Look-up of objects by id or label. The first access builds it."""
         return Names(self.scene.objects, self.left_out, self.unknown.vocabulary)
 
     def longest_name(self) -> int:
-        """Return the size in bytes of the longest id or label in a JSON answer."""
+        """Return the maximum size in bytes of an id or label in a JSON answer."""
         text = "".join(self.ids)
         if text.isascii() and '"' not in text and "\\" not in text:
             longest = max(map(len, self.ids), default=0) + 2
@@ -234,7 +244,7 @@ class Names:
 
     Args:
         objects: objects of the scene.
-        ignored: (id, label) of the ignored objects.
+        ignored: pairs (id, label) of the ignored objects.
         vocabulary: classes of the model.
     """
 
@@ -249,7 +259,8 @@ class Names:
         self._ignored_ids = {name for name, _ in ignored}
         self._ignored_labels = {label_key(label) for _, label in ignored}
 
-    # Built on first access, because most requests do not name their objects.
+    # The first access builds each table. Most requests never need them, because they do not refer
+    # to their objects by name.
 
     @cached_property
     def _by_id(self) -> dict[str, int]:
@@ -271,9 +282,9 @@ class Names:
         return places
 
     def find(self, name: str, location: Location, faults: Faults) -> int | None:
-        """Return the position of the object with this name, or add an error and return None.
+        """Return the index of the object with this name, or add an error and return None.
 
-        Ids take precedence over labels. A label matches in every accepted spelling of its class.
+        Ids take precedence over labels. The label may have any accepted spelling of its class.
         """
         if (place := self._by_id.get(name)) is not None:
             return place
@@ -306,7 +317,7 @@ def read_scene(
     may_be_empty: bool = False,
     derive: bool = True,
 ) -> Reading:
-    """Read the scene of a request in the classes of ``vocabulary``.
+    """Convert the scene of a request: find the class of each label, and derive relations.
 
     Args:
         request: the request.
@@ -314,10 +325,11 @@ def read_scene(
         limits: limits on the scene.
         look_ups: look-ups of the whole request, for a scene of a batch.
         may_be_empty: whether a scene without known objects is valid.
-        derive: whether to derive relations and warnings from poses; if False, only check the scene.
+        derive: whether to derive relations and warnings from poses. With False, the function only
+            checks the scene.
 
     Raises:
-        RequestError: all errors of the first kind found, in the order of `Reason`.
+        RequestError: the scene is invalid; see `Faults.raise_any`.
     """
     faults = Faults()
     _check_sizes(request, limits, faults)
@@ -398,7 +410,10 @@ def _derive(
 
 
 def _ids(entries: Sequence[str | Detection], faults: Faults) -> list[str]:
-    """Return the ids of the objects: given ids, else labels, numbered if they repeat."""
+    """Return the ids of the objects.
+
+    An object without an id has its label as id. Repeated labels have a number at the end.
+    """
     labels: list[str] = [entry for entry in entries if isinstance(entry, str)]
     if len(set(labels)) == len(entries):
         return labels
@@ -466,7 +481,7 @@ def _room(name: str, unknown: Unknown, faults: Faults) -> int | None:
 def _triples(
     relations: Sequence[Relation], reading: Reading, faults: Faults
 ) -> tuple[tuple[Triple, ...], frozenset[Triple]]:
-    """Return the canonical triples, and the triples stated in the opposite direction."""
+    """Return the canonical triples, and those that the request states by the opposite relation."""
     names, some_ignored = reading.names, bool(reading.left_out)
     triples: dict[Triple, bool] = {}
     for place, relation in enumerate(relations):
@@ -485,7 +500,7 @@ def _triples(
             continue
         index, i, j = canonicalise(subject, relation.relation, other)
         if (index, j, i) in triples:
-            message = "contradicts an earlier relation of this pair, which is the opposite"
+            message = "this relation contradicts an earlier relation of the same two objects"
             faults.add(Reason.CONTRADICTION, location, message)
         triples.setdefault((index, i, j), i != subject)
     return tuple(triples), frozenset([triple for triple, flipped in triples.items() if flipped])

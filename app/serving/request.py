@@ -1,4 +1,4 @@
-"""One request: its deadline, its snapshot of the models, and its record for log and metrics."""
+"""A request: its deadline, its snapshot of the models, and its record for log and metrics."""
 
 from __future__ import annotations
 
@@ -27,18 +27,19 @@ SUCCESS: Final = "success"
 
 @dataclass(slots=True)
 class Record:
-    """Values of a request for log and metrics, read after the response has been sent.
+    """Values of a request for log and metrics. The gateway reads them after the response.
 
     Attributes:
         outcome: `SUCCESS`, or the slug of the problem in the response.
-        status: HTTP status of the response; 0 before the response starts.
-        models: (name, version) of the models that the request used; a batch may use several.
-        queue_seconds: total waiting time of its scenes; None if no model was asked.
-        compute_seconds: total computing time of its models; None if no model was asked.
+        status: HTTP status of the response, or 0 before the response starts.
+        models: (name, version) of the models that the request used. A batch may use several models.
+        queue_seconds: total time that the scenes of the request waited, or None if the request used
+            no model.
+        compute_seconds: total computation time of the models, or None if the request used no model.
         answered_at: `time.perf_counter` at the last answer of a model.
-        serialise_seconds: time from the last answer of a model to the response.
-        stream: numbers of messages, answers and superseded updates, and the close code; None for
-            a request that is not a stream.
+        serialise_seconds: time in seconds from the last answer of a model to the response.
+        stream: for a stream, the numbers of messages, answers and superseded updates, and the close
+            code. None for other requests.
     """
 
     outcome: str = SUCCESS
@@ -57,7 +58,10 @@ class Record:
             self.serialise_seconds = perf_counter() - self.answered_at
 
     def known(self) -> dict[str, str | float]:
-        """Return the fields of a log line: times in milliseconds, and the model if it is one."""
+        """Return the fields for the access log line, with times in milliseconds.
+
+        The fields contain the model only if the request used exactly one model.
+        """
         entry: dict[str, str | float] = {"outcome": self.outcome, **(self.stream or {})}
         if len(self.models) == 1:
             ((entry["model"], entry["version"]),) = self.models
@@ -73,15 +77,15 @@ class Request(Ticket):
     """One request, with the same snapshot of the models from beginning to end.
 
     Attributes:
-        id: request id that every answer repeats.
+        id: request id. Every answer contains it.
         models: snapshot of the models.
-        limits: limits on its scenes and answers.
+        limits: limits on the scenes and answers of the request.
         metrics: metrics of the service.
         record: values for the log and the metrics.
         holding: whether the request has already reserved its rows in the queues of the models.
-        known: result of `read`, if several questions ask about the same scene.
-        low_priority: whether its questions run after the questions of other requests.
-        look_ups: nearest classes of its unknown labels.
+        known: stored result of `read`, if several questions concern the same scene.
+        low_priority: whether the questions run after the questions of other requests.
+        look_ups: look-ups of unknown labels in all scenes of the request.
     """
 
     id: str = ""
@@ -97,7 +101,7 @@ class Request(Ticket):
     def read(
         self, scene: SceneRequest, *, may_be_empty: bool = False
     ) -> tuple[ServedModel, Reading]:
-        """Return the model that a scene names, and the scene in the classes of this model.
+        """Return the model that a scene names, and the scene with the class indices of this model.
 
         Raises:
             UnknownModelError: the model does not exist.
@@ -125,8 +129,8 @@ class Request(Ticket):
         Args:
             model: the model.
             question: function of `app.questions`.
-            scene: the scene in the classes of the model.
-            *args, **kwargs: further arguments of ``question``.
+            scene: the scene with the class indices of the model.
+            *args, **kwargs: more arguments for ``question``.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
@@ -157,7 +161,8 @@ class Request(Ticket):
             rows: number of scenes.
             model: the model.
             name: name of the question.
-            draw: the work; its argument returns whether the request has been abandoned.
+            draw: function that samples the scenes. Its argument is a function that returns whether
+                the request has been abandoned.
 
         Raises:
             QueueFullError, DeadlinePassedError, DisconnectedError: see `WorkQueue`.
@@ -179,7 +184,7 @@ class Request(Ticket):
         return done.result
 
     def with_answer_bytes(self, left: int) -> Request:
-        """Return a copy of the request with another limit for the next answer, in bytes."""
+        """Return a copy of the request that limits the next answer to ``left`` bytes."""
         return replace(self, limits=replace(self.limits, answer_bytes=left))
 
     @contextmanager
@@ -187,7 +192,7 @@ class Request(Ticket):
         """Reserve a row for each scene of a batch, and yield a copy of the request.
 
         Args:
-            references: model of each scene; an unusable model needs no row.
+            references: model of each scene. The method reserves no rows for an unusable model.
 
         Raises:
             QueueFullError: the queue of a model is full.
@@ -204,10 +209,11 @@ class Request(Ticket):
 
 
 def _kind_of_cost(name: str, scene: Scene, parameters: Mapping[str, object]) -> str:
-    """Return a key that is equal for questions of similar cost at the same number of objects.
+    """Return a key for the expected computation time of a question.
 
-    The cost also depends on the number of classes, of related classes and of related pairs, so the
-    key holds their orders of magnitude.
+    Questions with the same key and the same number of objects take a similar time. The time also
+    depends on the numbers of classes, related classes and related pairs. So the key contains the
+    order of magnitude of these numbers.
     """
     of = [thing.class_index for thing in scene.objects]
     orders = [len(set(of)).bit_length(), 0, 0]

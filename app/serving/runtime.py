@@ -1,4 +1,4 @@
-"""The runtime of the process: the current snapshot of models, and its changes."""
+"""The runtime of the process: it holds the current snapshot of models and replaces it."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ T = TypeVar("T")
 
 _logger = logging.getLogger("app.serving")
 
-# Seconds that an administration request waits for another writer of the store.
+# Time in seconds that an administration request waits for another writer of the store.
 _LOCK_TIMEOUT = 5.0
 
-# Seconds after which the interpreter switches from a worker thread to the event loop. Its default
-# of 5 ms is a quarter of a robot's control cycle.
+# Time in seconds after which the interpreter switches from a worker thread to the event loop. The
+# default of 5 ms would delay answers by a quarter of a robot's control cycle.
 _SWITCH_INTERVAL = 5e-4
 
 
@@ -57,7 +57,7 @@ def _counted(
     [Callable[Concatenate[Runtime, P], Awaitable[T]]],
     Callable[Concatenate[Runtime, P], Awaitable[T]],
 ]:
-    """Count every call of a method that changes the served models, by its outcome."""
+    """Return a decorator for methods that change the served models. It counts their outcomes."""
 
     def decorate(
         method: Callable[Concatenate[Runtime, P], Awaitable[T]],
@@ -81,13 +81,13 @@ def _counted(
 
 
 class Runtime:
-    """Holder of the current snapshot of models.
+    """The runtime of the service, with the current snapshot of models.
 
     Args:
         settings: settings of the service.
 
     Attributes:
-        backlog: queued requests.
+        backlog: queue of requests that wait for admission.
         metrics: metrics of the service.
     """
 
@@ -131,8 +131,8 @@ class Runtime:
         """Create a request that keeps the current snapshot until its end.
 
         Args:
-            deadline, is_gone: see `Ticket`.
-            request_id: id that every answer repeats.
+            deadline, is_gone: attributes of `Ticket`.
+            request_id: request id. Every answer contains it.
             record: values for the log and the metrics.
 
         Raises:
@@ -165,15 +165,19 @@ class Runtime:
         self.models.resolve(DEFAULT)
 
     def drain(self) -> None:
-        """Refuse new requests and turn readiness off."""
+        """Refuse new requests, and answer readiness checks with 503."""
         self.backlog.draining = True
 
     async def start(self) -> None:
-        """Load, verify and warm up all versions in the store; `models.failures` lists failures."""
+        """Load, verify and warm up all versions in the store.
+
+        `models.failures` then contains the refused versions and aliases.
+        """
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
         check_cache()
-        # On this thread: no request waits yet, and another thread would cost time and memory.
+        # The models load on this thread. The service has no requests yet, and another thread would
+        # cost time and memory.
         self._serve(self._load(None))
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
@@ -181,7 +185,7 @@ class Runtime:
             self._polling = asyncio.create_task(self._follow())
 
     def stop(self) -> None:
-        """Stop the worker threads and drop their pending work."""
+        """Stop the worker threads. Work that has not started is dropped."""
         if self._polling is not None:
             self._polling.cancel()
         self._threads.stop()
@@ -193,11 +197,11 @@ class Runtime:
         The service refuses a state with a new failure, and a state without a usable default model.
 
         Raises:
-            RefreshRefusedError: the new state was refused; the served models are unchanged.
+            RefreshRefusedError: the service refused the new state. The served models are unchanged.
             NotReadyError: the models are not loaded yet.
         """
         async with self._changing:
-            # Keep only names of the old snapshot, so that its memory can be freed.
+            # These sets contain only names, so the memory of the old snapshot can be freed.
             failed, served = set(self.models.failures), set(self.models.served)
             new = await self._take_over(lambda subject: subject == DEFAULT or subject not in failed)
             return RefreshAnswer(
@@ -216,7 +220,8 @@ class Runtime:
             RequestError: the name is not valid for an alias.
             UnknownModelError: the model or version is not served.
             ModelUnusableError: the version was refused.
-            AliasConflictError: the alias has another target than expected, or is a model's name.
+            AliasConflictError: the alias has another target than expected, or a model has the name
+                of the alias.
             StoreNotWritableError: this process cannot write to the store.
             StoreBusyError: another process is writing to the store.
             NotReadyError: the models are not loaded yet.
@@ -238,7 +243,7 @@ class Runtime:
             )
 
     async def _follow(self) -> None:
-        """Poll the store for changes by publishers, operators or other replicas."""
+        """Check the store regularly for changes by other processes, and serve these changes."""
         while True:
             await asyncio.sleep(self._poll)
             if await asyncio.to_thread(self._store.state) == self._seen:
@@ -248,21 +253,22 @@ class Runtime:
             except RefreshRefusedError as error:
                 for failure in error.failures:
                     _logger.error(
-                        "Changes in the store were refused: %s: %s: %s",
+                        "the service refused the changes in the store: %s: %s: %s",
                         *(failure.subject, failure.reason, failure.detail),
                     )
             except Exception:
-                _logger.exception("Changes in the store could not be loaded")
+                _logger.exception("the service could not load the changes in the store")
 
     @_counted("poll")
     async def _take_over_changes(self) -> None:
         """Serve the changes in the store, if every usable version and alias stays usable.
 
-        A new version that fails is listed as refused; the other changes still take effect.
+        If a new version fails, the service lists it as refused. The other changes still take
+        effect.
 
         Raises:
-            RefreshRefusedError: a version or alias would stop working; the served models are
-                unchanged.
+            RefreshRefusedError: a usable version or alias would become unusable. The served models
+                are unchanged.
         """
         async with self._changing:
             await self._take_over(self.models.usable.__contains__)
@@ -271,12 +277,13 @@ class Runtime:
         """Load the store and serve it.
 
         Args:
-            matters: whether a failure of this subject makes the service refuse the new state.
+            matters: function that returns whether a failure of this subject makes the service
+                refuse the new state.
 
         Raises:
-            RefreshRefusedError: the new state was refused.
+            RefreshRefusedError: the service refused the new state.
         """
-        # In a thread, so that the old snapshot answers in the meantime.
+        # The load runs in a thread, so that the old snapshot answers in the meantime.
         new = await asyncio.to_thread(self._load, self.models)
         worse = [failure for subject, failure in new.failures.items() if matters(subject)]
         if worse:
@@ -292,7 +299,7 @@ class Runtime:
             _settle_memory()
 
     def _load(self, previous: ServedModels | None) -> ServedModels:
-        # Before the files are read, so that the next poll sees changes made during the load.
+        # The state is read before the files. So the next poll finds changes made during the load.
         self._seen = self._store.state()
         known = None if previous is None else previous.store
         with progress():
@@ -306,7 +313,7 @@ class Runtime:
             found = self.models.resolve(reference).reference
         except (ModelUnavailableError, NotReadyError):
             raise ModelUnusableError("The service refused to load this version.") from None
-        # With a name without version, the alias follows the newest version of the model.
+        # If the reference is a name without version, the alias follows the newest version.
         newest = reference == found.name
         return AliasTarget(name=found.name, version=None if newest else found.version)
 
@@ -346,9 +353,10 @@ def _names(keys: Iterable[Key]) -> list[str]:
 def _settle_memory() -> None:
     """Exclude long-lived objects from garbage collection.
 
-    A full collection stops every thread for tens of milliseconds. Objects of a replaced snapshot
-    are unfrozen first, because frozen reference cycles are never freed. Where the C library
-    supports it, empty pages (about 30 MB after loading) go back to the system.
+    A full collection stops every thread for tens of milliseconds. The function first unfreezes all
+    objects, because the collector never frees frozen reference cycles of a replaced snapshot. If
+    the C library supports it, the function returns unused memory (about 30 MB after the load) to
+    the operating system.
     """
     gc.unfreeze()
     if gc.isenabled():

@@ -1,8 +1,8 @@
-"""The scene of a stream and its answers; docs/stream.md describes the protocol.
+"""The scene of a stream and its answers. docs/stream.md describes the protocol.
 
-A valid message is merged into the scene on arrival; an invalid message is refused without effect.
-Only the newest scene is computed, so a superseded update costs no computation. This module is
-independent of WebSockets.
+The service merges a valid message into the scene when it arrives. It refuses an invalid message and
+leaves the scene unchanged. It computes answers only for the newest scene, so a superseded update
+costs no computation. This module does not use WebSockets.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class StreamScene:
     """The scene of one stream and the number of its unanswered messages.
 
     Attributes:
-        seq: `seq` of the newest message in the scene; 0 if only `open` has arrived.
+        seq: sequence number of the newest message in the scene, or 0 if only `open` has arrived.
         pending: number of messages since the last answer.
     """
 
@@ -45,7 +45,7 @@ class StreamScene:
 
     @property
     def timeout_ms(self) -> int | None:
-        """Time limit for an answer that the client chose, in milliseconds."""
+        """Time limit for an answer in milliseconds, or None if the client chose none."""
         timeout: int | None = self._scene.fields.get("timeout_ms")
         return timeout
 
@@ -53,7 +53,7 @@ class StreamScene:
         """Merge a message into the scene.
 
         Raises:
-            RequestError: the message or the merged scene is invalid; the scene stays unchanged.
+            RequestError: the message or the merged scene is invalid. The scene stays unchanged.
             UnknownModelError, ModelUnavailableError: see `Request.read`.
         """
         faults = Faults()
@@ -85,7 +85,10 @@ class StreamScene:
             self.pending += 1
 
     async def answer(self, request: Request) -> tuple[Answer, dict[str, ServingError]]:
-        """Return a message with the answers about the newest scene, and the errors by question."""
+        """Return the answer message about the newest scene, and the error of each failed question.
+
+        The errors are a mapping from the name of the question to its error.
+        """
         seq, covered = self.seq, self.pending
         found, errors = await _answers(self._scene, request)
         self.pending -= covered
@@ -102,14 +105,14 @@ def _request(scene: MergedScene, form: type[SceneRequest] = SceneRequest, **give
 def _in_message(
     error: RequestError, scene: MergedScene, places: Mapping[str, int], given: Set[str]
 ) -> RequestError:
-    """Translate the locations of errors in the scene into locations in the message.
+    """Convert the locations of errors from the merged scene to the message.
 
-    A location outside the message starts with ``scene``.
+    A location starts with ``scene`` if the message does not contain the value.
 
     Args:
-        error: the errors, located in the scene.
+        error: the errors with locations in the merged scene.
         scene: the merged scene.
-        places: positions of the message's objects, by id.
+        places: maps the id of each object in the message to its index in the message.
         given: names of the message's fields.
     """
     names = list(scene.objects)
@@ -129,7 +132,10 @@ def _in_message(
 async def _answers(
     scene: MergedScene, request: Request
 ) -> tuple[dict[str, Answer], dict[str, ServingError]]:
-    """Return the answers by question, as the routes return them, and the errors by question."""
+    """Return the answer of each question, as its route returns it, and the errors.
+
+    Both are mappings from the name of the question.
+    """
     ask = scene.fields.get("ask") or _DEFAULT_ASK
     asked = [question for question in _ASKED if getattr(ask, question.name) is not None]
     names = [question.name for question in asked]
@@ -165,7 +171,7 @@ async def _answers(
 
 
 class TokenBucket:
-    """A rate limit of ``burst`` tokens at once, then ``rate`` tokens per second."""
+    """A rate limit: ``rate`` tokens per second on average, and at most ``burst`` tokens at once."""
 
     def __init__(self, rate: float, burst: float) -> None:
         self._rate = rate
@@ -201,10 +207,10 @@ class Streams:
 
     @contextmanager
     def place(self, end: Callable[[], None]) -> Iterator[None]:
-        """Count a stream as open within the context.
+        """Count a stream as open within the ``with`` block.
 
         Args:
-            end: asks the stream to end; called at most once.
+            end: function that asks the stream to end. It is called at most once.
         """
         self._open.add(end)
         self._metrics.streams(len(self._open))

@@ -1,4 +1,4 @@
-"""Warnings about probable mistakes in a scene; they accompany the answer."""
+"""Warnings about probable mistakes in a scene. Answers contain these warnings."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from app.scene.scene import Point, Scene, SceneObject
 from app.scene.vocabulary import Vocabulary
 from scene_client.schemas import SceneRequest, SceneWarning
 
-MOST_DISTANT: Final = 100.0  # m; millimetres sent as metres exceed this distance
-SMALLEST, LARGEST = 1e-3, 20.0  # m, sides of a box
-_SAME_DEPTH: Final = 1e-3  # m
-_LEAST_FLAT: Final = 3  # objects; two objects may really have the same depth
+MOST_DISTANT: Final = 100.0  # m from the viewer; detects positions in millimetres
+SMALLEST, LARGEST = 1e-3, 20.0  # m, plausible sides of a box
+_SAME_DEPTH: Final = 1e-3  # m, maximum difference of depths that count as equal
+_LEAST_FLAT: Final = 3  # minimum number of objects; two objects may really have the same depth
 
 Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"]
 
@@ -23,30 +23,31 @@ Code = Literal["implausible-position", "implausible-size", "flat-scene", "unknow
 def scene_warnings(
     given: Scene, scene: Scene, vocabulary: Vocabulary, request: SceneRequest
 ) -> list[SceneWarning]:
-    """Return the warnings of a scene, in a fixed order.
+    """Return the warnings about a scene.
 
     Args:
         given: the scene in body axes of the request's frame.
-        scene: the same scene after `observe`, in the viewer's axes if the request has a viewpoint.
+        scene: the same scene after `observe`, in viewer axes if the request has a viewpoint.
         vocabulary: classes of the model, with their typical sizes.
-        request: the request that holds the scene.
+        request: the request with the scene.
     """
     found: list[SceneWarning] = []
     sized = [thing for thing in scene.objects if thing.size is not None]
-    # Plain comparisons are fast enough: most scenes have no poses or pass all checks.
+    # Python loops are fast enough, because most scenes have no poses or pass all checks.
     placed = [thing for thing in scene.objects if thing.position is not None]
     if placed:
         _add(
             found,
             "implausible-position",
-            f"the object is more than {MOST_DISTANT:g} m away; positions must be in metres",
+            f"the object is more than {MOST_DISTANT:g} m from the viewer; positions must be in "
+            "metres",
             _distant(given, request),
         )
     if sized:
         _add(
             found,
             "implausible-size",
-            f"a side is below {SMALLEST * 1e3:g} mm or above {LARGEST:g} m; "
+            f"a side of the object is below {SMALLEST * 1e3:g} mm or above {LARGEST:g} m; "
             "sizes must be in metres",
             [thing for thing in sized if not _is_plausible(thing.size)],
         )
@@ -61,8 +62,8 @@ def scene_warnings(
         _add(
             found,
             "unknown-sizes",
-            "vertical relations are not observed: the object has no size, and its class has no "
-            "typical size",
+            "the service cannot derive vertical relations of this object: the object has no size, "
+            "and its class has no typical size",
             _unsized(placed, vocabulary),
         )
     return found
@@ -77,9 +78,10 @@ def _add(
 
 
 def _distant(given: Scene, request: SceneRequest) -> list[SceneObject]:
-    """Return the objects far from the viewer.
+    """Return the objects that are too far from the viewer.
 
-    In a world-fixed frame without a viewpoint, the median position replaces the viewer.
+    In a world-fixed frame without a viewpoint, the viewer is unknown. The median position of the
+    objects then replaces the position of the viewer.
     """
     placed = [(thing, thing.position) for thing in given.objects if thing.position is not None]
     centre: Point = (0.0, 0.0, 0.0)
@@ -96,7 +98,7 @@ def _is_plausible(size: Point | None) -> bool:
 
 
 def _is_flat(given: Scene) -> bool:
-    """Return whether all objects have the same depth: x in body axes, along the optical axis."""
+    """Return whether all objects have the same depth, the distance along the optical axis."""
     depths = [thing.position[0] for thing in given.objects if thing.position is not None]
     return len(depths) >= _LEAST_FLAT and max(depths) - min(depths) <= _SAME_DEPTH
 

@@ -128,7 +128,7 @@ def test_an_answer_of_a_newer_service_may_say_more() -> None:
 @pytest.mark.parametrize("body", [b"", b"<html>", b"{}", b"[]", b'{"models": 1}'])
 def test_success_that_cannot_be_read_is_said_to_be_so(body: bytes) -> None:
     world = World((200, {}, body))
-    with pytest.raises(AnswerError, match="/models is not ModelList"):
+    with pytest.raises(AnswerError, match="/models does not match the schema ModelList"):
         world.run()
     assert len(world.told) == 1
 

@@ -133,7 +133,7 @@ def test_scenes_are_drawn(scene: Any, tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"\x89PNG")
     done = scene("generate", "--plot", str(tmp_path / "out.doc"))
     assert done.exit_code == 2
-    assert "picture cannot be drawn" in done.stderr
+    assert "cannot draw the picture" in done.stderr
 
 
 def test_without_matplotlib_nothing_is_asked_and_the_way_out_is_said(
@@ -159,12 +159,12 @@ def test_a_refusal_is_1_and_says_what_was_meant(scene: Any) -> None:
     ("arguments", "word"),
     [
         (("missing",), "name the objects: labels"),
-        (("missing", "bed", "--at", "over bed"), "--at must be one of left, right"),
+        (("missing", "bed", "--at", "over bed"), "--at must be a relation and an object"),
         (("missing", "bed", "--at", "nightstand"), '"on-top desk"'),
         (("missing", "bed", "--relation", "bed over lamp"), "--relation"),
         (("missing", "nowhere.json"), "nowhere.json"),
         (("missing", "scenes/nowhere"), "scenes/nowhere: No such file"),
-        (("missing", "bed", "nowhere.json"), "nowhere.json must stand alone"),
+        (("missing", "bed", "nowhere.json"), "nowhere.json is a whole scene"),
         (("missing", "-"), "not JSON"),
         (("missing", "bed", "--timeout", "0"), "the timeout must be"),
         (("missing", "bed", "--no-such-option"), "no-such-option"),

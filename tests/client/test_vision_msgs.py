@@ -604,7 +604,7 @@ def test_the_command_takes_a_recorded_message_for_a_scene(repository: Path, tmp_
     assert {thing["object"] for thing in answer["outliers"]} == {
         *("track_3", "track_5", "track_7", "toilet_1", "book_1")
     }
-    assert done.stderr == f"{recorded}: detection 8: no hypothesis has a score\n"
+    assert done.stderr == f"{recorded}: detection 8: the detection has no hypothesis with a score\n"
 
     numbers = tmp_path / "numbers.json"
     numbers.write_text(json.dumps(array(seen(result("56")))))

@@ -18,7 +18,7 @@ from tests.services import LiveService, begin
 
 pytestmark = pytest.mark.system
 
-IN_USE = "SCENE_PORT: 127.0.0.1:{} is in use by another program; set SCENE_PORT to a free one\n"
+IN_USE = "SCENE_PORT: another program uses 127.0.0.1:{}; set SCENE_PORT to a free port\n"
 
 
 def messages(log: Path) -> list[str]:

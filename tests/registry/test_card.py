@@ -78,5 +78,5 @@ def test_text_stays_in_its_cell() -> None:
 
 
 def test_a_final_fit_says_that_its_figures_are_of_the_first() -> None:
-    assert "second fit" in card(training={"measured_split": "group"})
-    assert "second fit" not in card(training={})
+    assert "second training run" in card(training={"measured_split": "group"})
+    assert "second training run" not in card(training={})

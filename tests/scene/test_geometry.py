@@ -194,9 +194,9 @@ def test_a_scene_of_none_and_of_one() -> None:
 @pytest.mark.parametrize(
     ("positions", "sizes", "yaws", "message"),
     [
-        ([[0, 0]], [[1, 1, 1]], None, r"positions has shape \(1, 2\), must be \(1, 3\)"),
-        ([[0, 0, 0]], [[1, 1, 1]] * 2, None, r"sizes has shape \(2, 3\), must be \(1, 3\)"),
-        ([[0, 0, 0]], [[1, 1, 1]], [0, 0], r"yaws has shape \(2,\), must be \(1,\)"),
+        ([[0, 0]], [[1, 1, 1]], None, r"positions must have the shape \(1, 3\), not \(1, 2\)"),
+        ([[0, 0, 0]], [[1, 1, 1]] * 2, None, r"sizes must have the shape \(1, 3\), not \(2, 3\)"),
+        ([[0, 0, 0]], [[1, 1, 1]], [0, 0], r"yaws must have the shape \(1,\), not \(2,\)"),
         ([[0, 0, math.inf]], [[1, 1, 1]], None, "infinite"),
         ([[0, 0, 0]], [[1, 1, math.inf]], None, "infinite"),
         ([[0, 0, 0]], [[1, 1, 1]], [NAN], "infinite"),

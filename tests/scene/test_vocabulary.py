@@ -77,7 +77,7 @@ def test_the_dictionary_form_survives_json() -> None:
 
 
 def test_two_classes_cannot_share_a_name() -> None:
-    with pytest.raises(ValueError, match=r"'Trash-Cans' names two object classes: 'bin' and 'can'"):
+    with pytest.raises(ValueError, match=r"have the name 'Trash-Cans': 'bin' and 'can'"):
         Vocabulary([ObjectClass("bin", ("trash can",)), ObjectClass("can", ("Trash-Cans",))])
     with pytest.raises(ValueError, match="'bed room' and 'bedroom' have the same name"):
         Vocabulary([ObjectClass("bed")], ["bed room", "bedroom"])
@@ -90,7 +90,7 @@ def test_two_classes_cannot_share_a_name() -> None:
     [
         ({}, "list 'objects'"),
         ({"objects": []}, "at least one object class"),
-        ({"objects": ["bed"]}, "mapping with a 'label'"),
+        ({"objects": ["bed"]}, "mapping with a string 'label'"),
         ({"objects": [{"label": ""}]}, "empty name"),
         ({"objects": [{"label": "bed", "aliases": "cot"}]}, "aliases of 'bed'"),
         ({"objects": [{"label": "bed", "aliases": ["_"]}]}, "empty name"),
@@ -102,7 +102,7 @@ def test_two_classes_cannot_share_a_name() -> None:
         ({"objects": [{"label": "bed", "colour": "red"}]}, "unknown fields.*colour"),
         ({"objects": [{"label": "bed"}], "room_types": "attic"}, "room_types"),
         ({"objects": [{"label": "bed"}], "room_types": [1]}, "room_types"),
-        ({"objects": [{"label": "bed"}], "room_types": [""]}, "empty room type"),
+        ({"objects": [{"label": "bed"}], "room_types": [""]}, "room type has an empty name"),
     ],
 )
 def test_malformed_dictionaries_are_refused(values: dict[str, Any], message: str) -> None:

@@ -1,4 +1,7 @@
-"""Clients of the scene-reasoning service, based on httpx and pydantic; see docs/clients.md."""
+"""Python clients of the scene-reasoning service, based on httpx and pydantic.
+
+docs/clients.md describes them.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +39,8 @@ __all__ = [
     "UnreachableError",
 ]
 
-# Imported on first use: the service needs only the schemas, and starts faster without httpx and
-# websockets.
+# The package imports these modules on first use. The service needs only the schemas, and starts
+# faster without httpx and websockets.
 _MODULES = {
     "AsyncClient": "asynchronous",
     "Client": "sync",

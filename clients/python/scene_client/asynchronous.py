@@ -1,4 +1,4 @@
-"""The clients: `AsyncClient`, and `Client`, which `make format` generates from it."""
+"""The asynchronous client. `make format` generates the blocking client (`sync`) from this file."""
 
 from __future__ import annotations
 
@@ -40,30 +40,32 @@ from scene_client.schemas import (
 )
 
 MAX_ANSWER: Final = 256 * 2**20
-"""Maximum size in bytes; the answer to 256 scenes with 4,096 relations each is smaller."""
+"""Maximum size of an answer in bytes. An answer to 256 scenes of 4,096 relations is smaller."""
 
 
 class AsyncClient:
     """A client of the service.
 
-    The methods of `Client` block until the answer arrives, and several threads may share one
-    client. The methods of `AsyncClient` are the same as coroutines.
+    `Client` and `AsyncClient` have the same methods. The methods of `Client` block until the answer
+    arrives. Several threads may share one `Client`. The methods of `AsyncClient` are coroutines.
 
     Args:
         url: address of the service.
-        timeout: seconds for a whole call, including retries and the pauses between them.
+        timeout: maximum time of a call in seconds, including all retries and pauses.
         api_key: API key, if the service requires one.
         admin_key: key for `refresh` and `promote`.
-        model: model of requests that name none; default: the service's default model.
-        retries: maximum number of retries within the timeout, after status 429 or 503 and after
-            connection errors.
-        transport: transport of the requests; default: pooled connections.
+        model: model for requests without the field ``model``. By default, the service chooses its
+            default model.
+        retries: maximum number of retries of a call. The client retries after status 429 or 503 and
+            after connection errors, within the timeout.
+        transport: transport of the requests. The default is a pool of connections.
 
-    The first argument of a question is the objects, and further fields follow by name. It may also
-    be a whole request without further fields. The argument ``timeout`` applies to one call.
+    The first argument of a question is the list of objects. Other fields of the request are keyword
+    arguments. The first argument may also be a whole request, without keyword arguments. The
+    argument ``timeout`` of a method replaces the timeout of the client for this call.
 
     Raises:
-        InvalidRequestError: the request is malformed, so it was not sent.
+        InvalidRequestError: the request is invalid. The client has not sent it.
         ProblemError: the service answered with a problem.
         DeadlineError: the timeout has expired.
         UnreachableError: the connection failed.
@@ -108,7 +110,7 @@ class AsyncClient:
         timeout: float | None = None,
         **fields: Unpack[MissingFields],
     ) -> MissingAnswer:
-        """Return classes that the scene probably lacks, and their likely places."""
+        """Return classes that are probably missing from the list, and their likely places."""
         form, answer = MissingRequest, MissingAnswer
         call = ask("/missing", form, answer, objects, fields, self.options.model)
         return await self._call(call, timeout)
@@ -147,7 +149,7 @@ class AsyncClient:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[RelationsAnswer]:
-        """Like `relations`, for up to 256 scenes; a refused scene affects only its own entry."""
+        """Ask `relations` for up to 256 scenes. An invalid scene affects only its own entry."""
         form, answer = RelationsRequest, BatchAnswer[RelationsAnswer]
         call = ask_each("/relations", form, answer, scenes, self.options.model)
         return await self._call(call, timeout)
@@ -158,7 +160,7 @@ class AsyncClient:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[MissingAnswer]:
-        """Like `missing`, for up to 256 scenes; a refused scene affects only its own entry."""
+        """Ask `missing` for up to 256 scenes. An invalid scene affects only its own entry."""
         form, answer = MissingRequest, BatchAnswer[MissingAnswer]
         call = ask_each("/missing", form, answer, scenes, self.options.model)
         return await self._call(call, timeout)
@@ -169,7 +171,7 @@ class AsyncClient:
         *,
         timeout: float | None = None,
     ) -> BatchAnswer[OutliersAnswer]:
-        """Like `outliers`, for up to 256 scenes; a refused scene affects only its own entry."""
+        """Ask `outliers` for up to 256 scenes. An invalid scene affects only its own entry."""
         form, answer = OutliersRequest, BatchAnswer[OutliersAnswer]
         call = ask_each("/outliers", form, answer, scenes, self.options.model)
         return await self._call(call, timeout)
@@ -213,7 +215,7 @@ class AsyncClient:
         return await self._call(Call("GET", path, ContextsAnswer), timeout)
 
     async def refresh(self, *, timeout: float | None = None) -> RefreshAnswer:
-        """Reload the model store in the service; requires the admin key."""
+        """Make the service load the current state of its store. This needs the admin key."""
         call = Call("POST", "/models/refresh", RefreshAnswer, administers=True)
         return await self._call(call, timeout)
 
@@ -225,29 +227,31 @@ class AsyncClient:
         timeout: float | None = None,
         **fields: Unpack[AliasFields],
     ) -> AliasAnswer:
-        """Point an alias at a model or at one version of it; requires the admin key.
+        """Point an alias at a model or at one version of the model. This needs the admin key.
 
-        The call is not repeated after a connection error, because the alias may have moved already.
+        The client does not retry after a connection error, because the service may already have
+        moved the alias.
 
         Args:
             alias: ``default``, or any other alias.
             model: ``name@version``, or ``name`` for the newest version.
-            **fields: ``expected``: the current target of the alias; None if the alias must be new.
+            **fields: ``expected``: required current target of the alias. None means that the alias
+                must not exist yet.
         """
         return await self._call(promote(alias, {"model": model, **fields}), timeout)
 
     # --------------------------------------------------------------------------------- health
 
     async def is_live(self, *, timeout: float | None = None) -> bool:
-        """Return whether the service answers; without retries."""
+        """Return whether the service answers. The client does not retry."""
         return await self._is("live", timeout)
 
     async def is_ready(self, *, timeout: float | None = None) -> bool:
-        """Return whether the default model of the service is ready; without retries."""
+        """Return whether the default model of the service is ready. The client does not retry."""
         return await self._is("ready", timeout)
 
     async def check_ready(self, *, timeout: float | None = None) -> None:
-        """Return if the default model of the service is ready, else raise; without retries.
+        """Check that the default model of the service is ready. The client does not retry.
 
         Raises:
             UnreachableError, DeadlineError, ProblemError: the default model is not ready.
@@ -268,7 +272,7 @@ class AsyncClient:
     # ----------------------------------------------------------------------------------- a call
 
     async def _call(self, call: Call[T], timeout: float | None, retries: int | None = None) -> T:
-        """Return the answer of a call, with retries as long as its time allows."""
+        """Return the answer of a call. Retry as long as the timeout allows."""
         retries = self.options.retries if retries is None else retries
         limit = self.options.limit(timeout)
         ends = monotonic() + limit
@@ -285,13 +289,13 @@ class AsyncClient:
                 attempt += 1
                 await anyio.sleep(pause)
             else:
-                # Reading takes time too; an answer after the deadline counts as late.
+                # An answer that the client has read after the deadline counts as late.
                 if monotonic() < ends:
                     return answer
-        raise DeadlineError(f"No answer within {limit:g} s.")
+        raise DeadlineError(f"The answer did not arrive within {limit:g} s.")
 
     async def _attempt(self, call: Call[T], left: float) -> T:
-        """Send a call once and return its answer; it may take `left` seconds."""
+        """Send a call once and return its answer. The attempt may take at most `left` seconds."""
         options, body = self.options, bytearray()
         with async_deadline(left):
             try:
@@ -305,7 +309,7 @@ class AsyncClient:
                     async for part in response.aiter_bytes():
                         body += part
                         if len(body) > MAX_ANSWER:
-                            raise AnswerError("The answer is too long for this client.")
+                            raise AnswerError(f"The answer has more than {MAX_ANSWER} bytes.")
             except httpx.TimeoutException:
                 raise
             except httpx.TransportError as error:

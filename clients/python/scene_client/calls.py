@@ -1,4 +1,4 @@
-"""Build the request of a call from its arguments, and the answer from the response."""
+"""Conversion of the arguments of a call to an HTTP request, and of a response to an answer."""
 
 from __future__ import annotations
 
@@ -34,10 +34,13 @@ from scene_client.validation import field_errors
 
 FIRST_PAUSE: Final = 0.05
 LONGEST_PAUSE: Final = 2.0
-"""Seconds between attempts without a Retry-After header; the pause doubles each time."""
+"""Maximum pause in seconds between attempts without a Retry-After header.
+
+The limit of the random pause starts at `FIRST_PAUSE` and doubles with each attempt.
+"""
 
 Objects: TypeAlias = Iterable[str | Detection | Body]
-"""Labels, `Detection` objects, or detections as in the HTTP contract."""
+"""Objects of a scene: labels, `Detection` objects, or dictionaries as in the HTTP contract."""
 
 
 # ------------------------------------------------------------------------------------ one call
@@ -55,9 +58,9 @@ class Call(Generic[T]):
         method: HTTP method.
         path: URL-encoded path.
         answer: class of the answer.
-        body: JSON text; None without a body.
-        administers: the call needs the admin key.
-        repeatable: repeating the call has no further effect.
+        body: body as JSON text, or None for a call without a body.
+        administers: whether the call needs the admin key.
+        repeatable: whether the client may send the call twice without harm.
     """
 
     method: str
@@ -71,7 +74,9 @@ class Call(Generic[T]):
         """Return the answer in a response.
 
         Raises:
-            ProblemError, DeadlineError, AnswerError: the response has no answer.
+            ProblemError: the service answered with a problem.
+            DeadlineError: the deadline passed in the service.
+            AnswerError: the client cannot read the answer.
         """
         if status != HTTPStatus.OK:
             problem = problem_of(status, headers, body)
@@ -83,34 +88,35 @@ class Call(Generic[T]):
             return self.answer.model_validate_json(body, extra="ignore")
         except ValidationError as error:
             raise AnswerError(
-                f"The answer of {self.path} is not {self.answer.__name__}: "
-                f"{error.error_count()} errors. Is this the address of the service?"
+                f"The answer of {self.path} does not match the schema {self.answer.__name__} "
+                f"({error.error_count()} errors). Check the address of the service."
             ) from None
 
     def retry_pause(self, error: ProblemError | UnreachableError, attempt: int) -> float | None:
-        """Return the seconds before a retry; None if a retry is useless or may do harm.
+        """Return the pause before a retry in seconds, or None if the client must not retry.
 
         Args:
-            attempt: number of the attempt, 0 for the first.
+            error: error of the attempt.
+            attempt: number of the attempt, from 0.
         """
         pause = min(LONGEST_PAUSE, FIRST_PAUSE * 2**attempt) * random()  # noqa: S311 # nosec B311
         if isinstance(error, ProblemError):
-            # Wait at least for Retry-After, plus a random pause so that clients spread out.
+            # The random pause spreads the retries of many clients over time.
             return pause + (error.retry_after or 0.0) if error.status in (429, 503) else None
         sent = not isinstance(error.__cause__, httpx.ConnectError)
         return pause if self.repeatable or not sent else None
 
 
 def segment(name: str) -> str:
-    """Return a name as one segment of a path.
+    """Return a name as one URL-encoded segment of a path.
 
     Raises:
-        InvalidRequestError: the name is empty or has only dots.
+        InvalidRequestError: the name is empty or contains only dots.
     """
-    # A segment of dots only would be read as a parent folder.
+    # In a URL, the segments "." and ".." mean a folder.
     if not name or set(name) <= {"."}:
         raise InvalidRequestError(
-            [FieldError(pointer="#", message="a name must have a character other than a dot")]
+            [FieldError(pointer="#", message="a name must contain a character other than a dot")]
         )
     return quote(name, safe="")
 
@@ -129,14 +135,14 @@ def ask(
     """Build one question about one scene.
 
     Args:
-        path: the address of the question.
-        form, answer: its schemas.
-        scene: objects, a whole request, or its body as in the HTTP contract.
-        fields: further fields, if ``scene`` holds objects.
-        model: model of requests that name none.
+        path: path of the question's route.
+        form, answer: schemas of the request and the answer.
+        scene: objects, or a whole request as an object or a dictionary.
+        fields: other fields of the request, if ``scene`` contains only objects.
+        model: model for requests without the field ``model``.
 
     Raises:
-        InvalidRequestError: the request is malformed.
+        InvalidRequestError: the request is invalid.
     """
     return Call("POST", path, answer, _json(_request(form, scene, fields, model)))
 
@@ -148,17 +154,17 @@ def ask_each(
     scenes: Iterable[Any],
     model: str | None = None,
 ) -> Call[T]:
-    """Build one question about many scenes, each as in `ask`; the answer is that of the batch.
+    """Build a batch request: one question about many scenes. `ask` describes the arguments.
 
     Raises:
-        InvalidRequestError: one of the requests is malformed.
+        InvalidRequestError: the request about a scene is invalid.
     """
     requests = [
         _json(_request(form, scene, {}, model, ("scenes", place)))
         for place, scene in enumerate(scenes)
     ]
     if not 1 <= len(requests) <= MAX_BATCH:
-        message = f"must hold from 1 to {MAX_BATCH} scenes"
+        message = f"a batch must contain from 1 to {MAX_BATCH} scenes"
         raise InvalidRequestError([FieldError(pointer="#/scenes", message=message)])
     body = f'{{"scenes":[{",".join(requests)}]}}'
     return Call("POST", f"{path}/batch", answer, body)
@@ -168,7 +174,7 @@ def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
     """Build the call that points an alias at another target.
 
     Raises:
-        InvalidRequestError: the request is malformed.
+        InvalidRequestError: the request is invalid.
     """
     return Call(
         "PUT",
@@ -176,13 +182,13 @@ def promote(alias: str, fields: Mapping[str, Any]) -> Call[AliasAnswer]:
         AliasAnswer,
         _json(_validated(AliasRequest, dict(fields))),
         administers=True,
-        # A repeated call would fail on its own `expected`.
+        # If the first attempt has moved the alias, a second attempt with `expected` would fail.
         repeatable=False,
     )
 
 
 def _json(request: BaseModel) -> str:
-    # Unset fields are left out, because an older service may reject them.
+    # The body leaves out unset fields, because an older service may refuse them.
     return request.model_dump_json(exclude_unset=True)
 
 
@@ -196,7 +202,7 @@ def _request(
     if isinstance(scene, SceneRequest | Mapping):
         if fields:
             names = ", ".join(fields)
-            message = f"fields beside a whole request must be in the request: {names}"
+            message = f"put these fields into the whole request, not beside it: {names}"
             raise InvalidRequestError([FieldError(pointer="#", message=message)])
         given = _plain(scene)
     else:
@@ -207,7 +213,7 @@ def _request(
     return _validated(kind, spelt_out, at)
 
 
-# Short forms: the members for which a tuple stands.
+# Short forms: in these fields, a tuple may replace an object with these members.
 _TUPLES: Final = {
     "relations": ("subject", "relation", "object"),
     "pairs": ("subject", "object"),
@@ -216,7 +222,7 @@ _TUPLES: Final = {
 
 
 def _spelt_out(name: str, value: Any) -> Any:
-    """Return a field's value as in the HTTP contract, if it has a known short form."""
+    """Return the value of a field as in the HTTP contract. Tuples in it become objects."""
     members = _TUPLES.get(name, ())
     if name == "at":
         return _member(value, members)

@@ -1,8 +1,8 @@
-"""The command ``scene``: the questions on the command line, for people and scripts.
+"""The command ``scene``: it asks the questions from the command line.
 
-Exit status: 0, answered; 1, the service refused the request; 2, wrong usage; 3, the service cannot
-be reached; 4, no answer in time; 5, the service is busy or not ready; 6, any other error. Error
-messages go to standard error.
+The exit status is 0 after an answer, 1 if the service refused the request, and 2 for wrong usage.
+It is 3 if the service cannot be reached, 4 if the answer did not arrive in time, 5 if the service
+is busy or not ready, and 6 for any other error. The command writes errors to standard error.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from scene_client.vision_msgs import from_message, is_message
 REFUSED, MEANINGLESS, UNREACHABLE, LATE, BUSY, FAILED = range(1, 7)
 
 MAX_FILE: Final = 64 * 2**20
-"""Maximum size of a scene file in bytes; larger ones exceed the limit of every service."""
+"""Maximum size of a scene file in bytes. Every service refuses larger bodies."""
 
 _FLAGS: Final = ("--json",)
 _VALUED: Final = ("--url", "--model", "--offline", "--timeout")
@@ -48,10 +48,10 @@ _RELATIONS: Final = get_args(RelationName)
 
 
 class _Group(TyperGroup):
-    """A command whose own options may also follow the subcommand."""
+    """A command whose general options may also follow the subcommand."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Move the command's own options to the front."""
+        """Move the general options before the subcommand, then parse all arguments."""
         own, others = [], []
         given = iter(args)
         for word in given:
@@ -81,7 +81,7 @@ app = typer.Typer(
 
 @dataclass(frozen=True)
 class Asked:
-    """The options of every question."""
+    """The general options, which apply to every question."""
 
     url: str
     model: str | None
@@ -90,28 +90,29 @@ class Asked:
     as_json: bool
 
     def ask(self, question: Callable[[Client], T]) -> T:
-        """Return the answer of the service or the store; an error ends the program."""
+        """Return the answer of the service or the store. An error ends the program."""
         with _failing(), self._client() as client:
             return question(client)
 
     def _client(self) -> Client:
         if self.store is not None:
             return OfflineClient(self.store, timeout=self.timeout, model=self.model)
-        # Keys are not options: other users of a machine can read the options of a process.
+        # The key is not an option, because other users of a machine can read the options of a
+        # process.
         key = os.environ.get("SCENE_API_KEY") or None
         return Client(self.url, timeout=self.timeout, model=self.model, api_key=key)
 
     def show(
         self, question: Callable[[Client], AnswerT], table: Callable[[AnswerT], RenderableType]
     ) -> AnswerT:
-        """Ask, and print the answer as JSON or as a table; terminals get colours."""
+        """Ask a question, and print the answer as JSON or as a table."""
         answer = self.ask(question)
         if self.as_json:
             print(answer.model_dump_json(exclude_none=True))
             return answer
         console = Console(markup=False, highlight=False, emoji=False)
         if not console.is_terminal:
-            # For programs, the table is neither cut nor wrapped.
+            # The output goes to a file or a program, so the table must not be cut or wrapped.
             console.width = 10_000
         console.print(table(answer))
         for note in tables.notes(answer):
@@ -294,7 +295,7 @@ def generate(
         try:
             draw(answer, plot)
         except (OSError, ValueError) as error:
-            _fail(f"the picture cannot be drawn: {error}", MEANINGLESS)
+            _fail(f"the command cannot draw the picture: {error}", MEANINGLESS)
 
 
 # ------------------------------------------------------------------------------------- models
@@ -338,14 +339,16 @@ def _scene(
     ignore_unknown: bool,
     unknown_labels: UnknownLabels | None,
 ) -> dict[str, Any]:
-    """Return the fields of a scene; options override the fields of a file."""
+    """Return the fields of the request. Options override the fields of a file."""
     if ignore_unknown and unknown_labels not in (None, "ignore"):
-        _fail("--ignore-unknown contradicts --unknown-labels", MEANINGLESS)
+        _fail("use only one of --ignore-unknown and --unknown-labels", MEANINGLESS)
     if things is None:
         _fail("name the objects: labels, a file that ends in .json, or - for stdin", MEANINGLESS)
     files = [thing for thing in things if _is_file(thing)]
     if files and things != files[:1]:
-        _fail(f"{files[0]} must stand alone, because it is a whole scene", MEANINGLESS)
+        _fail(
+            f"{files[0]} is a whole scene; do not give labels or other files with it", MEANINGLESS
+        )
     scene = _read(files[0]) if files else {"objects": things}
     return scene | _named(
         relations=[_relation(text) for text in stated] if stated else None,
@@ -355,12 +358,12 @@ def _scene(
 
 
 def _named(**options: Any) -> dict[str, Any]:
-    """Return the options that the command line gives."""
+    """Return the options that the user has set."""
     return {name: value for name, value in options.items() if value is not None}
 
 
 def _is_file(thing: str) -> bool:
-    """Return whether an argument is a file: labels never end in .json and never hold a slash."""
+    """Return whether an argument is a file. A label never ends in .json or contains a slash."""
     return thing == "-" or thing.endswith(".json") or os.sep in thing
 
 
@@ -374,17 +377,17 @@ def _read(name: str) -> dict[str, Any]:
     except OSError as error:
         _fail(f"{name}: {error.strerror}", MEANINGLESS)
     if len(text) > MAX_FILE:
-        _fail(f"{name}: the file has more than {MAX_FILE} bytes", MEANINGLESS)
+        _fail(f"{name} has more than {MAX_FILE} bytes", MEANINGLESS)
     try:
         scene = json.loads(text)
     except (ValueError, RecursionError) as error:
-        _fail(f"{name}: not JSON: {error}", MEANINGLESS)
+        _fail(f"{name} is not JSON: {error}", MEANINGLESS)
     if is_message(scene):
         return _detected(name, scene)
     if isinstance(scene, list):
         return {"objects": scene}
     if not isinstance(scene, dict):
-        _fail(f"{name}: the file is neither a request nor a list of objects", MEANINGLESS)
+        _fail(f"{name} must contain a request or a list of objects", MEANINGLESS)
     return scene
 
 
@@ -404,17 +407,24 @@ def _anchor(text: str) -> dict[str, str]:
     relation, _, object = text.strip().partition(" ")
     if relation not in _RELATIONS or not object:
         names = ", ".join(_RELATIONS)
-        _fail(f'--at must be one of {names}, and an object: "on-top desk"', MEANINGLESS)
+        _fail(
+            f'--at must be a relation and an object, such as "on-top desk"; relations: {names}',
+            MEANINGLESS,
+        )
     return {"relation": relation, "object": object.strip()}
 
 
 def _relation(text: str) -> dict[str, str]:
-    # Labels may hold spaces; the relation is the word between them.
+    # Labels may contain spaces. The first name of a relation separates the two labels.
     words = text.split()
     place = next((n for n, word in enumerate(words[1:-1], 1) if word in _RELATIONS), None)
     if place is None:
         names = ", ".join(_RELATIONS)
-        _fail(f"--relation must name two objects with one of {names} between them", MEANINGLESS)
+        _fail(
+            f'--relation must be an object, a relation and an object, such as "lamp on-top desk"; '
+            f"relations: {names}",
+            MEANINGLESS,
+        )
     subject, object = " ".join(words[:place]), " ".join(words[place + 1 :])
     return {"subject": subject, "relation": words[place], "object": object}
 
@@ -431,7 +441,7 @@ def _failing() -> Iterator[None]:
     except ProblemError as problem:
         _fail(str(problem), _status(problem))
     except UnreachableError as error:
-        _fail(f"no service: {error}", UNREACHABLE)
+        _fail(f"the service cannot be reached: {error}", UNREACHABLE)
     except DeadlineError as error:
         _fail(str(error), LATE)
     except ClientError as error:

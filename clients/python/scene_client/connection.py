@@ -1,8 +1,8 @@
 """Options of a client, and connections with a deadline for a whole call.
 
-httpx limits each wait on the socket. A server that sends single bytes could exceed that limit many
-times. For coroutines, anyio cancels the call at its deadline. For blocking calls, every wait gets
-the remaining time of the call. The name resolution of blocking calls has no limit.
+httpx limits only each wait on the socket. If a server sends single bytes, a call could take much
+longer than the limit. So anyio cancels a coroutine at the deadline of the call. In a blocking call,
+each wait lasts at most until the deadline. The name resolution of blocking calls has no limit.
 """
 
 from __future__ import annotations
@@ -25,23 +25,25 @@ from scene_client.errors import InvalidRequestError, UnreachableError
 from scene_client.schemas import FieldError
 
 MAX_TIMEOUT: Final = 600.0
-"""Seconds; the limit of the service."""
+"""Maximum timeout of a call in seconds. The service has the same maximum."""
 
 RETRIES: Final = 5
-"""Default for the maximum number of retries within the timeout."""
+"""Default for the maximum number of retries of a call."""
 
 MAX_CONNECTIONS: Final = 100
-"""Open connections at once; further calls wait for a free connection within their timeout."""
+"""Maximum number of open connections. More calls wait for a free connection."""
 
 KEEP_ALIVE: Final = 4.0
-"""Seconds that an idle connection stays open.
+"""The client closes a connection after this idle time in seconds.
 
-uvicorn closes it after five seconds. A request sent at that moment would be lost."""
+uvicorn closes idle connections after five seconds. A request sent at that moment would be lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Checked arguments of `AsyncClient`; ``url`` includes a path prefix that a proxy strips.
+    """The checked arguments of `AsyncClient`.
+
+    ``url`` includes the path prefix, if a proxy strips one.
 
     Raises:
         InvalidRequestError: the URL, the timeout or the number of retries is invalid.
@@ -57,7 +59,7 @@ class Options:
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
         if parts.scheme not in {"http", "https"} or not parts.hostname:
-            raise _refused("the URL must begin with http:// or https:// and name a host")
+            raise _refused("the URL must start with http:// or https:// and contain a host")
         if parts.query or parts.fragment:
             raise _refused("the URL must not have a query or a fragment")
         if self.retries < 0:
@@ -76,10 +78,10 @@ class Options:
         return seconds
 
     def ssl_context(self) -> ssl.SSLContext:
-        """Return a context with the system's CA bundle for https, without certificates for http."""
+        """Return the SSL context. Only for https, it contains the system's CA bundle."""
         if urlsplit(self.url).scheme == "https":
             return httpx.create_ssl_context()
-        # Loading the bundle takes longer than a question.
+        # For http, the bundle is not needed. Its load takes longer than a question.
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 
     def address(self, call: Call[T]) -> str:
@@ -87,16 +89,17 @@ class Options:
         return self.url.rstrip("/") + call.path
 
     def headers(self, call: Call[T], left: float) -> dict[str, str]:
-        """Return the headers of a call with `left` seconds remaining."""
+        """Return the headers of a call. The call has `left` seconds until its deadline."""
         headers = {
             "Accept": "application/json",
-            # Uncompressed, because a small compressed body could unpack to any size.
+            # The client refuses compression, because a small compressed body could unpack to any
+            # size.
             "Accept-Encoding": "identity",
             "X-Request-Timeout-Ms": str(max(1, int(left * 1e3))),
         }
         if call.body is not None:
             headers["Content-Type"] = "application/json"
-        # Only administrative routes get the admin key.
+        # The client sends the admin key only to administration routes.
         if call.administers and self.admin_key is not None:
             headers["X-Admin-Key"] = self.admin_key
         elif self.api_key is not None:
@@ -104,9 +107,9 @@ class Options:
         return headers
 
     def unreachable(self, error: Exception) -> UnreachableError:
-        """Return the error of a call whose connection failed with `error`."""
+        """Convert an exception of the connection to `UnreachableError`."""
         parts = urlsplit(self.url)
-        # The URL may hold a user name and a password, which are left out.
+        # The message leaves out the user name and the password of the URL.
         host = parts.netloc.rpartition("@")[2]
         return UnreachableError(f"{parts.scheme}://{host}: {str(error) or type(error).__name__}")
 
@@ -130,7 +133,7 @@ def async_transport(ssl_context: ssl.SSLContext) -> httpx.AsyncHTTPTransport:
 
 
 class _Deadline(threading.local):
-    """The end of this thread's waits, on the monotonic clock."""
+    """The deadline of the current call of each thread, on the monotonic clock."""
 
     ends = float("inf")
 
@@ -140,7 +143,7 @@ _DEADLINE: Final = _Deadline()
 
 @contextmanager
 def deadline(seconds: float) -> Iterator[None]:
-    """Limit the total time that this thread waits on connections of `DeadlineTransport`."""
+    """Limit the total time that this thread waits for connections of `DeadlineTransport`."""
     _DEADLINE.ends = monotonic() + seconds
     try:
         yield
@@ -149,11 +152,11 @@ def deadline(seconds: float) -> Iterator[None]:
 
 
 def _left(timeout: float | None) -> float:
-    """Return the seconds for the next wait.
+    """Return the maximum time of the next wait in seconds.
 
     Raises:
-        httpcore.TimeoutException: the time is over. Without this error, waits for data that have
-            already arrived would always succeed.
+        httpcore.TimeoutException: the deadline has passed. Without this exception, a wait for data
+            that have already arrived would succeed after the deadline.
     """
     left = _DEADLINE.ends - monotonic()
     if left <= 0:
@@ -224,7 +227,7 @@ class _Body(httpx.SyncByteStream):
 
 
 class DeadlineTransport(httpx.BaseTransport):
-    """Pooled connections whose waits end at the `deadline`."""
+    """A pool of connections. Each wait on a connection ends at the `deadline` at the latest."""
 
     def __init__(self, ssl_context: ssl.SSLContext) -> None:
         self._pool = httpcore.ConnectionPool(
@@ -235,7 +238,7 @@ class DeadlineTransport(httpx.BaseTransport):
         )
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """See `httpx.BaseTransport`."""
+        """Send one request; see `httpx.BaseTransport`."""
         url = request.url
         sent = httpcore.Request(
             request.method,

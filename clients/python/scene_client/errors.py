@@ -1,4 +1,4 @@
-"""The errors that a call raises."""
+"""The exceptions that a call can raise."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ class ClientError(Exception):
     """The call failed."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Restores the attributes without calling the class, so that process pools can pass errors
-        # on.
+        # Process pools pickle exceptions. `_restored` restores the attributes without the
+        # constructor.
         return _restored, (type(self), self.args, self.__dict__)
 
 
 class InvalidRequestError(ClientError, ValueError):
-    """The request is malformed, so it was not sent.
+    """The request is invalid. The client has not sent it.
 
     Attributes:
-        errors: the errors, with their places in the body of the request.
+        errors: the errors, with their locations in the body of the request.
     """
 
     def __init__(self, errors: Sequence[FieldError]) -> None:
@@ -39,14 +39,15 @@ class ProblemError(ClientError):
     """The service answered with a problem (RFC 9457).
 
     Attributes:
-            type: stable path of the problem's page (``/problems/unknown-labels``); branch on it.
-                ``about:blank`` if the answer is not from the service, for example from a proxy.
+            type: path of the problem's page, such as ``/problems/unknown-labels``. It never
+                changes, so programs can compare it. It is ``about:blank`` if the answer is not from
+                the service, but for example from a proxy.
             status: HTTP status.
-            title: text that all problems of a type share.
-            detail: text about this problem.
-            errors: the errors in the request, with their places and similar known names.
+            title: short summary. All problems of this type have the same title.
+            detail: description of this problem.
+            errors: the errors in the request, with their locations and similar known names.
             failures: entries of the store that a refresh refused, with reasons.
-            request_id: id of the request in the service's log; empty if the service sent none.
+            request_id: id of the request in the service's log, or "" if the response has none.
             retry_after: seconds to wait before the next request.
     """
 
@@ -75,14 +76,14 @@ class ProblemError(ClientError):
 
 
 class UnreachableError(ClientError):
-    """The connection failed or broke before an answer arrived."""
+    """The connection failed before the answer arrived."""
 
 
 class DeadlineError(ClientError):
     """The timeout expired before the answer arrived.
 
     Attributes:
-        request_id: id of the request if the service stopped it; else empty.
+        request_id: id of the request if the service stopped the request, else "".
     """
 
     def __init__(self, message: str, request_id: str = "") -> None:
@@ -91,14 +92,16 @@ class DeadlineError(ClientError):
 
 
 class AnswerError(ClientError):
-    """The service succeeded, and the client cannot read its answer."""
+    """The client cannot read the answer of the service."""
 
 
 def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemError:
-    """Return the problem of a response whose status is not 200.
+    """Return the problem of a response with an error status.
 
     Args:
+        status: HTTP status.
         headers: headers with lower-case names.
+        body: body of the response.
     """
     retry_after = _seconds(headers.get("retry-after"))
     with suppress(ValidationError):
@@ -113,7 +116,8 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
             request_id=problem.request_id,
             retry_after=retry_after,
         )
-    # From a proxy or another server. Its text may change at any time, so it is left out.
+    # The response comes from a proxy or another server. The error leaves out its text, because this
+    # text may change at any time.
     try:
         title = HTTPStatus(status).phrase
     except ValueError:
@@ -122,7 +126,7 @@ def problem_of(status: int, headers: Mapping[str, str], body: bytes) -> ProblemE
         "about:blank",
         status,
         title,
-        "The answer is not a problem document of the service.",
+        "The answer does not come from the service, but for example from a proxy.",
         request_id=headers.get("x-request-id", ""),
         retry_after=retry_after,
     )
@@ -149,7 +153,7 @@ def _restored(kind: type[ClientError], args: tuple[Any, ...], state: dict[str, A
 
 
 def _placed(error: FieldError) -> str:
-    # "#" means the whole body: the error has no field, or is not in the body.
+    # "#" means the whole body, so the message needs no location.
     where = "" if error.pointer == "#" else f"{error.pointer}: "
     return where + _worded(error)
 

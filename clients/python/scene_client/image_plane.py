@@ -1,14 +1,14 @@
-"""Relations of two boxes in an image: left of, or above, as the camera sees them.
+"""Relations of two boxes in an image: left, right, above and below, as the camera sees the boxes.
 
-Training on images and detections without depth use the same rule. Without depth, front and support
-are unknown, and an object that is *above* in the image may be farther away on the floor.
+Training on images and detections without depth use the same rule. Without depth, front and on-top
+are unknown. An object that is *above* another in the image may be farther away on the floor.
 
-An image has no metres, so the unit is the mean of the two boxes' diagonals. Boxes are neighbours if
-the gap between them is at most one unit. The larger offset between the centres decides the
-relation; at equal offsets the sideways one decides. Offsets under 10 % of the unit give no
-relation.
+An image has no metres, so the unit of length is the mean diagonal of the two boxes. Boxes are
+neighbours if the gap between them is at most one unit. The larger of the horizontal and the
+vertical distance between the centres decides the relation. If both are equal, the horizontal
+distance decides. If both are under 10 % of the unit, there is no relation.
 
-Plain Python, because a client has no arrays.
+The module is plain Python, because a client does not have numpy.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from collections.abc import Sequence
 from typing import Final, Literal, TypeAlias
 
 Box: TypeAlias = tuple[float, float, float, float]
-"""(xmin, ymin, xmax, ymax), y downwards; a box with NaN is unseen and has no neighbour."""
+"""A box (xmin, ymin, xmax, ymax), with y downwards. A box with NaN has no neighbours."""
 
-MIN_OFFSET: Final = 0.10  # of the mean diagonal
+MIN_OFFSET: Final = 0.10  # minimum distance between the centres, in mean diagonals
 
 
 def are_neighbours(box: Box, other: Box) -> bool:
@@ -31,7 +31,7 @@ def are_neighbours(box: Box, other: Box) -> bool:
 
 
 def relation_between(box: Box, other: Box) -> Literal["left", "right", "above", "below"] | None:
-    """Return the relation of a box to its neighbour; None if the centres are too close."""
+    """Return the relation of a box to its neighbour, or None if the centres are too close."""
     across = (box[0] + box[2]) / 2 - (other[0] + other[2]) / 2
     down = (box[1] + box[3]) / 2 - (other[1] + other[3]) / 2
     if not max(abs(across), abs(down)) >= MIN_OFFSET * _unit(box, other):
@@ -43,11 +43,13 @@ def relation_between(box: Box, other: Box) -> Literal["left", "right", "above", 
 
 
 def left_pairs(boxes: Sequence[Box | None], order: Sequence[int]) -> list[tuple[int, int]]:
-    """Return pairs of neighbours, left one first; boxes early in ``order`` give the first pairs.
+    """Return all pairs (i, j) of neighbours where box i is left of box j.
+
+    Pairs of boxes that are early in ``order`` come first.
 
     Args:
-        boxes: boxes of the objects; None for objects without a box.
-        order: positions in ``boxes``.
+        boxes: boxes of the objects, or None for objects without a box.
+        order: indices of ``boxes``.
     """
     found = []
     for rank, i in enumerate(order):
@@ -72,7 +74,7 @@ def upright_box(centre: tuple[float, float], size: tuple[float, float], theta: f
 
 
 def _unit(box: Box, other: Box) -> float:
-    """Return the mean of the diagonals."""
+    """Return the mean diagonal of two boxes."""
     return (_diagonal(box) + _diagonal(other)) / 2
 
 

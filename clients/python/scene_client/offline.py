@@ -8,15 +8,17 @@ from scene_client.sync import Client
 
 
 class OfflineClient(Client):
-    """Answer in this process from a model store, with the same answers and problems as a service.
+    """A client that runs the service in its own process, with a local model store.
 
-    It needs the service's packages (`pip install '.[service]'` in the repository). The constructor
-    loads the packages and every model of the store.
+    Answers and problems are the same as from a separate service. The client needs the service's
+    packages (`pip install '.[service]'` in the repository). The constructor loads these packages
+    and every model of the store.
 
     Args:
         store: directory of published models.
-        timeout: seconds for a whole call.
-        model: model of requests that name none; default: the store's default model.
+        timeout: maximum time of a call in seconds.
+        model: model for requests without the field ``model``. By default, the alias `default` of
+            the store applies.
 
     Raises:
         ImportError: the service's packages are not installed.
@@ -26,12 +28,12 @@ class OfflineClient(Client):
     def __init__(
         self, store: str | Path = "model_store", *, timeout: float = 10.0, model: str | None = None
     ) -> None:
-        # Imported here, because clients of a running service do not have these packages.
+        # The import is here, because clients of a separate service do not have these packages.
         try:
             from app.in_process import InProcess
         except ImportError as error:
             raise ImportError(
-                f"offline answers need the service's packages ({error}): "
+                f"offline answers need the packages of the service ({error}); install them with "
                 "pip install '.[service]' in the repository"
             ) from error
 

@@ -1,8 +1,9 @@
-"""Pictures of generated scenes, which show relations and have no overlapping objects.
+"""Pictures of generated scenes. They show the relations, and their boxes never overlap.
 
-The view is that of the robot: left is left, near is below, and supported objects are drawn above
-their support. If relations contradict each other, the first ones are drawn. The module needs
-matplotlib, which comes with the group `training`.
+A picture shows the scene from the view of the robot: left objects are left, near objects are at the
+bottom, and supported objects are above their support. If relations contradict each other, the
+earlier relation decides. The module needs matplotlib, which the dependency group `training`
+contains.
 """
 
 from __future__ import annotations
@@ -21,24 +22,24 @@ from scene_client.schemas import GenerateAnswer, GeneratedScene, Relation
 
 HEIGHT: Final = 1.0
 GAP: Final = 0.6
-"""Gap between objects side by side, and between a hovering object and the object below it."""
+"""Gap between neighbouring boxes, in the unit of `HEIGHT`, the height of a box."""
 
-# Each relation has its own dashes besides its colour. On-top has no line: the boxes touch.
+# Colour and line style of each relation. On-top has no line, because its boxes touch.
 _STYLES: Final = {
     "left": ("#1f5fa8", "-"),
     "front": ("#b34700", "--"),
     "above": ("#2d7a2d", ":"),
 }
-# Inches per unit of the layout; labels of `_POINTS` points then fit their boxes.
+# Inches per unit of length. With this scale, labels of `_POINTS` points fit into their boxes.
 _UNIT: Final = 0.32
 _POINTS: Final = 7
-# Units around each scene, for its title above and its legend below.
+# Units of length for the title above each scene and the legend below it.
 _MARGIN: Final = 4.0
 _MAX_PIXELS: Final = 6000
 
 
 def draw(answer: GenerateAnswer, path: Path) -> None:
-    """Write a picture of every scene; the suffix of ``path`` selects the format.
+    """Write a picture of all scenes to a file. The suffix of ``path`` selects the format.
 
     Raises:
         ValueError: matplotlib does not support the format.
@@ -79,7 +80,7 @@ def _draw(axes: Axes, scene: GeneratedScene, boxes: list[Box]) -> None:
             )
         )
         middle = (box.x + box.width / 2, box.y + box.height / 2)
-        # A dollar sign would start a formula.
+        # In matplotlib, an unescaped dollar sign starts a formula.
         text = box.label.replace("$", r"\$")
         axes.text(*middle, text, ha="center", va="center", fontsize=_POINTS, zorder=3)
     named = {box.label: box for box in boxes}
@@ -116,13 +117,13 @@ def _join(axes: Axes, subject: Box, object: Box, relation: str) -> None:
 
 # ------------------------------------------------------------------------------------ layout
 
-# Each opposite relation, and the drawn relation with subject and object exchanged.
+# Maps each opposite relation to the relation that the picture shows, with exchanged ends.
 _OPPOSITES: Final = {"right": "left", "behind": "front", "under": "on-top", "below": "above"}
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """The drawing of one object: its label, its lower left corner and its extents."""
+    """The box of one object in the picture: label, lower left corner, width and height."""
 
     label: str
     x: float
@@ -132,7 +133,7 @@ class Box:
 
 
 def extent(boxes: Sequence[Box]) -> tuple[float, float]:
-    """Return the right and the upper end of all boxes."""
+    """Return the largest x and the largest y of all boxes."""
     right = max((box.x + box.width for box in boxes), default=0.0)
     return right, max((box.y + box.height for box in boxes), default=0.0)
 
@@ -153,7 +154,7 @@ class _Order:
                 before |= earlier
 
     def ranks(self) -> dict[str, int]:
-        """Return the length of the longest chain of predecessors of each object."""
+        """Map each object to the length of its longest chain of predecessors."""
         ranks: dict[str, int] = {}
         for name in sorted(self._before, key=lambda name: len(self._before[name])):
             ranks[name] = max((ranks[other] + 1 for other in self._before[name]), default=0)
@@ -161,10 +162,10 @@ class _Order:
 
 
 def arrange(objects: Sequence[str], relations: Iterable[Relation]) -> list[Box]:
-    """Return a box for each object, in any order; the lower left corner of all is (0, 0).
+    """Return a box for each object, in any order. The smallest x and y of all boxes are 0.
 
     Args:
-        objects: names, without duplicates.
+        objects: names of the objects, without duplicates.
         relations: relations between the objects.
     """
     stated = [_drawn(relation) for relation in relations]
@@ -202,7 +203,10 @@ def _drawn(relation: Relation) -> tuple[str, str, str]:
 
 
 def _supporters(stated: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
-    """Return the object below each object that stands or hovers; cycles are left out."""
+    """Map each object that is on top of or above another object to this object and the relation.
+
+    The function ignores relations that would close a cycle.
+    """
     below: dict[str, tuple[str, str]] = {}
     for wanted in ("on-top", "above"):
         for subject, relation, object in stated:
@@ -218,7 +222,7 @@ def _root(name: str, below: dict[str, tuple[str, str]]) -> str:
 
 
 def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
-    """Return the boxes of an object at (0, 0) and of all objects above it, side by side."""
+    """Return the box of an object at (0, 0), and the boxes of all objects that stand above it."""
     boxes: list[Box] = []
     x = 0.0
     for other, (supporter, relation) in below.items():
@@ -231,7 +235,7 @@ def _pile(name: str, below: dict[str, tuple[str, str]]) -> list[Box]:
 
 
 def _shelved(piles: Sequence[list[Box]]) -> list[Box]:
-    """Arrange piles without an order on shelves; the number per shelf equals that of shelves."""
+    """Arrange piles that have no order in rows. There are about as many rows as piles in a row."""
     boxes: list[Box] = []
     length = ceil(sqrt(len(piles)))
     y = 0.0
@@ -249,7 +253,10 @@ def _shelved(piles: Sequence[list[Box]]) -> list[Box]:
 def _widest(
     cells: dict[tuple[int, int], list[Box]], axis: int
 ) -> list[tuple[tuple[int, int], list[Box]]]:
-    """Return the cells from narrow to wide (or low to high), so that the widest comes last."""
+    """Return the cells sorted by width (axis 0) or height (axis 1), in ascending order.
+
+    So in a dictionary by column or row, the widest or highest cell remains.
+    """
     return sorted(cells.items(), key=lambda cell: extent(cell[1])[axis])
 
 
@@ -258,7 +265,7 @@ def _moved(boxes: Iterable[Box], x: float, y: float) -> list[Box]:
 
 
 def _offsets(extents: dict[int, float]) -> dict[int, float]:
-    """Return the start of each column (or row)."""
+    """Return the x where each column starts, or the y where each row starts."""
     offsets: dict[int, float] = {}
     at = 0.0
     for rank in sorted(extents):

@@ -1,12 +1,12 @@
-"""Read ROS messages in two forms: JSON from rosbridge, or Python objects.
+"""Reading of ROS messages in two forms: JSON from rosbridge, or Python objects.
 
-rclpy and bag readers give objects with attributes. rosbridge gives dictionaries in which NaN and
-infinity are null. A field that is missing or has the wrong type is None here, and the caller
-decides what follows.
+rclpy and bag readers return objects with attributes. rosbridge returns dictionaries in which NaN
+and infinity are null. The functions of this module return None for a field that is missing or has
+the wrong type.
 
-Detectors report classes as text, and often as numbers in text ("56"). A label map gives the label
-of each number: a mapping, a list in the order of the numbers, a vision_msgs/LabelInfo message, or
-the name of a well-known list.
+Detectors report a class id as text, which is often a number ("56"). A label map contains the label
+of each class id. It is a mapping, a list in the order of the numbers, a vision_msgs/LabelInfo
+message, or the name of a well-known list.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from typing import Any, Final, TypeAlias
 
 
 class MessageError(ValueError):
-    """No scene can be made of a message, or an argument is wrong."""
+    """A message does not contain a valid scene, or an argument is invalid."""
 
 
 def take(message: Any, *path: str) -> Any:
-    """Return the field at the end of a path of names; None if a part of the path is missing."""
+    """Return the field at the end of a path of names, or None if a part of the path is missing."""
     for name in path:
         if message is None:
             return None
-        # A message has hundreds of fields. The check of the abstract class takes longer than a
-        # field.
+        # A message has hundreds of fields. The check for `dict` is much faster than the check for
+        # `Mapping`.
         if type(message) is dict or isinstance(message, Mapping):
             message = message.get(name)
         else:
@@ -36,12 +36,12 @@ def take(message: Any, *path: str) -> Any:
 
 
 def has(message: Any, name: str) -> bool:
-    """Return whether a message has a field, which may be null."""
+    """Return whether a message has a field. The value of the field may be null."""
     return name in message if isinstance(message, Mapping) else hasattr(message, name)
 
 
 def items(field: Any, name: str) -> Sequence[Any]:
-    """Return the entries of a list of messages; empty if the list is missing.
+    """Return the entries of a list field, or an empty sequence if the field is missing.
 
     Raises:
         MessageError: the field is not a list.
@@ -54,7 +54,7 @@ def items(field: Any, name: str) -> Sequence[Any]:
 
 
 def number(field: Any) -> float | None:
-    """Return a finite number, or None."""
+    """Return the field as a float, or None if it is not a finite number."""
     if type(field) is not float:
         if isinstance(field, bool) or not isinstance(field, Real):
             return None
@@ -66,19 +66,22 @@ def number(field: Any) -> float | None:
 
 
 def integer(field: Any) -> int | None:
-    """Return a whole number, or None."""
+    """Return the field as an int, or None if it is not a whole number."""
     value = number(field)
     return int(value) if value is not None and value.is_integer() else None
 
 
 def numbers(message: Any, names: str) -> tuple[float, ...] | None:
-    """Return the fields named by the letters of ``names``; None unless all are finite."""
+    """Return the fields whose names are the letters of ``names``, or None if one is not finite."""
     values = [number(take(message, name)) for name in names]
     return None if None in values else tuple(value for value in values if value is not None)
 
 
 def text(field: Any) -> str:
-    """Return text without surrounding blanks, a whole number as text, or "" for other values."""
+    """Return the field as text without surrounding blanks. Whole numbers are also accepted.
+
+    The result is "" for other values.
+    """
     if isinstance(field, str):
         return field.strip()
     whole = integer(field)
@@ -91,14 +94,14 @@ def is_plain(value: str, longest: int) -> bool:
 
 
 def frame_of(header: Any) -> str:
-    """Return the frame of a header; empty without a frame."""
+    """Return the frame of a header, or "" without a frame."""
     frame = take(header, "frame_id")
     # tf2 has no leading slashes, but older drivers still send them.
     return frame.strip().lstrip("/") if isinstance(frame, str) else ""
 
 
 def time_of(stamp: Any) -> dict[str, int] | None:
-    """Return a time of ROS 2 or ROS 1 as in a request; None if it is invalid."""
+    """Convert a time of ROS 2 or ROS 1 to the form of a request. Return None if it is invalid."""
     seconds = integer(take(stamp, "sec"))
     seconds = integer(take(stamp, "secs")) if seconds is None else seconds
     rest = integer(take(stamp, "nanosec"))
@@ -127,17 +130,20 @@ COCO: Final = (
     *("refrigerator", "book", "clock", "vase", "scissors", "teddy bear", "hair drier"),
     "toothbrush",
 )
-"""The 80 box classes of COCO in the usual numbering of detectors: from 0, without gaps."""
+"""The 80 box classes of COCO. Their order is the usual numbering of detectors, from 0 to 79."""
 
 _WELL_KNOWN: Final = {"coco": COCO}
 
 
 def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
-    """Return labels by class id (as text); classes mapped to None are left out of scenes.
+    """Return a dictionary from class ids (as text) to labels.
+
+    A class with the label None does not become part of a scene.
 
     Args:
-        label_map: a mapping from class ids (text or numbers); labels in the order of the numbers;
-            a vision_msgs/LabelInfo, as a message or as JSON; "coco"; or None, an empty map.
+        label_map: a mapping from class ids (text or numbers) to labels, a list of labels in the
+            order of the numbers, a vision_msgs/LabelInfo (message or JSON), or "coco". None means
+            an empty map.
 
     Raises:
         MessageError: `label_map` has another form.
@@ -147,7 +153,7 @@ def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
     if isinstance(label_map, str):
         if label_map not in _WELL_KNOWN:
             known = ", ".join(sorted(_WELL_KNOWN))
-            raise MessageError(f"no label map is called {label_map!r}; known: {known}")
+            raise MessageError(f"no label map has the name {label_map!r}; known names: {known}")
         label_map = _WELL_KNOWN[label_map]
     elif (classes := take(label_map, "class_map")) is not None:
         label_map = {
@@ -161,7 +167,8 @@ def read_label_map(label_map: LabelMap | None) -> dict[str, str | None]:
         pairs = list(enumerate(label_map))
     else:
         raise MessageError(
-            "label_map must be a mapping, a list of labels, a vision_msgs/LabelInfo or a name"
+            "label_map must be a mapping, a list of labels, a vision_msgs/LabelInfo or the name of "
+            "a known list"
         )
     labels: dict[str, str | None] = {}
     for class_id, label in pairs:

@@ -1,4 +1,4 @@
-"""A client of ``GET /stream`` that keeps the newest answer; docs/stream.md is the contract."""
+"""A client of ``GET /stream``. docs/stream.md describes the protocol."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ Objects = Sequence[str | dict[str, Any] | Detection]
 
 _PATH: Final = "/stream"
 _MAX_EVENT: Final = 64 * 2**20
-# Codes of broken connections and of services that stop or fail. After other codes, a new connection
-# would be closed again.
+# Close codes of broken connections and of services that stop or fail. After other codes, the
+# service would close a new connection too.
 _TRANSIENT: Final = frozenset({1001, 1006, 1011, 1012, 1013})
 _FIRST_PAUSE: Final = 0.1
 _LONGEST_PAUSE: Final = 5.0
 
 
 class StreamProblemError(ClientError):
-    """The service refused a message; the stream stays open.
+    """The service refused a message. The stream stays open.
 
     Attributes:
-        problem: the problem; branch on its `type`.
-        seq: number of the refused message, if it has one.
+        problem: the problem document. Its `type` identifies the problem type.
+        seq: number of the refused message, or None if the message has none.
     """
 
     def __init__(self, message: ProblemMessage) -> None:
@@ -60,38 +60,39 @@ class StreamClosedError(ClientError):
     """The stream has ended.
 
     Attributes:
-        code: close code (RFC 6455, section 7.4); 1006 if the connection broke.
-        reason: reason of the service in one word, if given: `draining`, `stream-idle`.
+        code: close code (RFC 6455, section 7.4), or 1006 if the connection broke.
+        reason: reason of the service, such as `draining` or `stream-idle`, or "".
     """
 
     def __init__(self, code: int, reason: str) -> None:
-        super().__init__(f"closed with {code} {reason}".rstrip())
+        super().__init__(f"the stream was closed with code {code} {reason}".rstrip())
         self.code = code
         self.reason = reason
 
 
 class StreamClient:
-    """A stream: send changes of the scene, and iterate over the newest answers.
+    """A stream: the program sends changes of the scene and iterates over the newest answers.
 
         async with StreamClient("http://127.0.0.1:8000", room_type="bedroom") as scene:
             await scene.update(objects=["bed", {"id": "lamp_1", "label": "lamp"}])
             async for answer in scene:
                 print(answer.missing.missing[0].label)
 
-    The client keeps the scene. If the connection breaks, the iteration reconnects and sends the
-    whole scene. After a `StreamProblemError`, the iteration can be started again.
+    The client keeps a copy of the scene. If the connection breaks, the iteration reconnects and
+    sends the whole scene. After a `StreamProblemError`, the program may start a new iteration.
 
     Args:
         url: address of the service, with http, https, ws or wss.
         api_key: API key, if the service requires one.
-        timeout: seconds for connecting and for closing.
-        reconnect: seconds without an answer after which the client gives up a broken stream.
-        **fields: fields of the opening message: `model`, `ask`, `room_type`, `frame_id` and so on.
+        timeout: maximum time in seconds to connect, and to close the stream.
+        reconnect: maximum time in seconds from the loss of the connection to the next answer.
+            After this time, the client stops reconnecting.
+        **fields: fields of the opening message, such as `model`, `ask`, `room_type` or `frame_id`.
 
     Attributes:
         seq: number of the newest sent message.
         limits: limits of the service.
-        answer: the newest answer; None before the first.
+        answer: the newest answer, or None before the first answer.
     """
 
     limits: StreamLimits
@@ -148,15 +149,15 @@ class StreamClient:
     async def update(
         self, objects: Objects = (), *, remove: Sequence[str] = (), **fields: Any
     ) -> int:
-        """Send added, changed and removed objects; return the number of the message.
+        """Send added, changed and removed objects. Return the number of the message.
 
         Args:
-            objects: objects with an id; without one, the label is the id.
+            objects: added and changed objects. An object without an id has its label as id.
             remove: ids of removed objects.
-            **fields: fields of the scene: `relations`, `room_type`, `stamp` and so on.
+            **fields: fields of the scene, such as `relations`, `room_type` or `stamp`.
 
         Raises:
-            pydantic.ValidationError: the message is malformed and was not sent.
+            pydantic.ValidationError: the message is invalid. The client has not sent it.
             StreamClosedError: the stream has ended.
         """
         if remove:
@@ -165,7 +166,7 @@ class StreamClient:
         return await self._next(Update(type="update", seq=self.seq + 1, objects=things, **fields))
 
     async def replace(self, objects: Objects, **fields: Any) -> int:
-        """Send a whole scene that replaces the previous one; return the number of the message.
+        """Send a whole scene that replaces the previous scene. Return the number of the message.
 
         Raises:
             pydantic.ValidationError, StreamClosedError: see `update`.
@@ -197,11 +198,11 @@ class StreamClient:
         return message.seq
 
     async def _send(self, message: BaseModel) -> bool:
-        """Send a message; return False if the connection is broken."""
+        """Send a message. Return False if the connection is broken."""
         if self._ended is not None:
             raise self._ended
         if self._connection is None:
-            raise RuntimeError("the stream is not open: use it with `async with`")
+            raise RuntimeError("the stream is not open: open it with `async with`")
         try:
             await self._connection.send(_text(message))
         except ConnectionClosed:
@@ -209,7 +210,7 @@ class StreamClient:
         return True
 
     def _merge(self, seq: int) -> None:
-        """Merge messages up to a number into the kept scene."""
+        """Merge all messages up to number `seq` into the client's copy of the scene."""
         for number in [number for number in self._unanswered if number <= seq]:
             self._scene = self._scene.after(self._unanswered.pop(number))
 
@@ -224,12 +225,12 @@ class StreamClient:
 
         Raises:
             StreamProblemError: the service refused a message.
-            StreamClosedError: the service ended the stream, or cannot be reached any more.
+            StreamClosedError: the service closed the stream, or the client could not reconnect.
             ProblemError: the service refused a new connection.
             StopAsyncIteration: `close` ended the stream.
         """
         if self._connection is None:
-            raise RuntimeError("the stream is not open: use it with `async with`")
+            raise RuntimeError("the stream is not open: open it with `async with`")
         while True:
             try:
                 event = _event(await self._connection.recv())
@@ -245,14 +246,14 @@ class StreamClient:
                 return event
 
     async def _reconnect(self, closed: StreamClosedError) -> None:
-        """Connect again and send the whole scene, with growing pauses between attempts."""
+        """Connect again and send the whole scene. The pauses between attempts grow."""
         self._lost_at = self._lost_at or monotonic()
         while self._ended is None:
             late = monotonic() + self._pause > self._lost_at + self._patience
             if late or closed.code not in _TRANSIENT:
                 self._ended = closed
                 raise closed
-            # Random, so that many robots do not reconnect to one service at the same time.
+            # The pause is random, so that many robots do not reconnect at the same time.
             await asyncio.sleep(self._pause * random.uniform(0.5, 1.0))  # noqa: S311 # nosec B311
             self._pause = min(2 * self._pause, _LONGEST_PAUSE)
             try:
@@ -276,9 +277,11 @@ class StreamClient:
             if isinstance(opened, ProblemMessage):
                 raise StreamProblemError(opened)
             if not isinstance(opened, Opened):
-                raise TypeError(f"the service answered the opening with {opened.type}")
+                raise TypeError(
+                    f"the service must answer the opening message with opened, not {opened.type}"
+                )
             sent = 0
-            while sent != self.seq:  # further messages may arrive while the scene is sent
+            while sent != self.seq:  # the program may send messages during the loop
                 sent = self.seq
                 self._merge(sent)
                 objects = list(self._scene.objects.values())
@@ -291,7 +294,7 @@ class StreamClient:
             raise
         self.limits = opened.limits
         self._connection = connection
-        if self._ended is not None:  # `close` was called meanwhile
+        if self._ended is not None:  # the program called `close` in the meantime
             await connection.close()
 
     async def _connected(self) -> ClientConnection:
@@ -310,7 +313,7 @@ class StreamClient:
             headers = {name.lower(): value for name, value in answer.headers.raw_items()}
             raise problem_of(answer.status_code, headers, bytes(answer.body or b"")) from None
         except (OSError, InvalidHandshake) as error:
-            raise UnreachableError(f"no stream at {self._address}: {error}") from error
+            raise UnreachableError(f"cannot open a stream at {self._address}: {error}") from error
 
 
 def _text(message: BaseModel) -> str:

@@ -1,6 +1,7 @@
-"""Messages of ``GET /stream`` as pydantic models, which the service and its clients share.
+"""Messages of ``GET /stream`` as pydantic models. The service and its clients use the same models.
 
-A client's messages are validated as strictly as a request; docs/stream.md is the contract.
+The messages of clients have the strict validation of requests. docs/stream.md describes the
+protocol.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ from scene_client.schemas import (
 )
 
 MAX_SEQ: Final = 2**53 - 1
-"""A double holds this number exactly, so every JSON reader keeps it."""
+"""Maximum number of a message. JSON readers that use doubles read it exactly."""
 
 Seq = Annotated[
     int,
-    Field(ge=1, le=MAX_SEQ, description="number of the message, greater than in all earlier ones"),
+    Field(ge=1, le=MAX_SEQ, description="number of the message; it must grow with each message"),
 ]
 
 # --------------------------------------------------------------------------------- from clients
 
 
 class Ask(Request):
-    """The questions to answer, each with the options of its route."""
+    """The questions to answer. Each question has the options of its route."""
 
     missing: MissingOptions | None = None
     outliers: OutliersOptions | None = None
@@ -54,20 +55,23 @@ class Ask(Request):
 
 
 class SceneMessage(SceneRequest):
-    """Fields of a scene; an object without an id has its label as id."""
+    """Base class of the messages with fields of a scene.
+
+    An object without an id has its label as id.
+    """
 
     objects: list[SceneObject] = Field(default_factory=list, max_length=256)
-    ask: Annotated[Ask | None, Field(description="the questions; null: missing and outliers")] = (
-        None
-    )
+    ask: Annotated[
+        Ask | None, Field(description="the questions; null means missing and outliers")
+    ] = None
     timeout_ms: Annotated[
         int | None,
-        Field(ge=1, le=600_000, description="an answer that starts later is dropped"),
+        Field(ge=1, le=600_000, description="time limit of each answer in milliseconds"),
     ] = None
 
 
 class Open(SceneMessage):
-    """The first message of a stream; it may contain the scene."""
+    """The first message of a stream. It may contain the scene."""
 
     type: Literal["open"]
 
@@ -80,19 +84,22 @@ class Whole(SceneMessage):
 
 
 class Update(SceneMessage):
-    """Objects that are added, replaced by id, or removed; given fields replace earlier values."""
+    """Added, changed and removed objects. An object replaces an earlier object with the same id.
+
+    The fields of the message replace earlier values.
+    """
 
     type: Literal["update"]
     seq: Seq
     remove: list[Name] = Field(
         default_factory=list,
         max_length=256,
-        description="ids of removed objects; their relations are removed too",
+        description="ids of removed objects; the service removes their relations too",
     )
 
 
 class Ping(Request):
-    """A request for a pong, which keeps an idle stream open."""
+    """A request for a `pong`. It keeps an idle stream open."""
 
     type: Literal["ping"]
 
@@ -105,25 +112,28 @@ COMMANDS: Final[dict[str, type[Command]]] = {
     "ping": Ping,
 }
 
-# A whole scene keeps these fields unless it names them.
+# If a message of type `scene` does not contain these fields, their earlier values stay.
 _KEPT: Final = frozenset({"model", "unknown_labels", "ask", "timeout_ms"})
 _FIELDS: Final = frozenset(SceneMessage.model_fields) - {"objects", "seed"}
 
 
 @dataclass(frozen=True, slots=True)
 class MergedScene:
-    """A scene after several messages; the service and the client each keep one.
+    """The scene that results from several messages. Service and client each keep a copy.
 
     Attributes:
-        objects: objects by id, in the order of their arrival.
-        fields: the other given fields of `SceneMessage`.
+        objects: maps ids to objects, in the order of their arrival.
+        fields: maps the names of all other fields of the messages to their values.
     """
 
     objects: Mapping[str, str | Detection] = field(default_factory=dict)
     fields: Mapping[str, Any] = field(default_factory=dict)
 
     def after(self, message: SceneMessage) -> MergedScene:
-        """Return the scene with a message merged into it; unknown ids in `remove` are allowed."""
+        """Return a copy of the scene with a message merged into it.
+
+        The method ignores unknown ids in `remove`.
+        """
         objects, fields = dict(self.objects), dict(self.fields)
         if isinstance(message, Whole):
             objects = {}
@@ -143,7 +153,7 @@ class MergedScene:
 
 
 def object_id(thing: str | Detection) -> str:
-    """Return the id of an object, or its label without an id."""
+    """Return the id of an object, or its label if it has no id."""
     return thing if isinstance(thing, str) else thing.id or thing.label
 
 
@@ -166,29 +176,32 @@ class Opened(Reply):
     """The stream is open."""
 
     type: Literal["opened"] = "opened"
-    seq: Annotated[int, Field(description="0: no message has been accepted yet")] = 0
+    seq: Annotated[int, Field(description="always 0, the number of the opening message")] = 0
     request_id: str
     limits: StreamLimits
 
 
 class AnswerMessage(Reply):
-    """The answers about the newest scene; each has the form of its route's answer."""
+    """The answers about the newest scene. Each answer has the form of its route's answer."""
 
     type: Literal["answer"] = "answer"
-    seq: Annotated[int, Field(description="newest message covered by the answer; 0: the opening")]
+    seq: Annotated[
+        int,
+        Field(description="number of the newest message that the answer covers; 0 for the opening"),
+    ]
     superseded: Annotated[
-        int, Field(description="number of earlier messages without their own answer")
+        int, Field(description="number of earlier messages that the answer covers too")
     ]
     missing: MissingAnswer | None = None
     outliers: OutliersAnswer | None = None
     relations: RelationsAnswer | None = None
     problems: dict[str, Problem] = Field(
-        default_factory=dict, description="problem of each question without an answer"
+        default_factory=dict, description="maps each question without an answer to its problem"
     )
 
 
 class ProblemMessage(Reply):
-    """A message was refused; the scene is unchanged."""
+    """The service refused a message. The scene is unchanged."""
 
     type: Literal["problem"] = "problem"
     seq: Annotated[

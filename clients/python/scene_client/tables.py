@@ -1,4 +1,4 @@
-"""Tables of answers for people; programs use the JSON output."""
+"""Tables of answers for terminals. Programs should use the JSON output."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from scene_client.schemas import (
 )
 
 MOST_MISPLACED: Final = 10
-"""Maximum number of rows: a dozen positions give a hundred relations."""
+"""Maximum number of rows with false relations. Twelve positions can give a hundred relations."""
 
 
 def relations(answer: RelationsAnswer) -> RenderableType:
-    """Return relations, best first, and observed relations that the model does not expect."""
+    """Return relations, most probable first, and a table of the disagreements."""
     rows = [
         (
             entry.subject,
@@ -58,7 +58,7 @@ def relations(answer: RelationsAnswer) -> RenderableType:
 
 
 def missing(answer: MissingAnswer) -> RenderableType:
-    """Return absent objects, likeliest first, with likely places and reasons."""
+    """Return missing objects, most probable first, with likely places and reasons."""
     rows = [
         (
             entry.label,
@@ -73,7 +73,7 @@ def missing(answer: MissingAnswer) -> RenderableType:
 
 
 def outliers(answer: OutliersAnswer) -> RenderableType:
-    """Return objects, least fitting first, with reasons, and the relations likely to be false."""
+    """Return objects, most probable outlier first, and relations that are probably false."""
     rows = [
         (
             entry.object,
@@ -112,7 +112,8 @@ def notes(answer: BaseModel) -> list[str]:
     if not isinstance(answer, Answer):
         return []
     mapped = [
-        f"{entry.label}: taken for {entry.class_} (similarity {entry.similarity:.2f})"
+        f"{entry.label}: unknown label, replaced by {entry.class_} "
+        f"(similarity {entry.similarity:.2f})"
         for entry in answer.mapped
     ]
     warnings = [
@@ -137,7 +138,7 @@ def generate(answer: GenerateAnswer) -> RenderableType:
 
 
 def models(answer: ModelList) -> RenderableType:
-    """Return versions with their aliases, and entries of the store that cannot be used."""
+    """Return versions with their aliases, and unusable entries of the store."""
     rows = [
         (
             f"{model.name}@{version.version}",
@@ -179,8 +180,7 @@ def _table(*columns: str, rows: Iterable[Sequence[str]], title: str | None = Non
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     for column in columns:
         numbers = column.startswith("probability") or column in {"log-odds", "log score"}
-        # The objects of a sampled scene need wrapping; all other cells are short or have line
-        # breaks.
+        # Only the list of a scene's objects can be long. Other cells are short or have line breaks.
         width = 60 if column == "objects" else None
         table.add_column(column, justify="right" if numbers else "left", max_width=width)
     for row in rows:
@@ -194,7 +194,7 @@ def _share(probability: float) -> str:
 
 def _placement(placement: Placement) -> str:
     told = f"{placement.relation} {placement.object} {_share(placement.probability)}"
-    # A model without positions in training has no offset.
+    # A model has no offsets if its training scenes have no positions.
     offset = placement.offset
     if offset is None:
         return told

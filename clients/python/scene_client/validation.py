@@ -1,4 +1,4 @@
-"""Convert pydantic's errors to messages with JSON pointers, for the service and its clients.
+"""Conversion of pydantic's errors to messages with JSON pointers, for the service and its clients.
 
 Pointers are URI fragments (RFC 6901, section 6).
 """
@@ -17,7 +17,7 @@ from scene_client import schemas
 from scene_client.schemas import OBJECT_TAGS, FieldError
 
 MAX_ERRORS: Final = 100
-"""Maximum number of errors listed for a request."""
+"""Maximum number of errors that the answer to a request lists."""
 
 _FIELDS: Final = sorted(
     {
@@ -27,7 +27,7 @@ _FIELDS: Final = sorted(
         for name in value.model_fields
     }
 )
-# Plain messages in place of pydantic's messages about Python types.
+# These messages replace pydantic's messages, which mention Python types.
 _MESSAGES: Final = {
     "extra_forbidden": "unknown field",
     "missing": "required",
@@ -36,8 +36,8 @@ _MESSAGES: Final = {
     "dict_type": "must be an object",
     "list_type": "must be an array",
 }
-# A pointer repeats member names of the request only if they are short and plain, so that a request
-# cannot choose the text of an error. At any other name, the pointer stops at the parent.
+# A pointer contains a member name of the request only if the name is short and plain. So a request
+# cannot choose the text of an error. At any other name, the pointer ends at the parent.
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MARKS: Final = frozenset({*OBJECT_TAGS, "[key]"})
 
@@ -52,13 +52,13 @@ def field_errors(
     """Return the first `MAX_ERRORS` of pydantic's errors.
 
     Args:
-        errors: errors of the validation.
+        errors: validation errors.
         body: the validated value.
         at: location of ``body`` in the request.
-        skip: number of leading steps in every location that lead to ``body``.
+        skip: number of steps to remove from the start of each error's location.
     """
     found = []
-    # Only for the listed errors: suggestions for 100,000 members take a minute.
+    # The limit also bounds the time: suggestions for 100,000 members take a minute.
     for error in errors[:MAX_ERRORS]:
         location = error["loc"][skip:]
         unknown = str(location[-1]) if error["type"] == "extra_forbidden" else ""
@@ -73,18 +73,18 @@ def field_errors(
 
 
 def _like(unknown: str) -> list[str]:
-    """Return similar field names; the unknown name itself is left out."""
+    """Return field names that are similar to an unknown name."""
     return [name for name in get_close_matches(unknown[:64], _FIELDS) if name != unknown]
 
 
 def pointer(location: tuple[str | int, ...], body: Any = None) -> str:
-    """Return the JSON pointer of a location; ``#`` is the whole body.
+    """Return the JSON pointer of a location. ``#`` is the whole body.
 
     Args:
-        location: field names and list positions from the root, with pydantic's marks for members
-            of unions and for keys.
-        body: the parsed request, if available. A bare label has no members, so a location inside
-            it points at the label.
+        location: field names and list indices from the root. It may contain pydantic's marks for
+            members of unions and for keys.
+        body: the parsed request, if available. It stops the pointer at an object that is only a
+            label, because a label has no members.
     """
     steps: list[str] = []
     value = body

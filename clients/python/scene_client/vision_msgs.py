@@ -1,12 +1,12 @@
-"""Convert detections of ROS (vision_msgs) to the fields of a request.
+"""Conversion of ROS detections (vision_msgs) to the fields of a request.
 
     fields = from_detection3d_array(message, label_map="coco")
     answer = client.missing(**fields, top_k=5)
 
 A message may be JSON (rosbridge, with or without its envelope) or an object (rclpy, bags). It may
-have the layout since Galactic (``results[].hypothesis.class_id``, ``id``) or the earlier one
-(``results[].id``, ``tracking_id``). Values that a detector does not know or did not fill in are
-left out of the request, and `SceneFields.notes` lists them. Values are never guessed.
+have the message layout of ROS Galactic and later (``results[].hypothesis.class_id``, ``id``) or the
+earlier layout (``results[].id``, ``tracking_id``). The request leaves out unknown and unset values,
+and `SceneFields.notes` lists them. The module never guesses a value.
 """
 
 from __future__ import annotations
@@ -35,33 +35,34 @@ from scene_client.schemas import UnknownLabels
 
 MAX_OBJECTS: Final = 256
 MAX_RELATIONS: Final = 4096
-"""Limits of the service for one scene, unless its operator chose others."""
+"""Default limits of the service for one scene."""
 
 _MAX_LABEL, _MAX_ID, _MAX_FRAME = 100, 128, 256
 _MAX_METRES, _MAX_EXTENT, _MAX_YAW = 1e8, 1e4, 1e3
-# A shorter quaternion is an unset message: its direction would come from rounding.
+# A quaternion below this length is unset. Its direction would be a rounding error.
 _MIN_NORM: Final = 1e-6
 
 Reason = Literal[
     "no-hypothesis",  # the detection has no class with a score
-    "low-score",  # the score is not above 0, or is under min_score
+    "low-score",  # the score is 0, negative or below min_score
     "high-score",  # the score is above 1 and counts as 1
-    "no-label",  # the class is a number without a label, or not plain text
+    "no-label",  # the class is a number without a label, or is not plain text
     "unwanted",  # the label map maps the class to None
-    "too-many",  # the request is full; the least confident ones are left out
-    "no-position",  # the position is not finite, unset, or in another frame
-    "no-box",  # the same for a box in an image: no left and right
-    "renamed",  # the id is a duplicate or not plain text
+    "too-many",  # the scene has too many detections or relations; the least confident are left out
+    "no-position",  # the position is unset, not finite, or in another frame
+    "no-box",  # the box in the image is empty, not finite, or in another frame
+    "renamed",  # the id is a duplicate, or is not plain text
     "no-stamp",  # the stamp is not a valid time
 ]
 
 
 class Note(NamedTuple):
-    """A detection that was left out or changed, and the reason.
+    """A note that the conversion left out or changed a value, with the reason.
 
     Attributes:
-        detection: position of the detection in the message; None for the whole message.
-        reason: a stable code.
+        detection: index of the detection in the message. None if the note concerns the whole
+            message.
+        reason: stable code of the reason.
         detail: the reason in words.
     """
 
@@ -74,7 +75,7 @@ class SceneFields(dict[str, Any]):
     """The fields of a request, for `Client.missing(**fields)` or `SceneRequest(**fields)`.
 
     Attributes:
-        notes: omissions and changes, in the order of the message.
+        notes: notes on omitted and changed values, in the order of the detections.
     """
 
     def __init__(self, fields: Mapping[str, Any], notes: tuple[Note, ...] = ()) -> None:
@@ -94,25 +95,27 @@ def from_detection3d_array(
     viewpoint: Viewpoint | None = None,
     unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
-    """Convert objects with poses; the service derives their relations in the axes of ``frame_id``.
+    """Convert objects with poses. The service derives their relations in the axes of ``frame_id``.
 
-    An unset box is replaced by the pose of the best hypothesis. Extents that are not positive are
-    unknown. An all-zero quaternion means no rotation. An object without a finite position has no
-    position in the request.
+    If a box is unset, the pose of the best hypothesis replaces it. Extents that are not positive
+    count as unknown. An all-zero quaternion means no rotation. An object without a finite position
+    has no position in the request.
 
     Args:
         message: a vision_msgs/Detection3DArray.
-        label_map: labels of the class ids, see `read_label_map`; other text is itself a label.
-        min_score: detections with a lower score are left out.
-        boxes: False for detectors whose boxes are in pixels, not in space. Positions then come from
-            the hypotheses, and extents are unknown.
-        viewpoint: position and direction of the robot in the frame of the detections, (x, y, yaw).
-            Needed for left and front in map, odom or world. Default: the origin of the frame,
-            looking along x.
-        unknown_labels: as in a request; detectors often have classes that the model lacks.
+        label_map: labels of the class ids, see `read_label_map`. A class id without an entry is
+            itself the label.
+        min_score: the request leaves out detections with a lower score.
+        boxes: False for detectors whose boxes are in pixels instead of metres. Positions then come
+            from the hypotheses, and extents are unknown.
+        viewpoint: position and viewing direction (x, y, yaw) of the robot in the frame of the
+            detections. In a map, odom or world frame, left and front need it. By default, the
+            robot is at the origin of the frame and looks along x.
+        unknown_labels: field of the request. The default is "ignore", because detectors often have
+            classes that the model lacks.
 
     Raises:
-        MessageError: no scene can be made of the message, or an argument is wrong.
+        MessageError: the message does not contain a valid scene, or an argument is invalid.
     """
     reader = _Reader(message, label_map, min_score)
     objects = [reader.object(seen) | reader.pose(seen, boxes) for seen in reader.sightings]
@@ -129,16 +132,16 @@ def from_detection2d_array(
     min_score: float = 0.0,
     unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
-    """Convert objects without poses; left follows from neighbours in the image.
+    """Convert objects without poses. The relation left comes from neighbours in the image.
 
-    An image shows neither depth nor support: front, on-top and above stay unobserved.
+    An image does not show depth or support, so front, on-top and above stay unobserved.
 
     Args:
         message: a vision_msgs/Detection2DArray.
-        label_map, min_score, unknown_labels: as in `from_detection3d_array`.
+        label_map, min_score, unknown_labels: arguments of `from_detection3d_array`.
 
     Raises:
-        MessageError: no scene can be made of the message, or an argument is wrong.
+        MessageError: the message does not contain a valid scene, or an argument is invalid.
     """
     reader = _Reader(message, label_map, min_score)
     fields = {"objects": [reader.object(seen) for seen in reader.sightings]}
@@ -155,10 +158,10 @@ def from_message(
     viewpoint: Viewpoint | None = None,
     unknown_labels: UnknownLabels = "ignore",
 ) -> SceneFields:
-    """Convert either kind of message; the boxes show which kind it is.
+    """Convert a Detection3DArray or a Detection2DArray. The boxes show the type of the message.
 
     Raises:
-        MessageError: the message is of neither kind, or see `from_detection3d_array`.
+        MessageError: the message has another type, or see `from_detection3d_array`.
     """
     if _is_flat(message):
         return from_detection2d_array(
@@ -175,7 +178,7 @@ def from_message(
 
 
 def is_message(value: Any) -> bool:
-    """Return whether a value is a message with detections rather than, for example, a request."""
+    """Return whether a value is a message with detections. A request, for example, is not."""
     return take(_unwrapped(value), "detections") is not None
 
 
@@ -194,11 +197,11 @@ class _Sighting:
 
 
 class _Reader:
-    """A reader of one message: it keeps the sightings and the notes."""
+    """Reader of one message. It collects the sightings and the notes."""
 
     def __init__(self, message: Any, label_map: LabelMap | None, min_score: float) -> None:
         if not is_message(message):
-            raise MessageError("this is not a message with detections")
+            raise MessageError("the message must have a list of detections")
         message = _unwrapped(message)
         self.notes: list[Note] = []
         self.header = take(message, "header")
@@ -213,8 +216,8 @@ class _Reader:
         ]
         if not sightings and label_map is None and self._only_numbers():
             raise MessageError(
-                "the class ids are numbers: give their labels with label_map (a mapping, a list "
-                "of labels in their order, a vision_msgs/LabelInfo, or 'coco')"
+                "the class ids are numbers: set label_map to their labels (a mapping, a list of "
+                "labels in the order of the numbers, a vision_msgs/LabelInfo, or 'coco')"
             )
         self.sightings = self._surest(sightings)
         self.ids = self._ids()
@@ -232,20 +235,20 @@ class _Reader:
                 best, score = result, rated
                 class_id = text(take(hypothesis, "class_id")) or text(take(hypothesis, "id"))
         if best is None:
-            self.note(place, "no-hypothesis", "no hypothesis has a score")
+            self.note(place, "no-hypothesis", "the detection has no hypothesis with a score")
             return None
         if not score > 0 or score < min_score:
-            self.note(place, "low-score", f"its score is {score:g}")
+            self.note(place, "low-score", f"the score {score:g} is too low")
             return None
         label = self.labels.get(class_id, class_id)
         if label is None:
-            self.note(place, "unwanted", f"class {class_id!r} is not wanted")
+            self.note(place, "unwanted", f"the label map excludes class {class_id!r}")
             return None
         if _is_number(label) or not is_plain(label.strip(), _MAX_LABEL):
             self.note(place, "no-label", f"class {class_id[:_MAX_LABEL]!r} has no label")
             return None
         if score > 1:
-            self.note(place, "high-score", f"its score is {score:g}; it counts as 1")
+            self.note(place, "high-score", f"the score {score:g} is above 1 and counts as 1")
         pose = take(best, "pose")
         return _Sighting(
             place, detection, label.strip(), min(score, 1.0), take(pose, "pose") or pose
@@ -264,11 +267,18 @@ class _Reader:
             return sightings
         ranked = sorted(sightings, key=lambda seen: -seen.confidence)
         for seen in ranked[MAX_OBJECTS:]:
-            self.note(seen.place, "too-many", f"{MAX_OBJECTS} others have scores at least as high")
+            self.note(
+                seen.place,
+                "too-many",
+                f"{MAX_OBJECTS} other detections have equal or higher scores",
+            )
         return sorted(ranked[:MAX_OBJECTS], key=lambda seen: seen.place)
 
     def _ids(self) -> dict[int, str]:
-        """Return ids by place: the detector's own id if it is unique, else the numbered label."""
+        """Map the index of each detection to an id.
+
+        The id is the detector's id if it is unique, else the label with a number.
+        """
         own: dict[str, int] = {}
         ids: dict[int, str] = {}
         for seen in self.sightings:
@@ -276,7 +286,7 @@ class _Reader:
             if not name:
                 continue
             if not is_plain(name, _MAX_ID):
-                self.note(seen.place, "renamed", "its id is not plain text")
+                self.note(seen.place, "renamed", "the id is not plain text")
             elif name in own:
                 self.note(seen.place, "renamed", f"detection {own[name]} has the same id")
             else:
@@ -316,7 +326,7 @@ class _Reader:
     def pose(self, seen: _Sighting, boxes: bool) -> dict[str, Any]:
         """Return the known parts of position, size and orientation."""
         if self._is_elsewhere(seen):
-            self.note(seen.place, "no-position", "its frame differs from that of the message")
+            self.note(seen.place, "no-position", "the detection has another frame than the message")
             return {}
         box = take(seen.detection, "bbox") if boxes else None
         pose, size = take(box, "center"), numbers(take(box, "size"), "xyz")
@@ -324,11 +334,11 @@ class _Reader:
         if not sized and _is_unset(pose):
             pose = seen.pose
             if _is_unset(pose):
-                self.note(seen.place, "no-position", "its box and its pose are unset")
+                self.note(seen.place, "no-position", "the box and the pose are unset")
                 return {}
         position = numbers(take(pose, "position"), "xyz")
         if position is None or any(abs(value) > _MAX_METRES for value in position):
-            self.note(seen.place, "no-position", "its position is not finite")
+            self.note(seen.place, "no-position", "the position is not finite or out of range")
             return {}
         found: dict[str, Any] = {"position": dict(zip("xyz", position, strict=True))}
         if size is not None and sized:
@@ -344,11 +354,13 @@ class _Reader:
     def image_relations(self, ids: list[str]) -> list[dict[str, str]]:
         """Return left and right between neighbours in the image."""
         boxes = [self._image_box(seen) for seen in self.sightings]
-        # If a request cannot hold all relations, those of the most confident objects are kept.
+        # If there are too many relations, the relations of the most confident objects stay.
         order = sorted(range(len(ids)), key=lambda i: -self.sightings[i].confidence)
         found = left_pairs(boxes, order)
         if len(found) > MAX_RELATIONS:
-            self.note(None, "too-many", f"{len(found) - MAX_RELATIONS} relations were left out")
+            self.note(
+                None, "too-many", f"the request leaves out {len(found) - MAX_RELATIONS} relations"
+            )
         return [
             {"subject": ids[i], "relation": "left", "object": ids[j]}
             for i, j in sorted(found[:MAX_RELATIONS])
@@ -357,7 +369,7 @@ class _Reader:
     def _image_box(self, seen: _Sighting) -> Box | None:
         """Return the upright box around a box that may be rotated."""
         if self._is_elsewhere(seen):
-            self.note(seen.place, "no-box", "its frame differs from that of the message")
+            self.note(seen.place, "no-box", "the detection has another frame than the message")
             return None
         box = take(seen.detection, "bbox")
         centre = take(box, "center")
@@ -365,15 +377,15 @@ class _Reader:
         theta = number(take(centre, "theta"))
         width, height = number(take(box, "size_x")), number(take(box, "size_y"))
         if middle is None or not (width is not None and height is not None):
-            self.note(seen.place, "no-box", "its box is not finite")
+            self.note(seen.place, "no-box", "the box is not finite")
             return None
         if not (width > 0 and height > 0):
-            self.note(seen.place, "no-box", "its box has no extent")
+            self.note(seen.place, "no-box", "the box must have a positive width and height")
             return None
         return upright_box((middle[0], middle[1]), (width, height), theta or 0.0)
 
     def finish(self, fields: dict[str, Any], unknown_labels: str) -> SceneFields:
-        """Add frame and time of the header."""
+        """Add the frame and the time of the message, and return all fields with the notes."""
         if unknown_labels not in get_args(UnknownLabels):
             raise MessageError("unknown_labels must be 'error', 'ignore' or 'nearest'")
         fields["unknown_labels"] = unknown_labels
@@ -383,7 +395,7 @@ class _Reader:
         if (time := time_of(stamp)) is not None:
             fields["stamp"] = time
         elif stamp is not None:
-            self.note(None, "no-stamp", "its stamp is not a valid time")
+            self.note(None, "no-stamp", "the stamp of the message is not a valid time")
         order = sorted(
             self.notes, key=lambda note: -1 if note.detection is None else note.detection
         )
@@ -391,14 +403,14 @@ class _Reader:
 
 
 def _unwrapped(message: Any) -> Any:
-    """Return the message in rosbridge's envelope, or the message itself."""
+    """Return the message without the envelope of rosbridge."""
     if isinstance(message, Mapping) and "detections" not in message:
         return message.get("msg", message)
     return message
 
 
 def _is_flat(message: Any) -> bool:
-    """Return whether the boxes are boxes in an image."""
+    """Return whether the message is a Detection2DArray, with boxes in an image."""
     detections = take(_unwrapped(message), "detections")
     return any(
         has(take(detection, "bbox"), "size_x") for detection in items(detections, "detections")
@@ -423,5 +435,8 @@ def _viewpoint(viewpoint: Viewpoint) -> dict[str, float]:
     if x is None or y is None or yaw is None:
         raise MessageError("viewpoint must be three finite numbers: x, y, yaw")
     if max(abs(x), abs(y)) > _MAX_METRES or abs(yaw) > _MAX_YAW:
-        raise MessageError("viewpoint is out of range")
+        raise MessageError(
+            f"viewpoint is out of range: x and y must be within ±{_MAX_METRES:g} m, and yaw within "
+            f"±{_MAX_YAW:g} radians"
+        )
     return {"x": x, "y": y, "yaw": yaw}

@@ -1,6 +1,6 @@
-"""The HTTP contract: plain pydantic, shared by the service and its clients.
+"""The HTTP contract as pydantic models. The service and its clients use the same models.
 
-A question has a module of its own. `requests` and `answers` hold the parts that questions share.
+Each question has its own module. `requests` and `answers` contain the parts that questions share.
 """
 
 from __future__ import annotations

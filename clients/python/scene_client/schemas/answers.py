@@ -11,7 +11,7 @@ from scene_client.schemas.requests import Finite, Probability, RelationName, Sta
 
 
 class Reply(BaseModel):
-    """Part of an answer."""
+    """Base class of all parts of an answer."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -31,17 +31,22 @@ class FieldError(Reply):
 
 
 class Failure(Reply):
-    """An entry of the model store that cannot be used, and the reason."""
+    """An unusable entry of the model store, with the reason."""
 
-    subject: Annotated[str, Field(description="`name@version`, an alias, or `store`")]
-    reason: Annotated[str, Field(description="a stable code of the reason")]
+    subject: Annotated[
+        str, Field(description="the unusable entry: `name@version`, an alias, or `store`")
+    ]
+    reason: Annotated[str, Field(description="stable code of the reason")]
     detail: str
 
 
 class Problem(Reply):
     """Problem details (RFC 9457), media type `application/problem+json`."""
 
-    type: Annotated[str, Field(description="stable path of the problem's page; branch on it")]
+    type: Annotated[
+        str,
+        Field(description="path of the problem's page; it never changes, so programs can test it"),
+    ]
     title: str
     status: int
     detail: str
@@ -50,7 +55,7 @@ class Problem(Reply):
     ]
     request_id: str
     errors: Annotated[
-        list[FieldError] | None, Field(description="errors with their places, at most 100")
+        list[FieldError] | None, Field(description="errors in the request, at most 100")
     ] = None
     failures: Annotated[
         list[Failure] | None,
@@ -67,15 +72,15 @@ class ModelReference(Reply):
     name: str
     version: str
     variant: Annotated[str, Field(description="rbm, gbm or triway")]
-    digest: Annotated[str, Field(description="sha256 over the artifact")]
+    digest: Annotated[str, Field(description="SHA-256 of the model's manifest")]
 
 
 @dataclass(slots=True)
 class ObservedRelation:
-    """A relation between two objects (by id), derived from their positions."""
+    """A relation between two objects, derived from their positions. Objects are named by id."""
 
-    # A dataclass: a scene of a dozen objects has some fifty of these, and a pydantic model takes
-    # ten times as long.
+    # This is a dataclass, because the creation of a pydantic model takes ten times as long. A scene
+    # of twelve objects has about fifty derived relations.
     subject: str
     relation: RelationName
     object: str
@@ -86,41 +91,39 @@ class Mapped(Reply):
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, serialize_by_alias=True)
 
-    label: Annotated[
-        str, Field(description="the label in the request: of an object, a candidate or the room")
-    ]
+    label: Annotated[str, Field(description="unknown label of an object, a candidate or the room")]
     class_: Annotated[str, Field(alias="class", description="canonical label of the class")]
     similarity: Annotated[
         float,
-        Field(ge=0, le=1, description="similarity of the names, by spelling and common words"),
+        Field(ge=0, le=1, description="similarity of label and class in spelling or common words"),
     ]
 
 
 class SceneWarning(Reply):
-    """A probable mistake in the scene. The scene is answered nevertheless."""
+    """A probable mistake in the scene. The service answers the question in spite of it."""
 
     code: Annotated[
         Literal["implausible-position", "implausible-size", "flat-scene", "unknown-sizes"],
         Field(
-            description="implausible-position: beyond 100 m, perhaps in millimetres. "
-            "implausible-size: a side below 1 mm or above 20 m. flat-scene: equal depth of all "
-            "objects in an optical frame. unknown-sizes: vertical relations are unobserved "
+            description="implausible-position: the object is more than 100 m away. "
+            "implausible-size: a side is below 1 mm or above 20 m. flat-scene: all objects have "
+            "the same depth in an optical frame. unknown-sizes: vertical relations are unobserved, "
             "because sizes are unknown"
         ),
     ]
     message: str
-    objects: Annotated[list[str], Field(description="ids of the objects of the warning")]
+    objects: Annotated[list[str], Field(description="ids of the objects that the warning concerns")]
 
 
 class Answer(Reply):
-    """Fields that every answer has."""
+    """Base class of the answers, with the fields that every answer has."""
 
     model: ModelReference
     request_id: Annotated[
         str, Field(description="value of the X-Request-Id header, or a random id")
     ]
-    frame_id: Annotated[str | None, Field(description="as in the request")] = None
-    stamp: Annotated[Stamp | None, Field(description="as in the request")] = None
+    frame_id: Annotated[str | None, Field(description="copy of the request's field")] = None
+    stamp: Annotated[Stamp | None, Field(description="copy of the request's field")] = None
     ignored: Annotated[
         list[str],
         Field(
@@ -145,7 +148,7 @@ class Answer(Reply):
 
 
 class ScoredRelation(Reply):
-    """A relation between two objects (by id) and its probability."""
+    """A relation between two objects and its probability. Objects are named by id."""
 
     subject: str
     relation: RelationName
@@ -153,14 +156,11 @@ class ScoredRelation(Reply):
     probability: Probability
 
 
-# Dataclasses: an answer has thirty of these, and a pydantic model takes ten times as long.
-
-
 @dataclass(slots=True)
 class Because:
-    """The change of an object's log-odds by the presence of another object (by id)."""
+    """How much the presence of `object` (an id) changes the log-odds of another object."""
 
-    # A dataclass too: an answer has some thirty of these.
+    # This is a dataclass, because an answer has about thirty of them.
     object: str
     log_odds_change: Finite
 
@@ -169,7 +169,7 @@ AnswerT = TypeVar("AnswerT", bound=Answer)
 
 
 class BatchEntry(Reply, Generic[AnswerT]):
-    """The outcome of one scene: a `result`, or the `problem` of the scene."""
+    """The outcome of one scene: either a `result` or a `problem`."""
 
     status: int
     result: AnswerT | None = None

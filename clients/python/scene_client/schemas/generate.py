@@ -24,12 +24,12 @@ class GenerateRequest(SceneRequest):
 
     objects: Annotated[
         list[SceneObject],
-        Field(max_length=256, description="objects that every scene contains; may be empty"),
+        Field(max_length=256, description="objects that every scene contains; [] is allowed"),
     ] = []
     count: Annotated[int, Field(ge=1, le=64, description="number of scenes")] = 1
     steps: Annotated[
         int | None,
-        Field(ge=1, le=2000, description="number of Gibbs sweeps; default: the model's own"),
+        Field(ge=1, le=2000, description="number of Gibbs sweeps; default: the model's value"),
     ] = None
     temperature: Annotated[
         float,
@@ -37,29 +37,32 @@ class GenerateRequest(SceneRequest):
             ge=0.05,
             le=20,
             allow_inf_nan=False,
-            description="sampling temperature; above 1: more varied scenes",
+            description="sampling temperature; values above 1 give more varied scenes",
         ),
     ] = 1.0
     context: Annotated[
         dict[Name, Annotated[list[UnitNumber], Field(max_length=4096)]] | None,
-        Field(max_length=8, description="numbers of the active units, by the name of the layer"),
+        Field(
+            max_length=8,
+            description="hidden units that are on: maps the name of each layer to unit numbers",
+        ),
     ] = None
 
 
 class GeneratedScene(Reply):
-    """A sampled scene: labels, relations between labels, and the active context units."""
+    """A sampled scene: labels, relations between labels, and the hidden units that are on."""
 
     objects: list[str]
     relations: list[Relation]
     log_score: Finite
     context: Annotated[
         dict[str, list[int]],
-        Field(description="numbers of the active units, by the name of the layer"),
+        Field(description="hidden units that are on: maps the name of each layer to unit numbers"),
     ]
 
 
 class GenerateAnswer(Answer):
-    """Scenes that contain the given objects; an equal `seed` gives equal scenes."""
+    """Scenes that contain the given objects. The same request with this `seed` gives them again."""
 
     seed: int
     scenes: list[GeneratedScene]

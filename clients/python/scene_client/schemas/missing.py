@@ -36,20 +36,24 @@ class MissingOptions(Request):
     coverage: Annotated[
         Probability | None,
         Field(
-            description="probability that a present object is listed. 1: the whole scene is seen, "
-            "so unlisted classes count as absent. 0: unlisted classes give no evidence. Default: "
-            "the model's own value",
+            description="probability that the request lists an object of the scene. With 1, "
+            "unlisted classes count as absent. With 0, unlisted classes do not count as evidence. "
+            "Default: the model's value",
         ),
     ] = None
     top_k: Annotated[
-        int, Field(ge=1, description="maximum number of objects, up to the vocabulary's size")
+        int, Field(ge=1, description="maximum number of classes, up to the size of the vocabulary")
     ] = 10
     candidates: Annotated[
         list[Label] | None,
-        Field(min_length=1, max_length=4096, description="only classes with these labels"),
+        Field(
+            min_length=1,
+            max_length=4096,
+            description="limit the answer to classes with these labels",
+        ),
     ] = None
     at: Annotated[
-        Anchor | None, Field(description="only objects that are missing at this place")
+        Anchor | None, Field(description="limit the answer to objects missing at this place")
     ] = None
 
 
@@ -61,7 +65,7 @@ class MissingRequest(MissingOptions, SceneRequest):
 
 @dataclass(slots=True)
 class Vector:
-    """Metres along the axes of ``frame_id``."""
+    """A vector in metres, in the axes of ``frame_id``."""
 
     x: float
     y: float
@@ -72,11 +76,12 @@ class Vector:
 class Offset:
     """Offset from the centre of a placement's object to the centre of the missing object.
 
-    Add it to the position of the placement's object. The axes are those of `frame_id`. Without a
-    frame they point away from the viewer, to the left and up. `std`: standard deviations. Four of
-    five objects are within 1.8 of them in the plane, or 2.15 in space. `scenes`: number of training
-    scenes with this relation of the two classes. 0: the offset is the usual one of the relation and
-    of either class.
+    `mean` plus the position of the placement's object is the expected position. The axes are the
+    axes of `frame_id`. Without a frame, x points away from the viewer, y to the left and z up.
+    `std` is the standard deviation on each axis. 80 % of the objects are within 1.8 standard
+    deviations in the plane, or 2.15 in space. `scenes` is the number of training scenes with this
+    relation of the two classes. With 0, the offset is estimated from the relation and from each
+    class separately.
     """
 
     mean: Vector
@@ -85,7 +90,7 @@ class Offset:
 
 
 class Placement(Reply):
-    """A likely place of a missing object: in `relation` to the object with this id."""
+    """A likely place of a missing object: it has `relation` to the object with the id `object`."""
 
     relation: RelationName
     object: str
@@ -93,18 +98,18 @@ class Placement(Reply):
     offset: Annotated[
         Offset | None,
         Field(
-            description="offset from the object in metres; absent if the training scenes have no "
-            "poses. Also absent for left, right, front and behind in a map, odom or world frame "
-            "without a viewpoint"
+            description="offset from the object in metres. It is absent if the training scenes "
+            "have no poses. It is also absent for left, right, front and behind in a map, odom or "
+            "world frame without a viewpoint"
         ),
     ] = None
 
 
 class MissingObject(Reply):
-    """A class that is not listed.
+    """A class that the request does not list.
 
-    `probability`: an unlisted object of the class is present, given `coverage`. `log_odds`:
-    log-odds of its presence, before calibration.
+    `probability` is the probability that an object of the class is in the scene, given `coverage`.
+    `log_odds` are the log-odds of its presence, before calibration.
     """
 
     label: str
@@ -115,7 +120,7 @@ class MissingObject(Reply):
         list[Because],
         Field(
             description="objects that change the log-odds most, strongest first, at most 3. Only "
-            "the first 32 entries have them"
+            "the first 32 entries of the answer have this list"
         ),
     ]
 
@@ -125,13 +130,13 @@ class MissingAnswer(Answer):
 
     coverage: Annotated[
         Probability | None,
-        Field(description="applied probability that a present object is listed"),
+        Field(description="the applied value of the request's field `coverage`"),
     ] = None
     missing: list[MissingObject]
 
 
 class MissingFields(SceneFields, total=False):
-    """The fields of `MissingRequest`; ``at`` may be ``("on-top", "desk")``."""
+    """The fields of `MissingRequest`. ``at`` may be a tuple, such as ``("on-top", "desk")``."""
 
     coverage: float
     top_k: int

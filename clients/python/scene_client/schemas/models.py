@@ -14,7 +14,7 @@ from scene_client.schemas.requests import Finite, RelationName, Size
 
 
 class Metric(Reply):
-    """A metric measured on held-out scenes, with its 95 % interval over n units."""
+    """A metric on held-out scenes, with its 95 % confidence interval. n is the sample size."""
 
     task: str
     source: str
@@ -26,7 +26,7 @@ class Metric(Reply):
 
 
 class TrainingSource(Reply):
-    """Scenes on which a model was trained, and their terms of use."""
+    """A source of training scenes and its terms of use."""
 
     source: str
     scenes: int
@@ -36,7 +36,7 @@ class TrainingSource(Reply):
 
 
 class VersionSummary(Reply):
-    """One version of a model; it is ready, or refused for a reason."""
+    """One version of a model. A refused version has a reason."""
 
     version: str
     status: Literal["ready", "refused"]
@@ -62,43 +62,43 @@ class ModelList(Reply):
     models: list[ModelSummary]
     aliases: Annotated[
         dict[str, str],
-        Field(description="target of each alias: `name@version`, or `name` (newest)"),
+        Field(description="target of each alias: `name@version`, or `name` for the newest version"),
     ]
     failures: Annotated[
-        list[Failure], Field(description="entries of the store that cannot be used, with reasons")
+        list[Failure], Field(description="unusable entries of the store, with reasons")
     ] = []
     generation: Annotated[
         str,
-        Field(description="equal in all replicas with the same versions and aliases"),
+        Field(description="digest of all versions and aliases; equal in replicas of equal state"),
     ] = ""
 
 
 class VersionDetails(VersionSummary):
-    """The details of one version; a refused version has only its summary."""
+    """The details of one version. A refused version has only the fields of `VersionSummary`."""
 
     name: str
     created: datetime | None = None
     parameters: Annotated[int | None, Field(description="number of weights")] = None
     metrics: list[Metric] = []
     data: Annotated[list[TrainingSource], Field(description="sources of the training scenes")] = []
-    terms: Annotated[str | None, Field(description="licence of the weights")] = None
+    terms: Annotated[str | None, Field(description="terms of use of the weights")] = None
     card: Annotated[str | None, Field(description="the model card, in Markdown")] = None
 
 
 class VocabularyEntry(Reply):
-    """One class of objects. Structure classes (walls, floors, vague names) are never proposed."""
+    """One object class. With `structure` (wall, floor, vague name), a model never proposes it."""
 
     label: str
     aliases: list[str]
     structure: bool
     size: Annotated[
         Size | None,
-        Field(description="typical extents in metres, used if a detection has no size"),
+        Field(description="typical extents in metres, for detections without a size"),
     ] = None
 
 
 class VocabularyAnswer(Reply):
-    """The vocabulary of a model. Case, separators and plurals never matter."""
+    """The vocabulary of a model. Labels match in any case, with any separators or as plurals."""
 
     model: ModelReference
     objects: list[VocabularyEntry]
@@ -107,14 +107,14 @@ class VocabularyAnswer(Reply):
 
 
 class WeightedLabel(Reply):
-    """An object class or room type, and its weight to a hidden unit."""
+    """An object class or room type, and the weight between it and a hidden unit."""
 
     label: str
     weight: Finite
 
 
 class WeightedRelation(Reply):
-    """A relation between two classes and its weight to a hidden unit."""
+    """A relation between two classes, and the weight between it and a hidden unit."""
 
     subject: str
     relation: RelationName
@@ -123,23 +123,25 @@ class WeightedRelation(Reply):
 
 
 class ContextUnit(Reply):
-    """A hidden unit with its objects, relations and room types, strongest first."""
+    """A hidden unit with the objects, relations and room types of largest weight."""
 
     unit: int
-    name: Annotated[str, Field(description="readable name: its strongest objects and relation")]
+    name: Annotated[
+        str, Field(description="name made of the objects and the relation with the largest weights")
+    ]
     objects: list[WeightedLabel]
     relations: Annotated[
         list[WeightedRelation],
         Field(
             description="relations seen in training; each weight is the difference from the mean "
-            "over the layer"
+            "weight of the layer"
         ),
     ]
     room_types: list[WeightedLabel]
 
 
 class ContextsAnswer(Reply):
-    """The hidden units of a model, layer by layer."""
+    """The hidden units of each layer of a model."""
 
     model: ModelReference
     layers: dict[str, list[ContextUnit]]
@@ -150,12 +152,11 @@ class RefreshAnswer(Reply):
 
     request_id: str
     default: Annotated[ModelReference, Field(description="the model at which `default` points")]
-    added: Annotated[list[str], Field(description="versions that are new, as `name@version`")]
-    removed: Annotated[
-        list[str], Field(description="versions that no longer answer, as `name@version`")
-    ]
+    added: Annotated[list[str], Field(description="new versions, as `name@version`")]
+    removed: Annotated[list[str], Field(description="versions no longer served, as `name@version`")]
     failures: Annotated[
-        list[Failure], Field(description="entries of the store that failed before and still fail")
+        list[Failure],
+        Field(description="unusable entries of the store; they were unusable before, too"),
     ] = []
 
 
@@ -205,7 +206,7 @@ class ModelReady(Reply):
 
 
 class TensorMetadata(Reply):
-    """Open Inference Protocol: metadata of a tensor; the questions of this service use none."""
+    """Open Inference Protocol: metadata of a tensor. This service has no tensor inputs."""
 
     name: str
     datatype: str
@@ -213,7 +214,7 @@ class TensorMetadata(Reply):
 
 
 class ModelMetadata(Reply):
-    """Open Inference Protocol: metadata of a model. Its questions are `/relations` and similar."""
+    """Open Inference Protocol: metadata of a model. Ask it by the routes of the questions."""
 
     name: str
     versions: list[str]

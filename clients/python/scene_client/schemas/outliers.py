@@ -1,4 +1,4 @@
-"""The contract of `/outliers`: what does not belong here, or stands in the wrong place?"""
+"""The contract of `/outliers`: which objects do not belong here, or are in the wrong place?"""
 
 from __future__ import annotations
 
@@ -25,21 +25,22 @@ class OutliersOptions(Request):
     sensitivity: Annotated[
         Sensitivity,
         Field(
-            description="alarm rate: about 2, 10 or 20 % of untouched scenes of the hardest large "
-            "source raise an alarm. The same rates hold for lists of few classes"
+            description="alarm rate. With low, medium and high, about 2, 10 and 20 % of the "
+            "unchanged scenes of the hardest large source raise an alarm. The same rates hold for "
+            "short lists"
         ),
     ] = "medium"
     threshold: Annotated[
         Probability | None,
         Field(
-            description="an object is an outlier from this probability on; default: the model's "
-            "threshold for `sensitivity`",
+            description="minimum probability of an outlier; default: the model's threshold for "
+            "`sensitivity`",
         ),
     ] = None
 
 
 class OutliersRequest(OutliersOptions, SceneRequest):
-    """What does not belong here, or stands in the wrong place?"""
+    """Which objects do not belong here, or are in the wrong place?"""
 
     objects: SomeObjects
 
@@ -47,8 +48,8 @@ class OutliersRequest(OutliersOptions, SceneRequest):
 class Outlier(Reply):
     """How well one object fits the scene.
 
-    `probability`: the object does not belong, if half of all scenes contain an intruder.
-    `log_odds`: log-odds that its class is present, given the rest of the scene.
+    `probability` is the probability that the object does not belong, if half of all scenes contain
+    an intruder. `log_odds` are the log-odds that its class is present, given the rest of the scene.
     """
 
     object: str
@@ -59,8 +60,8 @@ class Outlier(Reply):
     because: Annotated[
         list[Because],
         Field(
-            description="objects that support the verdict, strongest first, at most 3. For an "
-            "outlier, they make the object unlikely; for any other object, they make it likely"
+            description="objects that explain `is_outlier`, strongest first, at most 3. They make "
+            "an outlier unlikely, and any other object likely"
         ),
     ]
     usually_with: Annotated[
@@ -70,7 +71,7 @@ class Outlier(Reply):
 
 
 class MisplacedRelation(ScoredRelation):
-    """A relation as the request spells it, and the probability that it is false."""
+    """A relation, with the name from the request, and the probability that it is false."""
 
     is_misplaced: Annotated[
         bool, Field(description="true if `probability` reaches the threshold of `sensitivity`")
@@ -78,14 +79,14 @@ class MisplacedRelation(ScoredRelation):
 
 
 class OutliersAnswer(Answer):
-    """Objects, least fitting first, and stated or derived relations, least likely first.
+    """Objects, most probable outlier first, and observed relations, most probably false first.
 
-    In `misplaced`, `probability` means that the relation is false.
+    In `misplaced`, `probability` is the probability that the relation is false.
     """
 
     threshold: Annotated[
         Probability | None,
-        Field(description="applied probability from which an object is an outlier"),
+        Field(description="applied minimum probability of an outlier"),
     ] = None
     outliers: list[Outlier]
     misplaced: list[MisplacedRelation]

@@ -1,4 +1,4 @@
-"""The contract of `/relations`: how do these objects stand to each other?"""
+"""The contract of `/relations`: which spatial relations hold between these objects?"""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RelationsOptions(Request):
             min_length=1,
             max_length=4096,
             fail_fast=True,
-            description="only relations of these ordered pairs",
+            description="limit the answer to these pairs of subject and object",
         ),
     ] = None
     include_opposites: Annotated[
@@ -50,22 +50,22 @@ class RelationsOptions(Request):
 
 
 class RelationsRequest(RelationsOptions, SceneRequest):
-    """How do these objects stand to each other?"""
+    """Which spatial relations hold between these objects?"""
 
     objects: SomeObjects
 
 
 @dataclass(slots=True)
 class Disagreement:
-    """Two objects (by id) whose observed relation differs from the expected one.
+    """Two objects whose observed relation differs from the expected relation.
 
-    `observed`: stated or derived relations of `subject` to `object`. `expected`: the likeliest
-    relation given the rest of the scene, without any observed relation of the two objects.
-    `probability`: probability of `expected`. `observed_probability`: probability of the likeliest
-    observed relation.
+    `subject` and `object` are ids. `observed` lists the stated or derived relations between them.
+    `expected` is the most probable relation given the rest of the scene, without the observed
+    relations of the two objects. `probability` is the probability of `expected`.
+    `observed_probability` is the probability of the most probable observed relation.
     """
 
-    # A dataclass too, because half of the observed relations may appear here.
+    # This is a dataclass, because an answer may have one for half of the observed relations.
     subject: str
     object: str
     observed: list[RelationName]
@@ -78,23 +78,25 @@ class ExpectedRelation(ScoredRelation):
     """A relation and the probability that it holds, given that both objects are in the scene."""
 
     observed: Annotated[
-        bool, Field(description="the request states the relation, or positions show it")
+        bool,
+        Field(description="true if the request states the relation, or positions imply it"),
     ] = False
 
 
 class RelationsAnswer(Answer):
-    """Relations, best first.
+    """Relations, most probable first.
 
-    `probability`: the relation holds between the two objects, given that both are in the scene.
+    `probability` is the probability that the relation holds, given that both objects are in the
+    scene.
     """
 
     relations: list[ExpectedRelation]
     disagreements: Annotated[
         list[Disagreement],
         Field(
-            description="pairs whose stated or derived relation differs from the expected one. The "
-            "expected relation has a probability of at least one half given the rest of the scene. "
-            "Largest ratio of the probabilities first, at most `top_k`"
+            description="pairs whose observed relation differs from the expected relation, at most "
+            "`top_k`. Given the rest of the scene, the expected relation has a probability of at "
+            "least one half. The pair with the largest ratio of the two probabilities is first"
         ),
     ]
 

@@ -1,8 +1,8 @@
 """Requests of the HTTP contract.
 
-Requests are strict: no coercion ("1" is not 1, true is not 1), no unknown fields, no NaN and no
-infinity. Every text and list has a maximum length. Checks that need a model's vocabulary or the
-whole scene happen where the scene is read: unknown labels, ambiguous names and contradictions.
+Validation is strict: it refuses other types ("1" is not 1, true is not 1), unknown fields, NaN and
+infinity. Every text and list has a maximum length. Unknown labels, ambiguous names and
+contradictions are not checked here, because these checks need the vocabulary of the model.
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ from pydantic_core import PydanticCustomError
 MAX_BATCH = 256
 MAX_SEED = 2**63 - 1
 MAX_RELATIONS = 65536
-"""Upper bound of the service's setting; listing a million invalid ones would take seconds."""
+"""Upper limit of the setting ``SCENE_MAX_RELATIONS``.
+
+The validation of a million invalid relations would take seconds.
+"""
 
 UnknownLabels = Literal["error", "ignore", "nearest"]
 RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "above", "below"]
@@ -34,7 +37,7 @@ RelationName = Literal["left", "right", "front", "behind", "on-top", "under", "a
 
 def _plain_text(value: str) -> str:
     if not value.strip() or not value.isprintable():
-        raise PydanticCustomError("plain_text", "must be printable text and not blank")
+        raise PydanticCustomError("plain_text", "must be printable text, and must not be blank")
     return value
 
 
@@ -49,11 +52,11 @@ ModelSpec = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_
 
 
 Body: TypeAlias = Mapping[str, Any]
-"""Any part of a request, as in the HTTP contract."""
+"""A JSON object of a request, as a dictionary."""
 
 
 class Request(BaseModel):
-    """Part of a request; unknown fields and type coercion are not allowed."""
+    """Base class of all parts of a request. Validation refuses unknown fields and other types."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -87,14 +90,17 @@ class Quaternion(Request):
 
     @model_validator(mode="after")
     def _unit(self) -> Self:
-        # tf2 allows the same deviation; an all-zero quaternion (an unset message) is refused.
+        # tf2 allows the same deviation. An all-zero quaternion comes from an unset message.
         if abs(math.hypot(self.x, self.y, self.z, self.w) - 1) > 0.01:
             raise PydanticCustomError("unit_quaternion", "must be a unit quaternion (length 1)")
         return self
 
 
 class Viewpoint(Request):
-    """Position of the robot in ``frame_id``, and its direction of view in radians (x towards y)."""
+    """Position of the robot in ``frame_id`` and its viewing direction `yaw` in radians.
+
+    `yaw` is the angle from the x axis towards the y axis.
+    """
 
     x: Metres
     y: Metres
@@ -109,11 +115,14 @@ class Stamp(Request):
 
 
 class Detection(Request):
-    """One object, as a detector reports it."""
+    """One detected object."""
 
     id: Annotated[
         Name | None,
-        Field(description="id of the object in this scene; default: the label, numbered if needed"),
+        Field(
+            description="id of the object in this scene; default: its label, with a number if "
+            "the label repeats"
+        ),
     ] = None
     label: Annotated[Label, Field(description="any spelling that the model's vocabulary accepts")]
     confidence: Annotated[
@@ -122,7 +131,7 @@ class Detection(Request):
             gt=0,
             le=1,
             allow_inf_nan=False,
-            description="confidence that the object is present (soft evidence)",
+            description="probability that the object exists",
         ),
     ] = 1.0
     position: Annotated[Position | None, Field(description="centre of the object's box")] = None
@@ -140,8 +149,8 @@ def _kind_of_object(value: object) -> str | None:
     return OBJECT_TAGS[1] if isinstance(value, dict | Detection) else None
 
 
-# Names of the union's members in pydantic's error locations. Their space distinguishes them from
-# field names when a location becomes a JSON pointer.
+# pydantic puts these tags of the union's members into error locations. They contain a space, so
+# `validation.pointer` can tell them from field names.
 OBJECT_TAGS = ("a label", "a detection")
 
 SceneObject = Annotated[
@@ -158,7 +167,7 @@ SomeObjects = Annotated[list[SceneObject], Field(min_length=1, max_length=256)]
 
 
 class Relation(Request):
-    """``subject`` has the ``relation`` to ``object``; both are an id or an unambiguous label."""
+    """``subject`` has the ``relation`` to ``object``. Both are an id or an unambiguous label."""
 
     subject: Name
     relation: RelationName
@@ -179,25 +188,33 @@ class SceneRequest(Request):
             # With this many relations, a list of all errors would need a hundred times the memory
             # of the request.
             fail_fast=True,
-            description="relations that hold. Relations that are not listed are unobserved, "
-            "unless `relations_complete` is true. Without this field, relations are derived from "
-            "positions. With an empty list, no relation is stated and none is derived",
+            description="relations that hold. Unlisted relations are unobserved, unless "
+            "`relations_complete` is true. Without this field, the service derives relations from "
+            "positions. With an empty list, the service does not derive relations",
         ),
     ] = None
     relations_complete: Annotated[
-        bool, Field(description="if true, relations that are not listed do not hold")
+        bool, Field(description="whether all unlisted relations do not hold")
     ] = False
     room_type: Annotated[Label | None, Field(description="one of the model's room types")] = None
     frame_id: Annotated[
         str | None,
-        Field(max_length=256, description="as in std_msgs/Header; the answer repeats it"),
+        Field(
+            max_length=256,
+            description="name of the frame of all positions, as in std_msgs/Header; the answer "
+            "contains it too",
+        ),
     ] = None
     stamp: Annotated[
-        Stamp | None, Field(description="as in std_msgs/Header; the answer repeats it")
+        Stamp | None,
+        Field(description="time of the scene, as in std_msgs/Header; the answer contains it too"),
     ] = None
     viewpoint: Annotated[
         Viewpoint | None,
-        Field(description="default: the origin of the frame, view along x"),
+        Field(
+            description="pose of the viewer; by default, the viewer is at the origin of the frame "
+            "and looks along x"
+        ),
     ] = None
     model: Annotated[ModelSpec, Field(description="an alias, `name` or `name@version`")] = "default"
     seed: Annotated[
@@ -209,15 +226,15 @@ class SceneRequest(Request):
     unknown_labels: Annotated[
         UnknownLabels,
         Field(
-            description="treatment of labels that the model does not know: refuse them, leave "
-            "them out of the answer, or use the nearest class (`mapped`). A label without a "
-            "similar class is refused"
+            description="treatment of labels that the model does not know. `error` refuses the "
+            "request. `ignore` leaves these objects out of the scene. `nearest` uses the most "
+            "similar class (see `mapped`) and refuses a label without a similar class"
         ),
     ] = "error"
 
 
 class SceneFields(TypedDict, total=False):
-    """The fields of `SceneRequest`; relations and pairs may be tuples of names."""
+    """The fields of `SceneRequest` as keyword arguments. A relation may be a tuple of names."""
 
     relations: Iterable[Relation | Body | tuple[str, RelationName, str]]
     relations_complete: bool
@@ -239,8 +256,8 @@ class AliasRequest(Request):
     expected: Annotated[
         ModelSpec | None,
         Field(
-            description="required current target of the alias, as in GET /models. null: the alias "
-            "must not exist yet. Default: any target"
+            description="required current target of the alias, as in GET /models. null means that "
+            "the alias must not exist yet. By default, every target is accepted"
         ),
     ] = None
 
@@ -261,8 +278,8 @@ def _as_it_came(value: Any, _validate: object) -> Any:
 class BatchRequest(Request, Generic[RequestT]):
     """Scenes to answer in order. An invalid scene affects only its own entry of the answer."""
 
-    # The schema describes RequestT, and the value stays raw: validation here would refuse the
-    # batch.
+    # The schema shows RequestT, but the scenes are not validated here. Otherwise one invalid scene
+    # would make the whole batch invalid.
     scenes: Annotated[
         list[Annotated[RequestT, WrapValidator(_as_it_came)]],
         Field(min_length=1, max_length=MAX_BATCH),
