@@ -13,7 +13,12 @@ from tests.training.evaluation.scenes import V, tensors, toy
 from training.batches import relation_units
 from training.config import ObjectiveConfig
 from training.machines import MachineSpec, build
-from training.objectives.relations import RelationLikelihood, bake_word_prior, partly_shown
+from training.objectives.relations import (
+    RelationLikelihood,
+    bake_word_prior,
+    partly_shown,
+    with_counted_residuals,
+)
 
 CONFIG = ObjectiveConfig(name="relations", room_dropout=0.0, offset_prior=0.1, weight_prior=0.1)
 SPECS = {
@@ -223,3 +228,58 @@ def test_machines_without_factors_have_no_word_prior():
     keys = set(machine.state_dict())
     RelationLikelihood(WORDS, machine, scenes, vectors())
     assert set(machine.state_dict()) == keys
+
+
+# --------------------------------------------------------------------------------------- residuals
+
+LISTED = {(0, 1, 2): (18, 2), (0, 3, 4): (4, 8), (1, 0, 3): (0, 12)}
+"""Per triple: scenes that list it, and scenes that observe that it does not hold."""
+
+
+def listed_scenes():
+    """Scenes of two sources; each observes one triple of `LISTED`."""
+    every = []
+    for (a, i, j), counts in LISTED.items():
+        for holds, count in zip((True, False), counts, strict=True):
+            for k in range(count):
+                source = "captions" if k % 2 else "rooms"
+                one = toy([0, 1, 2, 3, 4], [(a, i, j)] if holds else [], source=source)
+                observed = np.zeros_like(one.evidence.observed)
+                observed[a, i, j] = True
+                every.append(replace(one, evidence=replace(one.evidence, observed=observed)))
+    return tensors(every)
+
+
+@pytest.mark.parametrize("weights", [(1.0, 1.0), (0.5, 2.0)])
+def test_residuals_maximise_the_likelihood_of_triples_under_a_normal_prior(monkeypatch, weights):
+    """At the mode the slope of the log-likelihood is τ δ, with one precision τ for all triples."""
+    monkeypatch.setattr("training.objectives.relations.partly_shown", lambda v, _: v)
+    scenes, machine = listed_scenes(), machine_of("triway")
+    with torch.no_grad():
+        machine.residual.copy_(torch.linspace(-0.3, 0.3, 6))
+    offsets, source_weights = torch.tensor([[0.4, 0.1], [-0.6, 0.2]]), torch.tensor(weights)
+    found = with_counted_residuals(machine, scenes, offsets, source_weights)
+    before, after = (
+        dict(zip(map(tuple, m.triples.tolist()), m.residual.tolist(), strict=True))
+        for m in (machine, found)
+    )
+    assert set(after) == set(before) | {(1, 0, 3)}
+    assert all(after[key] == before[key] for key in set(before) - set(LISTED))
+    batch = whole(scenes)
+    edges, r, observed = relation_units(found, batch)
+    with torch.no_grad():
+        h1 = (found.c1 + batch.v @ found.W).sigmoid()
+        logits = found.relation_logits(edges, batch.v, h1)
+    p = (logits + offsets[batch.source].gather(1, edges.relation.expand_as(logits))).sigmoid()
+    error = observed * (r - p) * source_weights[batch.source].unsqueeze(1)
+    relation, subject, object_ = (
+        part.expand_as(logits) for part in (edges.relation, edges.subject, edges.object)
+    )
+    precision = []
+    for key, (on, off) in LISTED.items():
+        a, i, j = key
+        unit = (relation == a) & (subject == i) & (object_ == j)
+        assert int((observed * unit).sum()) == on + off
+        precision.append(float(error[unit].sum()) / (after[key] - before.get(key, 0.0)))
+    assert precision[0] > 0
+    assert precision == pytest.approx([precision[0]] * 3, rel=1e-3)

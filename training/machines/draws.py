@@ -86,7 +86,7 @@ class HiddenDraws:
 def fixed_uniforms(count: int, units: int) -> Tensor:
     """Return (count, units) quasi-random numbers in (0, 1), the same in every process."""
     engine = torch.quasirandom.SobolEngine(units, scramble=True, seed=20180521)
-    return engine.draw(count, dtype=torch.float64).clamp(1e-9, 1 - 1e-9)
+    return engine.draw(count, dtype=torch.float64).clamp(min=1e-9)
 
 
 def draw_hidden(

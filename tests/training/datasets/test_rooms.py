@@ -8,7 +8,7 @@ import pytest
 from app.scene import CANONICAL
 from app.scene.footprints import overlap_and_gap
 from training.datasets import AnnotatedScene, encode, generate_rooms, rooms_vocabulary, split
-from training.datasets.rooms import ROOMS, WORKPLACES
+from training.datasets.rooms import ROOMS, WORKPLACES, Beside, Piece
 
 
 @pytest.fixture(scope="module")
@@ -91,3 +91,29 @@ def test_other_tables_make_another_domain() -> None:
     homes = {thing.label for scene in generate_rooms(60, 0) for thing in scene.objects}
     assert not homes & {thing.label for scene in found for thing in scene.objects}
     assert generate_rooms(20, 0, WORKPLACES) == found[:20]
+
+
+@pytest.mark.parametrize(
+    ("side", "axis", "sign"), [("left", 0, -1), ("right", 0, 1), ("front", 1, 1), ("back", 1, -1)]
+)
+def test_an_adjacent_piece_is_close_to_the_named_side(side, axis, sign) -> None:
+    """In the axes of the main piece, whose front is +y; from every viewpoint of a room."""
+    chair = Piece("chair", (0.3, 0.3, 0.8))
+    table = Piece("table", (0.6, 0.5, 0.7), where="centre", beside=(Beside(chair, side),))
+    for scene in generate_rooms(40, 0, {"kitchen": (table,)}):
+        (main,) = (thing for thing in scene.objects if thing.label == "table")
+        (other,) = (thing for thing in scene.objects if thing.label == "chair")
+        cos, sin = np.cos(main.yaw), np.sin(main.yaw)
+        away = np.subtract(other.position, main.position)[:2] @ [[cos, -sin], [sin, cos]]
+        gap = sign * away[axis] - (main.size[axis] + other.size[axis]) / 2
+        assert 0 < gap < 0.2
+
+
+def test_a_piece_is_in_a_room_once_unless_its_table_says_otherwise() -> None:
+    def most(piece: Piece) -> int:
+        scenes = generate_rooms(40, 0, {"hall": (piece,)})
+        return max(len(scene.objects) for scene in scenes)
+
+    size = (0.5, 0.3, 1.0)
+    assert most(Piece("shelf", size)) == 1
+    assert most(Piece("shelf", size, most=3)) == 3

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from app.scene import ObjectClass, Vocabulary
+from training.config import DataConfig
 from training.datasets import DatasetError, indoor_vocabulary, words
 from training.datasets.words import class_vectors, read_word_vectors
+from training.pipeline import read_sources, split_and_encode
 
 WORDS = np.array(["coffee", "table", "zero", "the", "sofa"])
 VECTORS = np.array([[4, 0], [0, 2], [0, 0], [3, 3], [3, -4]], dtype=np.int8)
@@ -51,6 +53,20 @@ def test_classes_have_the_vector_of_their_label_or_alias(tmp_path: Path) -> None
     assert vectors.dtype == np.float32
     assert vectors[1] == pytest.approx([0.6, -0.8])
     assert np.linalg.norm(vectors, axis=1) == pytest.approx([1, 1, 0])
+
+
+def test_training_reads_the_vectors_beside_the_scenes(tmp_path: Path) -> None:
+    """A relative path of the configuration starts at the folder of the data."""
+    folder = tmp_path / "words"
+    folder.mkdir()
+    save(folder)
+    data = DataConfig(sources=("rooms",), vocabulary="rooms", rooms=40, words="words/vectors.npz")
+    scenes = split_and_encode(data, read_sources(data, tmp_path), root=tmp_path)
+    assert scenes.words is not None
+    vectors = dict(zip(scenes.vocabulary.labels, scenes.words.tolist(), strict=True))
+    assert vectors["sofa"] == pytest.approx([0.6, -0.8])
+    assert vectors["coffee table"] == pytest.approx([np.sqrt(0.5)] * 2)
+    assert vectors["bed"] == [0, 0]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,9 @@ import pytest
 import uvicorn
 
 from app.main import create_app
+from app.questions import relations
 from app.registry import Store, load_model_set
+from app.scene import Scene, SceneObject, opposite
 from app.settings import Settings
 from tests.training.evaluation.furnished_rooms import STRUCTURE, room_model, rooms
 from training.evaluation.everyday import (
@@ -118,6 +120,23 @@ def test_unknown_labels_count_as_missed(folder):
     found = ask_everyday(room_model(), folder)
     assert [found[line][1] for line in LINES] == [3, 3, 3, 2, 3, 1, 1, 1, 16, 16, 16]
     assert found["missing: an expected object is among five"][0] <= 1
+
+
+def test_a_fact_and_its_mirror_image_are_the_same_fact(tmp_path):
+    """The likeliest relation of two objects is so too from the other object, as its opposite."""
+    model, names = room_model(), ("lamp", "nightstand")
+    things = (SceneObject(name, name, model.vocabulary.index(name)) for name in names)
+    found, _ = relations(model, Scene(tuple(things)), top_k=50)
+    first = max(found, key=lambda answer: answer.probability)
+    subject, object_ = names[first.subject], names[first.object]
+    mirrored = opposite(first.relation)
+    facts = [
+        {"subject": subject, "relation": first.relation, "object": object_},
+        {"subject": object_, "relation": mirrored, "object": subject},
+        {"subject": subject, "relation": mirrored, "object": object_},
+    ]
+    (tmp_path / "facts.json").write_text(json.dumps(FACTS | {"relations": facts}))
+    assert ask_everyday(model, tmp_path)["relations: the fact is the likeliest of eight"] == (2, 3)
 
 
 def test_the_task_has_a_metric_for_each_line(folder):

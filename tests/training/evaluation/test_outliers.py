@@ -33,12 +33,14 @@ from training.evaluation.intruders import (
     by_popularity,
     by_room,
     by_signature,
+    clean_scores,
     draw_intruders,
     intruder_scores,
     signatures,
 )
 from training.evaluation.outliers import (
     MEDIUM,
+    Alarm,
     alarm_threshold,
     calibrated_alarm,
     fitted_alarm,
@@ -270,6 +272,15 @@ def test_no_room_type_no_question():
     assert signature_task(Contender(), Setting(DATA, STRUCTURE, TRAIN)) is None
 
 
+def test_scenes_with_the_first_class_as_intruder_count():
+    """Class 0, of room 0, is the only candidate in the first scene; the second has none."""
+    data = tensors([scene([1, 2, 3], room=1), scene([0, 1, 2, 3], room=1)])
+    contender = Contender(objects=lambda v: torch.tensor([-1.0, 1, 1, 1, 1]).expand_as(v))
+    outcome = signature_task(contender, Setting(data, NO_STRUCTURE, TOY))
+    assert outcome.scenes == 1
+    assert outcome.metrics["hit@1"].value == 1.0
+
+
 def test_a_planted_cheater_is_caught(monkeypatch):
     """A model that counts the scenes, and flags the intruder of the one whose turn it is."""
     drawn = draw_intruders(DATA, STRUCTURE, by_signature(DATA, TRAIN))
@@ -374,6 +385,20 @@ def test_a_model_alarms_as_its_service_does():
     logits = 0.3 - 0.8 * odds + 0.2 * np.log(scores.size)
     assert alarm.suspicion(scores) == pytest.approx(1 / (1 + np.exp(-logits)))
     assert alarm.threshold == 0.4
+
+
+def test_an_object_at_the_threshold_of_its_list_raises_the_alarm():
+    """Lists of one and two classes have their own thresholds; structure is not listed."""
+    structure = torch.arange(WIDE) == 11
+    scenes = tensors([scene([0]), scene([0, 11]), scene([0, 1]), scene([0, 1, 2])], WIDE)
+    scores = clean_scores(scenes.v, structure, by_frequency)
+    limits = np.array([0.5, 0.5, 0.25, 0.125])[scores.scene]
+    at, below = (
+        Alarm(lambda _, some=some: some, 0.125, (0.5, 0.25)).raised(scores)
+        for some in (limits, limits - 1e-6)
+    )
+    assert at.tolist() == [True] * 7
+    assert not below.any()
 
 
 def test_scenes_with_incomplete_object_lists_fit_no_alarm():

@@ -173,11 +173,15 @@ def test_the_control_learns_from_other_scenes_and_is_asked_about_the_same(finish
 
 
 def test_rows_above_the_yardstick_are_named():
-    figures = {"sees more": Figure(-0.2, -0.3, -0.1, 9), "falls": Figure(-0.1, -0.2, 0.1, 9)}
+    """By their figures on all sources together, not on one of them."""
+    above, near = Figure(-0.2, -0.3, -0.1, 9), Figure(-0.1, -0.2, 0.1, 9)
+    figures = {
+        ("sees more", "x"): near, ("sees more", "pooled"): above,
+        ("falls", "x"): above, ("falls", "pooled"): near,
+    }  # fmt: skip
     differences = tuple(
         Difference(row, "T2 missing", source, "MRR", figure)
-        for row, figure in figures.items()
-        for source in ("x", "pooled")
+        for (row, source), figure in figures.items()
     )
     text = shuffled_text("T2 missing", Results("popularity", (), differences))
     assert "above popularity over the whole interval: sees more by 0.200." in text

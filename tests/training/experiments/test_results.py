@@ -143,3 +143,25 @@ def test_skipped_scenes_are_told_by_source():
     asked = [Asked(r, 0, "T2", s, 90, k, {}) for r, s, k in [("a", "x", 8), ("b", "x", 9)]]
     asked.append(Asked("a", 0, "T2", "y", 1200, 0, {}))
     assert remarks(asked) == ["Scenes that could not be scored: x 8–9 of 90."]
+
+
+def test_a_row_is_compared_by_scene_where_the_reference_row_has_the_metric():
+    """Differences (.5, .5, -.25) of three scenes; the metric of one row alone is not compared."""
+
+    def report(**metrics):
+        outcome = Outcome({n: Ratio.of_scenes(np.array(v)) for n, v in metrics.items()}, 3, 0)
+        return {"x": SourceReport("x", "", {"T2 missing": outcome})}
+
+    reports = {
+        ("ours", 0): report(MRR=[1.0, 0.5, 0.25]),
+        ("other", 0): report(MRR=[0.5, 0.0, 0.5], extra=[1.0, 1.0, 1.0]),
+    }
+    results = summarise(reports, "ours")
+    assert {(cell.row, cell.metric) for cell in results.cells} == {
+        ("ours", "MRR"), ("other", "MRR"), ("other", "extra"),
+    }  # fmt: skip
+    (gap,) = results.differences
+    assert (gap.row, gap.task, gap.source, gap.metric) == ("other", "T2 missing", "x", "MRR")
+    assert gap.figure.value == pytest.approx(0.25)
+    assert gap.figure.low == pytest.approx(-0.25)
+    assert gap.figure.high == pytest.approx(0.5)
