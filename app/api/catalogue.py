@@ -121,8 +121,8 @@ STORE_NOT_WRITABLE: Final = ProblemType(
     "store-not-writable",
     409,
     "The store cannot be written",
-    "The store holds the aliases, but this service has no write access to the store. Move the "
-    "alias on a machine that can write to the store. Then POST /models/refresh here.",
+    "The store holds the aliases, but this service has no write access to the store. Change the "
+    "alias on a computer with write access. Then send POST /models/refresh to this service.",
 )
 STORE_BUSY: Final = ProblemType(
     "store-busy",
@@ -142,9 +142,9 @@ BODIES_FULL: Final = ProblemType(
     "bodies-full",
     503,
     "The service holds too many bytes of request bodies",
-    "The bodies of all requests in progress may hold at most SCENE_HELD_BODY_BYTES together. The "
-    "service always accepts a body of at most 64 KiB that arrives in one piece. Send the request "
-    "again after the time in Retry-After.",
+    "All requests in progress share SCENE_HELD_BODY_BYTES for their bodies. The service always "
+    "accepts a body of at most 64 KiB that has arrived whole. Send the request again after the "
+    "time in Retry-After.",
 )
 UNSUPPORTED_MEDIA_TYPE: Final = ProblemType(
     "unsupported-media-type",

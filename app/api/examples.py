@@ -180,8 +180,7 @@ ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     },
     "model_ready": {"name": "home", "ready": True},
     "show_metrics": (
-        "# HELP scene_requests_total Requests answered; outcome is success or the name of the "
-        "problem\n"
+        "# HELP scene_requests_total Requests answered\n"
         "# TYPE scene_requests_total counter\n"
         'scene_requests_total{method="POST",outcome="success",route="/missing"} 1027.0\n'
         'scene_requests_total{method="POST",outcome="unknown-labels",route="/missing"} 3.0\n'

@@ -99,7 +99,10 @@ async def show_vocabulary(name: Reference, runtime: RuntimeDep) -> VocabularyAns
 
 @router.get("/{name}/contexts", summary="The hidden units of a model", responses=_USABLE)
 async def show_contexts(name: Reference, runtime: RuntimeDep) -> ContextsAnswer:
-    """Hidden units with their strongest objects. `context` of `/generate` takes their numbers."""
+    """Hidden units with the classes of their largest weights.
+
+    `context` of `/generate` takes the numbers of these units.
+    """
     # This runs in a thread, because the first call takes 0.2 s.
     return await asyncio.to_thread(describe.contexts, runtime.models.resolve(name))
 

@@ -140,7 +140,9 @@ class SceneChains:
 
     def __init__(self, weights: Weights, units: RelationUnits | None = None) -> None:
         if not self.fits(weights):
-            raise ValueError("compiled chains need a machine in the local form and in float32")
+            raise ValueError(
+                "compiled chains need a machine in the local form with float32 weights"
+            )
         self.machine = weights
         self.units = units or weights.spec.kind.units(weights)
         W, J, H1 = weights["W"], weights["J"], weights.spec.H1

@@ -11,9 +11,9 @@ symmetric in i and j. So one row of gains for class i holds the increase by ever
 is exact for one hidden layer in the local form. It leaves out a second layer, relations and the
 room type.
 
-Rare companions have the largest increases: for a toilet, the toilet paper holder. Common objects
-such as chairs are likely beside any class. So companions are ranked by the product of the increase
-and the probability beside class i. Increases below half of the largest one are ignored.
+Rare companions have the largest increases: for a toilet, the toilet paper holder. Common classes
+such as chair are likely in any scene. So companions are ranked by the product of the increase and
+the probability in a scene with class i. Increases below half of the largest one are ignored.
 """
 
 from __future__ import annotations

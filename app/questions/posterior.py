@@ -57,7 +57,7 @@ def present(scene: Scene, spec: MachineSpec) -> Present:
             name = scene.objects[place].id
             raise ValueError(f"class_index of {name!r} is {index}, but must be below V = {V}")
     if scene.room_type is not None and spec.C and not 0 <= scene.room_type < spec.C:
-        raise ValueError(f"room_type is {scene.room_type}, but must be below C = {spec.C}")
+        raise ValueError(f"room_type is {scene.room_type}, but must be in 0 to {spec.C - 1}")
     confidence = np.array([thing.confidence for thing in scene.objects], dtype=np.float64)
     classes, first, row, counts, presence = pool_classes(
         np.array(indices, dtype=np.int64), confidence

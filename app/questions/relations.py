@@ -129,7 +129,7 @@ def relations(
 def _asked(
     artifact: Artifact, present: Present, pairs: Sequence[tuple[int, int]] | None
 ) -> NDArray[np.bool_]:
-    """The ordered pairs to answer, as a mask (N, N)."""
+    """The requested ordered pairs of objects, as a mask (N, N)."""
     size = len(present.row)
     if pairs is None:
         things = ~artifact.vocabulary.structure[present.classes][present.row]

@@ -27,7 +27,8 @@ def observe(
 
     Positions and yaws must be in body axes (`app.scene.frames.body_pose`). If there is a viewpoint,
     the returned scene has positions and yaws in viewer axes. The field ``relations`` of the result
-    lists the relations that hold. The field ``poses`` also contains relations observed off.
+    lists the relations that hold. The field ``poses`` also contains relations observed not to
+    hold.
 
     The function returns a scene unchanged if it states relations or has no positions. In a
     world-fixed frame (map, odom, world) without a viewpoint, left and front are undefined. The

@@ -94,7 +94,7 @@ def vocabulary(served: ServedModel) -> VocabularyAnswer:
 
 
 def contexts(served: ServedModel) -> ContextsAnswer:
-    """List the hidden units of a model with their strongest objects and relations."""
+    """List the hidden units of a model with the objects and relations of their largest weights."""
     return ContextsAnswer(
         model=served.reference,
         layers={

@@ -55,7 +55,7 @@ class Metrics:
         self.registry = registry = CollectorRegistry()
         self._requests = Counter(
             "scene_requests_total",
-            "Requests answered; outcome is success or the name of the problem",
+            "Requests answered",
             ("route", "method", "outcome"),
             registry=registry,
         )
@@ -68,7 +68,7 @@ class Metrics:
         )
         self._entries = Counter(
             "scene_batch_entries_total",
-            "Scenes of batch requests; outcome is success or the name of the problem",
+            "Scenes of batch requests",
             ("question", "outcome"),
             registry=registry,
         )
@@ -88,7 +88,7 @@ class Metrics:
         )
         self._rows = Histogram(
             "scene_batch_rows",
-            "Scenes of one question: 1, or the number of generated scenes",
+            "Scenes computed for one question: 1, or the number of generated scenes",
             (*_MODEL, "question"),
             buckets=_ROWS,
             registry=registry,
@@ -112,13 +112,13 @@ class Metrics:
         )
         self._messages = Counter(
             "scene_stream_messages_total",
-            "Messages of streams; outcome is success or the name of the problem",
+            "Messages of streams",
             ("type", "outcome"),
             registry=registry,
         )
         self._answers = Counter(
             "scene_stream_answers_total",
-            "Answers to streams; outcome is success or the name of the problem",
+            "Answers to streams",
             ("outcome",),
             registry=registry,
         )

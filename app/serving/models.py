@@ -69,7 +69,7 @@ class ServedModel:
 
     @cached_property
     def contexts(self) -> Mapping[str, tuple[questions.ContextUnit, ...]]:
-        """Hidden units of each layer, with their strongest objects and relations.
+        """Hidden units of each layer, with the objects and relations of their largest weights.
 
         The first access takes 0.2 s.
         """

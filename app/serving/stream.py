@@ -146,7 +146,7 @@ async def _answers(
         return {}, dict.fromkeys(names, _in_message(error, scene, {}, frozenset()))
     except ServingError as error:
         return {}, dict.fromkeys(names, error)
-    # All questions share one reading of the scene and one deadline.
+    # All questions use the same parsed scene and the same deadline.
     request = replace(request, known=(model, reading), low_priority=True)
     found: dict[str, Answer] = {}
     errors: dict[str, ServingError] = {}

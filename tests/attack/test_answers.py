@@ -55,7 +55,7 @@ async def test_the_answer_to_a_batch_has_a_limit(client: httpx.AsyncClient) -> N
     last = results[-1]["problem"]
     assert last["type"] == "/problems/answer-too-large"
     assert last["errors"][0]["pointer"] == f"#/scenes/{MAX_BATCH - 1}/top_k"
-    assert "lower `top_k`" in last["errors"][0]["message"]
+    assert "Lower `top_k`" in last["errors"][0]["message"]
 
 
 async def test_a_batch_within_the_limit_is_answered_as_before(client: httpx.AsyncClient) -> None:

@@ -82,7 +82,7 @@ def test_what_cannot_be_asked_is_reported_and_does_not_end_the_program(repositor
     with bridge(message) as (url, _):
         answers, errors = run(repository, url, "/x")
     assert answers == []
-    assert errors == ["MessageError: this is not a message with detections"]
+    assert errors == ["MessageError: the message must have a list of detections"]
 
 
 def test_frames_that_say_nothing_are_left_out_and_complaints_are_handed_on(
@@ -108,7 +108,7 @@ def test_frames_that_say_nothing_are_left_out_and_complaints_are_handed_on(
         f"left out: text that is no JSON object: {'[' * 40!r}",
         "bridge: error: no such type",
         "bridge: warning: slow",
-        "MessageError: this is not a message with detections",
+        "MessageError: the message must have a list of detections",
     ]
 
 

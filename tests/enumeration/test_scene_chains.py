@@ -298,5 +298,5 @@ def test_other_machines_are_refused():
     for machine in (small_machine("triway-seed").float(), small_machine("triway-local")):
         weights = weights_of(machine)
         assert not SceneChains.fits(weights)
-        with pytest.raises(ValueError, match="local form in float32"):
+        with pytest.raises(ValueError, match="local form with float32 weights"):
             SceneChains(weights)

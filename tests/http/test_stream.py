@@ -225,7 +225,7 @@ def test_a_flood_is_answered_about_its_newest_state_only(live: LiveService) -> N
 def test_a_fast_stream_is_slowed_down_and_others_are_not(live: LiveService) -> None:
     """By the numbers of the documentation: so many messages a second after a burst."""
     (pace,) = re.findall(r"(\d+) small messages a second", DOCUMENT)
-    ((share, burst),) = re.findall(r"(\d+) % of a core, and (\d+) s at once", DOCUMENT)
+    ((share, burst),) = re.findall(r"(\d+) % of a core, with a burst of (\d+) s", DOCUMENT)
     later = int(pace) // 2
     count = round(int(pace) * 100 / int(share) * int(burst)) + later
     with opened(live) as fast, opened(live) as other:

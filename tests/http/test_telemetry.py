@@ -103,5 +103,5 @@ def test_missing_packages_are_named(
 
 def test_nowhere_to_send_is_refused(shared_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OTEL_EXPORTER_OTLP_ENDPOINT", raising=False)
-    with pytest.raises(ValidationError, match=r"SCENE_OPENTELEMETRY needs OTEL_EXPORTER_OTLP"):
+    with pytest.raises(ValidationError, match=r"set OTEL_EXPORTER_OTLP_ENDPOINT"):
         Settings(store=shared_store, opentelemetry=True)

@@ -63,6 +63,6 @@ def test_every_message_and_setting_is_in_the_document() -> None:
     for name in ("max_streams", "stream_idle"):
         default = f"{Settings.model_fields[name].default:g}"
         assert f"| `SCENE_{name.upper()}` | {default} |" in DOCUMENT
-    assert f"{100 * READING_SHARE:g} % of a core, and {READING_BURST:g} s at once" in DOCUMENT
+    assert f"{100 * READING_SHARE:g} % of a core, with a burst of {READING_BURST:g} s" in DOCUMENT
     assert f"at least {1e3 * LEAST_COST:g} ms" in DOCUMENT
     assert f"{READING_SHARE / LEAST_COST:g} small messages a second" in DOCUMENT

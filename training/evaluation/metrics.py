@@ -435,7 +435,7 @@ class MeanOverSeeds(Metric):
         if not members:
             raise ValueError("a mean over seeds needs at least one metric")
         if len({member.scenes for member in members}) > 1:
-            raise ValueError("the seeds were measured on different numbers of scenes")
+            raise ValueError("all seeds must have results on the same number of scenes")
         self.members = tuple(members)
         self.scenes, self.n = members[0].scenes, members[0].n
 

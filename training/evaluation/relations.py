@@ -171,7 +171,7 @@ def complete_scenes(
         for index, batch in _batches(scenes, 2):
             mask = scorable(batch, structure)
             given = random_half((batch.holds > 0) & mask, scenes, index, seed)
-            # A single triple cannot be divided: the scene has no given triple and is left out.
+            # With a single triple the observed half is empty: the scene is left out.
             divided = given.flatten(1).any(1)[:, None, None, None]
             yield batch, score(telling(batch, given)), mask & ~given & ~given.mT & divided
 

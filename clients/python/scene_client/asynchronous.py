@@ -210,7 +210,7 @@ class AsyncClient:
     async def contexts(
         self, name: str | None = None, *, timeout: float | None = None
     ) -> ContextsAnswer:
-        """Return the hidden units of a model with their strongest objects."""
+        """Return each hidden unit of a model with the classes of its largest weights."""
         path = f"/models/{segment(name or self.options.model or 'default')}/contexts"
         return await self._call(Call("GET", path, ContextsAnswer), timeout)
 

@@ -207,7 +207,7 @@ class Client:
         return self._call(Call("GET", path, VocabularyAnswer), timeout)
 
     def contexts(self, name: str | None = None, *, timeout: float | None = None) -> ContextsAnswer:
-        """Return the hidden units of a model with their strongest objects."""
+        """Return each hidden unit of a model with the classes of its largest weights."""
         path = f"/models/{segment(name or self.options.model or 'default')}/contexts"
         return self._call(Call("GET", path, ContextsAnswer), timeout)
 

@@ -246,7 +246,7 @@ def test_a_mean_over_seeds_is_resampled_scene_by_scene():
     np.testing.assert_allclose(mean.draws(), together.draws())
     difference = paired_difference(mean, together)
     assert (difference.low, difference.high) == pytest.approx((0.0, 0.0))
-    with pytest.raises(ValueError, match="different numbers of scenes"):
+    with pytest.raises(ValueError, match="same number of scenes"):
         MeanOverSeeds([mean_of([1.0]), mean_of([1.0, 0.0])])
     with pytest.raises(ValueError, match="at least one"):
         MeanOverSeeds([])
