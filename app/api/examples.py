@@ -84,7 +84,11 @@ _OF_QUESTIONS: Final = {
 }
 ANSWERS: Final[dict[str, dict[str, Any] | str]] = {
     **_OF_QUESTIONS,
-    **{f"{name}_batch": _batch(answer) for name, answer in _OF_QUESTIONS.items()},
+    **{
+        f"{question.name}_batch": _batch(_OF_QUESTIONS[question.name])
+        for question in QUESTIONS
+        if question.has_batch
+    },
     "list_models": {
         "generation": "3f6d0f4be1a25c77",
         "models": [_SUMMARY],

@@ -85,9 +85,11 @@ def pool_classes(
     """Return the n distinct classes of N instances, ascending.
 
     Returns:
-        (n,) classes, (n,) index of the first instance of each class, (N,) index of each instance's
-        class in the first array, (n,) number of instances, and (n,) probability that at least one
-        instance exists.
+        The classes, (n,).
+        The index of the first instance of each class, (n,).
+        The index of each instance's class in the first array, (N,).
+        The number of instances of each class, (n,).
+        The probability that at least one instance of each class exists, (n,).
     """
     distinct, row = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
     counts, first = np.zeros(len(classes), np.int64), np.empty(len(classes), np.int64)
