@@ -123,9 +123,14 @@ def serve(settings: Settings, began: float) -> int:
     # A question needs only small matrix products. More threads would take cores from other
     # processes. numpy reads this variable at its import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from app.registry import StoreError
     from app.server import build
 
-    server = build(settings, began)
+    try:
+        server = build(settings, began)
+    except StoreError as error:
+        sys.stderr.write(f"SCENE_STORE: {error.reason}\n")
+        return 3
     # On Ctrl-C, the server finishes its shutdown and then raises KeyboardInterrupt.
     with suppress(KeyboardInterrupt):
         try:

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from app.registry import Artifact, RegistryError, Store, load_model_set
+from app.registry.location import open_for_publisher
 from app.registry.references import AliasTarget
 from training.batches import subset
 from training.config import (
@@ -61,11 +62,11 @@ Data = Annotated[
     ),
 ]
 Runs = Annotated[Path, typer.Option("--runs", help="folder of the training runs")]
-StorePath = Annotated[Path, typer.Option("--store", help="the model store")]
+StorePath = Annotated[str, typer.Option("--store", help="the model store: a folder or a URL")]
 Alias = Annotated[
     str | None, typer.Option("--alias", help="afterwards, point this alias at the version")
 ]
-_RUNS, _STORE = Path("runs"), Path("model_store")
+_RUNS, _STORE = Path("runs"), "model_store"
 
 
 @app.command()
@@ -152,7 +153,7 @@ def publish(
         scenes = _prepare(run.config, root)
         if promote:
             gate = _Gate(alias or "default", margin, limit, even_if_worse)
-            _promote(run, scenes, root, Store(store), version, gate)
+            _promote(run, scenes, root, open_for_publisher(store), version, gate)
         else:
             _publish(run, scenes, store, version, alias)
     except WorseError as error:
@@ -180,7 +181,8 @@ def evaluate_command(
     try:
         tables: dict[str, list[Row]] = {}
         for reference in models:
-            artifact = Store(store).load(*Store(store).resolve(reference))
+            found = open_for_publisher(store)
+            artifact = found.load(*found.resolve(reference))
             config = Config.model_validate(artifact.manifest.training["config"])
             wanted = source or [source_name(name) for name in config.data.sources]
             with console.status("reading scenes"):
@@ -219,7 +221,7 @@ def evaluate_command(
 def list_command(store: StorePath = _STORE) -> None:
     """List the models of the store and the shipped configurations."""
     try:
-        models = load_model_set(Store(store))
+        models = load_model_set(open_for_publisher(store))
     except RegistryError as error:
         fail(error)
     table = Table("model", "version", "variant", "state", title="Published")
@@ -271,14 +273,14 @@ def _train(
 def _publish(
     run: FinishedRun,
     scenes: SplitScenes,
-    store: Path,
+    store: str,
     version: str,
     alias: str | None,
     measured: tuple[FinishedRun, SplitScenes] | None = None,
 ) -> None:
     with console.status("publishing") as status:
         artifact = publish_run(
-            *(run, scenes, Store(store), version),
+            *(run, scenes, open_for_publisher(store), version),
             alias=alias,
             measured=measured,
             progress=status.update,

@@ -28,17 +28,30 @@ _NOT_READY = problems(catalogue.NOT_READY, catalogue.DRAINING)
 _NO_MODEL = queued(catalogue.MODEL_NOT_FOUND, catalogue.NOT_READY, catalogue.MODEL_UNAVAILABLE)
 
 
-@router.get("/health/live", summary="Is the process alive?", responses=problems())
+@router.get(
+    "/health/live",
+    summary="Is the process alive?",
+    responses=problems(),
+    response_model_exclude_none=True,
+)
 async def health_live() -> Health:
     """Status 200 while the process runs, even if its models are not usable."""
     return Health(status="live")
 
 
-@router.get("/health/ready", summary="Is the default model usable?", responses=_NOT_READY)
+@router.get(
+    "/health/ready",
+    summary="Is the default model usable?",
+    responses=_NOT_READY,
+    response_model_exclude_none=True,
+)
 async def health_ready(runtime: RuntimeDep) -> Health:
-    """Status 200 if the default model is usable, else 503."""
+    """Status 200 if the default model is usable, else 503.
+
+    A replica of a remote store stays ready while it cannot reach the store.
+    """
     runtime.check_ready()
-    return Health(status="ready")
+    return Health(status="ready", store=runtime.store_health)
 
 
 @protocol.get("", summary="Server metadata", responses=queued())

@@ -21,6 +21,7 @@ ArtifactCode = Literal[
     "invalid_tensor",
     "unsupported",
     "wrong_place",
+    "revoked",
     "unexpected_error",
 ]
 StoreCode = Literal[
@@ -36,6 +37,12 @@ StoreCode = Literal[
     "unreadable",
     "not_writable",
     "locked",
+    "unreachable",
+    "empty",
+    "invalid_index",
+    "untrusted_index",
+    "rolled_back",
+    "invalid_key",
 ]
 
 

@@ -41,9 +41,9 @@ from app.registry.references import (
 from app.registry.tensors import StorageDtype
 from app.registry.verified import MAX_WEIGHTS_BYTES
 
-_ALIASES: Final = "aliases.json"
+ALIASES: Final = "aliases.json"
 _LOCK: Final = ".lock"
-_TEMPORARY: Final = ".publishing-"
+TEMPORARY: Final = ".publishing-"
 
 
 StoreState: TypeAlias = tuple[tuple[str | int, ...], ...]
@@ -56,7 +56,12 @@ class Store:
         root: directory of the store; the first publication creates it.
         lock_timeout: time in seconds that a writer waits for another writer.
         max_weights_bytes: maximum size of a version's weights file.
+
+    Attributes:
+        error: the reason why the last `sync` with a remote store failed, or None.
     """
+
+    error: StoreError | None = None
 
     def __init__(
         self,
@@ -68,6 +73,14 @@ class Store:
         self.root = Path(root)
         self._lock_timeout = lock_timeout
         self._max_weights_bytes = max_weights_bytes
+
+    def sync(self) -> None:
+        """Bring the local copy of a remote store up to date. A store in a folder has no copy."""
+
+    @property
+    def age(self) -> float | None:
+        """Seconds since the last successful `sync`, or None for a store in a folder."""
+        return None
 
     # -- reading --------------------------------------------------------------------------------
 
@@ -114,7 +127,7 @@ class Store:
         Raises:
             StoreError: `invalid_aliases`.
         """
-        return MappingProxyType(read_aliases(self.root / _ALIASES))
+        return MappingProxyType(read_aliases(self.root / ALIASES))
 
     def resolve(self, reference: str) -> tuple[str, str]:
         """Return the (name, version) that an alias, `name` or `name@version` points at.
@@ -154,7 +167,7 @@ class Store:
 
         The method reads only the metadata of the files.
         """
-        files = [self.root / _ALIASES]
+        files = [self.root / ALIASES]
         with suppress(StoreError):
             for name in self.names():
                 for version in self.versions(name):
@@ -202,7 +215,7 @@ class Store:
             place = folder / version
             if os.path.lexists(place):
                 raise StoreError("version_exists", f"{name}@{version} is already published")
-            temporary = folder / f"{_TEMPORARY}{version}-{token_hex(8)}"
+            temporary = folder / f"{TEMPORARY}{version}-{token_hex(8)}"
             try:
                 write_artifact(temporary, description, state, storage_dtype=storage_dtype)
                 artifact = load_artifact(temporary, None, self._max_weights_bytes)
@@ -279,7 +292,7 @@ class Store:
         table = {name: entry for name, entry in self.aliases().items() if name != alias}
         if target is not None:
             table[alias] = target
-        write_aliases(self.root / _ALIASES, table, prefix=_TEMPORARY)
+        write_aliases(self.root / ALIASES, table, prefix=TEMPORARY)
 
     def _require_no_model(self, alias: str) -> None:
         if self.versions(alias):
@@ -308,7 +321,7 @@ class Store:
         folders = [self.root, *(self.root / name for name in self._folders())]
         for folder in filter(_is_directory, folders):
             for entry in folder.iterdir():
-                if not entry.name.startswith(_TEMPORARY):
+                if not entry.name.startswith(TEMPORARY):
                     continue
                 if _is_directory(entry):
                     shutil.rmtree(entry)

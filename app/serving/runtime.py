@@ -6,13 +6,14 @@ import asyncio
 import ctypes
 import gc
 import logging
+import random
 import sys
 from collections.abc import Awaitable, Callable, Iterable
 from functools import wraps
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 
 from app.compiling import check_cache, progress
-from app.registry import AliasTarget, Store, StoreError, StoreState, load_model_set
+from app.registry import AliasTarget, StoreError, StoreState, load_model_set, open_store
 from app.serving.admission import Backlog, Threads, WorkQueue
 from app.serving.errors import (
     AliasConflictError,
@@ -36,7 +37,7 @@ from app.serving.reading import Limits
 from app.serving.request import Record, Request
 from app.serving.warm_up import prepare
 from app.settings import Settings
-from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer
+from scene_client.schemas import AliasAnswer, AliasRequest, RefreshAnswer, StoreHealth
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -45,6 +46,9 @@ _logger = logging.getLogger("app.serving")
 
 # Time in seconds that an administration request waits for another writer of the store.
 _LOCK_TIMEOUT = 5.0
+
+# While a remote store is unreachable, the time between two polls doubles up to so many times.
+_MAX_DOUBLINGS = 4
 
 # Time in seconds after which the interpreter switches from a worker thread to the event loop. The
 # default of 5 ms would delay answers by a quarter of a robot's control cycle.
@@ -94,11 +98,15 @@ class Runtime:
     def __init__(self, settings: Settings) -> None:
         self.metrics = Metrics()
         self.backlog = Backlog(settings.queue_requests)
-        self._store = Store(
+        self._store = open_store(
             settings.store,
+            trusted=None if settings.unsigned_store else settings.trusted_keys,
+            cache=settings.store_cache,
             lock_timeout=_LOCK_TIMEOUT,
             max_weights_bytes=settings.max_weights_bytes,
+            max_cache_bytes=settings.store_cache_bytes,
         )
+        self._max_age = settings.store_max_age
         self._limits = Limits(
             settings.max_objects, settings.max_relations, settings.max_answer_bytes
         )
@@ -109,6 +117,7 @@ class Runtime:
         self._changing = asyncio.Lock()
         self._models: ServedModels | None = None
         self._seen: StoreState | None = None
+        self._failed_polls = 0
 
     @property
     def models(self) -> ServedModels:
@@ -157,12 +166,28 @@ class Runtime:
         """Check that the service accepts requests and its default model is usable.
 
         Raises:
-            NotReadyError: the default model is not usable.
+            NotReadyError: the default model is not usable, or the local copy of a remote store is
+                too old.
             DrainingError: the service is shutting down.
         """
         if self.draining:
             raise DrainingError("The service finishes the requests in progress and then stops.")
+        age = self._store.age
+        if self._max_age and age is not None and age > self._max_age:
+            raise NotReadyError(f"The service has not reached the model store for {age:.0f} s.")
         self.models.resolve(DEFAULT)
+
+    @property
+    def store_health(self) -> StoreHealth | None:
+        """The state of the contact to a remote store, or None for a store in a folder."""
+        if self._store.age is None:
+            return None
+        error = self._store.error
+        return StoreHealth(
+            age_s=self._store.age,
+            reason=None if error is None else error.code,
+            detail=None if error is None else error.reason,
+        )
 
     def drain(self) -> None:
         """Refuse new requests, and answer readiness checks with 503."""
@@ -245,11 +270,12 @@ class Runtime:
     async def _follow(self) -> None:
         """Check the store regularly for changes by other processes, and serve these changes."""
         while True:
-            await asyncio.sleep(self._poll)
-            if await asyncio.to_thread(self._store.state) == self._seen:
-                continue
+            await asyncio.sleep(self._wait())
             try:
-                await self._take_over_changes()
+                async with self._changing:
+                    changed = await asyncio.to_thread(self._look)
+                if changed:
+                    await self._take_over_changes()
             except RefreshRefusedError as error:
                 for failure in error.failures:
                     _logger.error(
@@ -258,6 +284,20 @@ class Runtime:
                     )
             except Exception:
                 _logger.exception("the service could not load the changes in the store")
+
+    def _wait(self) -> float:
+        """Return the time in seconds until the next poll. It grows while the store is unreachable.
+
+        The time is random within 10 %, so that replicas do not poll a remote store all at once.
+        """
+        self._failed_polls = 0 if self._store.error is None else self._failed_polls + 1
+        longer = 1 << min(self._failed_polls, _MAX_DOUBLINGS)
+        return self._poll * longer * random.uniform(0.9, 1.1)  # noqa: S311 # nosec B311
+
+    def _look(self) -> bool:
+        """Bring the local copy of the store up to date. Return whether its state has changed."""
+        self._store.sync()
+        return self._store.state() != self._seen
 
     @_counted("poll")
     async def _take_over_changes(self) -> None:
@@ -285,7 +325,11 @@ class Runtime:
         """
         # The load runs in a thread, so that the old snapshot answers in the meantime.
         new = await asyncio.to_thread(self._load, self.models)
-        worse = [failure for subject, failure in new.failures.items() if matters(subject)]
+        worse = [
+            failure
+            for subject, failure in new.failures.items()
+            if matters(subject) and failure.reason != "revoked"
+        ]
         if worse:
             raise RefreshRefusedError(worse)
         self._serve(new)
@@ -299,6 +343,7 @@ class Runtime:
             _settle_memory()
 
     def _load(self, previous: ServedModels | None) -> ServedModels:
+        self._store.sync()
         # The state is read before the files. So the next poll finds changes made during the load.
         self._seen = self._store.state()
         known = None if previous is None else previous.store

@@ -16,6 +16,7 @@ from rich.table import Table
 from torch import Tensor
 
 from app.registry import RegistryError, Store
+from app.registry.location import open_for_publisher
 from app.scene import Vocabulary
 from training.batches import SceneTensors, scene_tensors
 from training.cases import some_scenes
@@ -142,7 +143,9 @@ def compare_command(
     data: Annotated[
         Path | None, typer.Option("--data", help="folder with the scenes of the first model")
     ] = None,
-    store: Annotated[Path, typer.Option("--store", help="the model store")] = Path("model_store"),
+    store: Annotated[
+        str, typer.Option("--store", help="the model store: a folder or a URL")
+    ] = "model_store",
     limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
     examples: Annotated[int, typer.Option(min=0, help="number of changed answers to show")] = 3,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
@@ -155,8 +158,9 @@ def compare_command(
     try:
         with console.status("reading") as status:
             say: Say = status.update
-            a = find(new, Store(store), data, say)
-            b = find(old or _served(store), Store(store), data, say)
+            models = open_for_publisher(store)
+            a = find(new, models, data, say)
+            b = find(old or _served(models), models, data, say)
             comparison = compare(a, b, _root(data, a, b), limit=limit, examples=examples, say=say)
     except (ConfigError, DatasetError, RegistryError, RunError) as error:
         console.print(f"[red]error:[/red] {error}", soft_wrap=True)
@@ -167,9 +171,9 @@ def compare_command(
     show(comparison, console)
 
 
-def _served(store: Path) -> str:
+def _served(store: Store) -> str:
     """Return `default`, or the name of the baselines if the store has no such alias."""
-    return "default" if "default" in Store(store).aliases() else BASELINE_SIDE
+    return "default" if "default" in store.aliases() else BASELINE_SIDE
 
 
 def _root(given: Path | None, *sides: Side) -> Path:

@@ -172,10 +172,26 @@ class AliasAnswer(Reply):
 # ------------------------------------------------------------------------------------ health
 
 
+class StoreHealth(Reply):
+    """The contact of a replica to its remote store of models."""
+
+    age_s: Annotated[
+        Finite, Field(description="seconds since the replica last read the remote store")
+    ]
+    reason: Annotated[
+        str | None, Field(description="stable code of the reason why the last reading failed")
+    ] = None
+    detail: Annotated[str | None, Field(description="the reason in words")] = None
+
+
 class Health(Reply):
     """The status of the service."""
 
     status: Literal["live", "ready"]
+    store: Annotated[
+        StoreHealth | None,
+        Field(description="contact to a remote store; absent for a store in a folder"),
+    ] = None
 
 
 class ServerMetadata(Reply):
