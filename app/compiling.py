@@ -201,7 +201,7 @@ def check_cache() -> None:
     """Log the cache directory of compiled kernels, unless it is the preferred directory."""
     if _FOLDER is None:
         _logger.warning(
-            "no directory for compiled kernels is usable, so each start compiles: %s", _PROBLEM
+            "each start compiles the kernels, because no cache directory is usable: %s", _PROBLEM
         )
     elif _PROBLEM:
         _logger.info("compiled kernels are stored in %s: %s", _FOLDER, _PROBLEM)
@@ -217,7 +217,7 @@ def progress() -> Iterator[None]:
     try:
         _wait(descriptor)
         if not (_FOLDER / "complete").exists():
-            _logger.info("compiling kernels (about a minute, once for this version)")
+            _logger.info("compiling kernels, which takes about a minute, once for this version")
         with event.install_listener("numba:compile", _Progress()):
             yield
         (_FOLDER / "complete").touch()
@@ -233,7 +233,7 @@ class _Progress(event.Listener):
         self._logged = float("-inf")
 
     def on_start(self, event: Any) -> None:
-        """Log the start of a compilation. Ignore functions of numba itself."""
+        """Log the start of a kernel's compilation. Ignore functions of numba itself."""
         loop = event.data["dispatcher"]
         if not any(loop is known for known in _LOOPS):
             return

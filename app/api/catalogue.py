@@ -1,4 +1,4 @@
-"""The problem types (RFC 9457) of the service."""
+"""The problem types (RFC 9457) of the service. Each has a name, a status, a title and a remedy."""
 
 from __future__ import annotations
 

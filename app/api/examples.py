@@ -67,9 +67,9 @@ REQUESTS: Final[dict[str, dict[str, Example]]] = {
     **{question.name: dict(question.examples) for question in QUESTIONS},
     **{f"{question.name}_batch": BATCH for question in QUESTIONS if question.has_batch},
     "move_alias": {
-        "promote": Example("move the alias to a version", {"model": "home@1.1.0"}),
+        "promote": Example("point the alias at a version", {"model": "home@1.1.0"}),
         "guarded": Example(
-            "move the alias only if it still refers to the expected version",
+            "change the alias only if it still points at the expected version",
             {"model": "home@1.1.0", "expected": "home@1.0.0"},
         ),
         "create": Example(

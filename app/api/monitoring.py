@@ -25,6 +25,6 @@ async def show_metrics(runtime: RuntimeDep) -> PlainTextResponse:
 
     docs/operations.md explains each metric.
     """
-    # The formatting of many series takes more than 10 ms, so it runs in a thread.
+    # The formatting runs in a thread, because it takes more than 10 ms for many series.
     text = await asyncio.to_thread(runtime.metrics.exposition)
     return PlainTextResponse(text, media_type=CONTENT_TYPE)

@@ -118,7 +118,7 @@ _EXAMPLES: Final = {
     ),
     "poses": Example("scenes around the objects that the robot sees", {**POSES, "seed": 7}),
     "context": Example(
-        "hidden units held on (GET /models/{name}/contexts lists the units)",
+        "active hidden units (GET /models/{name}/contexts lists all units)",
         {"context": {"h1": [0, 3]}, "seed": 7},
     ),
     "varied": Example(
