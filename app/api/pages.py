@@ -25,7 +25,7 @@ _BOARD: Final = "board.html"
 _VENDOR: Final = "vendor/"
 
 # Policy of the API documentation. Swagger UI and Redoc need inline styles. Redoc searches in a web
-# worker that it creates from a blob. The policy forbids inline scripts.
+# worker, which Redoc creates from a blob. The policy forbids inline scripts.
 _POLICY: Final = "; ".join(
     (
         "default-src 'none'",

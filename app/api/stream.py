@@ -71,7 +71,7 @@ async def plain_http() -> None:
 
 @router.websocket(PATH)
 async def stream(socket: WebSocket) -> None:
-    """Run one stream, or refuse its handshake."""
+    """Accept a WebSocket handshake and run the stream, or refuse the handshake."""
     streams: Streams = socket.app.state.streams
     refusal = _refusal(socket, streams)
     if refusal is not None:
@@ -200,7 +200,7 @@ class _Conversation:
     def _check_deadline(self, message: SceneMessage) -> None:
         most = self._settings.max_request_timeout_ms
         if (message.timeout_ms or 0) > most:
-            raise _unfit(f"must be at most {most}", "timeout_ms")
+            raise _unfit(f"`timeout_ms` must be at most {most} milliseconds", "timeout_ms")
 
     def _opened(self) -> Opened:
         settings = self._settings
@@ -277,7 +277,7 @@ def _parsed(event: Mapping[str, Any]) -> tuple[Any, str, int | None]:
 def _command(kind: str, value: Any) -> Command:
     form = COMMANDS.get(kind)
     if form is None:
-        raise _unfit("must be one of " + ", ".join(COMMANDS))
+        raise _unfit("`type` must be one of " + ", ".join(COMMANDS))
     try:
         return form.model_validate(value)
     except ValidationError as error:

@@ -381,13 +381,21 @@ def read_scene(
 
 def _check_sizes(request: SceneRequest, limits: Limits, faults: Faults) -> None:
     if len(request.objects) > limits.objects:
-        faults.add(Reason.INVALID, ("objects",), f"must have at most {limits.objects} objects")
+        faults.add(
+            Reason.INVALID, ("objects",), f"the scene must have at most {limits.objects} objects"
+        )
     if request.relations is None:
         if request.relations_complete:
-            faults.add(Reason.INVALID, ("relations_complete",), "requires relations")
+            faults.add(
+                Reason.INVALID,
+                ("relations_complete",),
+                "`relations_complete` requires the field `relations`",
+            )
     elif len(request.relations) > limits.relations:
         faults.add(
-            Reason.INVALID, ("relations",), f"must have at most {limits.relations} relations"
+            Reason.INVALID,
+            ("relations",),
+            f"the scene must have at most {limits.relations} relations",
         )
     if faults.found:
         faults.raise_any()

@@ -46,9 +46,9 @@ async def missing(request: Request, asked: MissingRequest) -> Answer:
     """
     model, reading = request.read(asked)
     faults = Faults()
-    # The default of `top_k` may exceed the size of the vocabulary. A value of the client must not.
+    # Only the default of `top_k` may exceed the size of the vocabulary.
     if asked.top_k > len(model.vocabulary) and "top_k" in asked.model_fields_set:
-        message = f"must be at most {len(model.vocabulary)}, the size of the model's vocabulary"
+        message = f"`top_k` must be at most {len(model.vocabulary)}, the size of the vocabulary"
         faults.add(Reason.INVALID, ("top_k",), message)
     candidates = at = None
     if asked.candidates is not None:

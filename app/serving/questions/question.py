@@ -18,7 +18,7 @@ RequestT = TypeVar("RequestT", bound=schemas.SceneRequest)
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A worked example for the documentation.
+    """An example request for the documentation.
 
     Attributes:
         summary: title of the example.
@@ -143,7 +143,7 @@ SCENES: Final[dict[str, Example]] = {
         {"objects": ["bed", "nigthstand", "big lamp"], "unknown_labels": "nearest"},
     ),
 }
-"""Valid examples for every question that needs a list of objects."""
+"""Valid example requests for every question that needs a list of objects."""
 
 REFUSED: Final[dict[str, Example]] = {
     "unknown-labels": Example(
@@ -166,7 +166,7 @@ REFUSED: Final[dict[str, Example]] = {
         "a model that does not exist", {**LABELS, "model": "nobody@9.9.9"}, "model-not-found"
     ),
 }
-"""Invalid examples for every question."""
+"""Invalid example requests for every question."""
 
 BATCH: Final[dict[str, Example]] = {
     "scenes": Example("two scenes", {"scenes": [LABELS, BEDROOM]}),
@@ -176,4 +176,4 @@ BATCH: Final[dict[str, Example]] = {
     ),
     "empty": Example("an empty list of scenes", {"scenes": []}, "invalid-request"),
 }
-"""Examples for every batch route."""
+"""Example requests for every batch route."""

@@ -116,7 +116,11 @@ def segment(name: str) -> str:
     # In a URL, the segments "." and ".." refer to folders, so they cannot be names.
     if not name or set(name) <= {"."}:
         raise InvalidRequestError(
-            [FieldError(pointer="#", message="a name must contain a character other than a dot")]
+            [
+                FieldError(
+                    pointer="#", message="a name must not be empty, and must not contain only dots"
+                )
+            ]
         )
     return quote(name, safe="")
 

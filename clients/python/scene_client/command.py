@@ -441,7 +441,7 @@ def _relation(text: str) -> dict[str, str]:
     if place is None:
         names = ", ".join(_RELATIONS)
         _fail(
-            f'--relation must be an object, a relation and an object, such as "lamp on-top desk"; '
+            f'--relation must be a subject, a relation and an object, as in "lamp on-top desk"; '
             f"relations: {names}",
             MEANINGLESS,
         )

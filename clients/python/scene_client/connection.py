@@ -65,7 +65,7 @@ class Options:
         if parts.query or parts.fragment:
             raise _refused("the URL must not have a query or a fragment")
         if self.retries < 0:
-            raise _refused("retries must not be negative")
+            raise _refused("the number of retries must not be negative")
         self.limit(self.timeout)
 
     def limit(self, timeout: float | None) -> float:

@@ -206,7 +206,8 @@ def _drawn(relation: Relation) -> tuple[str, str, str]:
 def _supporters(stated: Sequence[tuple[str, str, str]]) -> dict[str, tuple[str, str]]:
     """Return the lower object and the relation of each object with a relation on-top or above.
 
-    The keys of the dictionary are the upper objects. It has no relations that close a cycle.
+    The keys of the dictionary are the upper objects. The function ignores a relation that would
+    close a cycle.
     """
     below: dict[str, tuple[str, str]] = {}
     for wanted in ("on-top", "above"):

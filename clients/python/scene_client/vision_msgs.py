@@ -243,7 +243,9 @@ class _Reader:
             self.note(place, "no-hypothesis", "the detection has no hypothesis with a score")
             return None
         if not score > 0 or score < min_score:
-            self.note(place, "low-score", f"the score {score:g} is too low")
+            self.note(
+                place, "low-score", f"the score {score:g} is not positive or is below min_score"
+            )
             return None
         label = self.labels.get(class_id, class_id)
         if label is None:

@@ -1,4 +1,4 @@
-"""Answers of the four questions, and problems."""
+"""Schemas of the answers to the four questions, and of problems."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class ModelReference(Reply):
     name: str
     version: str
     variant: Annotated[str, Field(description="rbm, gbm or triway")]
-    digest: Annotated[str, Field(description="SHA-256 of the model's manifest")]
+    digest: Annotated[str, Field(description="SHA-256 digest of the model's manifest")]
 
 
 @dataclass(slots=True)

@@ -50,7 +50,7 @@ class GenerateRequest(SceneRequest):
 
 
 class GeneratedScene(Reply):
-    """A sampled scene: labels, relations between labels, and the hidden units that are on."""
+    """A sampled scene: labels, relations between the labels, and the hidden units that are on."""
 
     objects: list[str]
     relations: list[Relation]

@@ -31,7 +31,7 @@ class Anchor(Request):
 
 
 class MissingOptions(Request):
-    """Options of `/missing`, besides the scene."""
+    """The options of `/missing`, without the fields of the scene."""
 
     coverage: Annotated[
         Probability | None,

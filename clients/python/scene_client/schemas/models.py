@@ -151,7 +151,9 @@ class RefreshAnswer(Reply):
     """The changes made by a refresh."""
 
     request_id: str
-    default: Annotated[ModelReference, Field(description="target of the alias `default`")]
+    default: Annotated[
+        ModelReference, Field(description="model to which the alias `default` refers")
+    ]
     added: Annotated[list[str], Field(description="new versions, as `name@version`")]
     removed: Annotated[list[str], Field(description="versions no longer served, as `name@version`")]
     failures: Annotated[

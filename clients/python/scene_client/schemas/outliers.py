@@ -20,7 +20,7 @@ Sensitivity = Literal["low", "medium", "high"]
 
 
 class OutliersOptions(Request):
-    """Options of `/outliers`, besides the scene."""
+    """The options of `/outliers`, without the fields of the scene."""
 
     sensitivity: Annotated[
         Sensitivity,
@@ -75,7 +75,7 @@ class MisplacedRelation(ScoredRelation):
     """A relation in the form of the request, and the probability that the relation is false."""
 
     is_misplaced: Annotated[
-        bool, Field(description="true if `probability` reaches the threshold of `sensitivity`")
+        bool, Field(description="true if `probability` reaches the threshold for `sensitivity`")
     ] = False
 
 

@@ -29,7 +29,7 @@ class Pair(Request):
 
 
 class RelationsOptions(Request):
-    """Options of `/relations`, besides the scene."""
+    """The options of `/relations`, without the fields of the scene."""
 
     top_k: Annotated[int, Field(ge=1, le=4096, description="maximum number of relations")] = 20
     min_probability: Annotated[
@@ -96,7 +96,8 @@ class RelationsAnswer(Answer):
         Field(
             description="pairs whose observed relation differs from the expected relation, at most "
             "`top_k`. Given the rest of the scene, the expected relation has a probability of at "
-            "least one half. The pair with the largest ratio of the two probabilities is first"
+            "least one half. The first pair has the largest ratio of the probabilities of the "
+            "expected and the observed relation"
         ),
     ]
 

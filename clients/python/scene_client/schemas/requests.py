@@ -1,4 +1,4 @@
-"""Requests of the HTTP contract.
+"""Schemas of the requests to the service.
 
 Validation is strict: it refuses values of another type ("1" or true in place of 1), unknown fields,
 NaN and infinity. Every text and list has a maximum length. The service checks unknown labels,
@@ -176,7 +176,7 @@ class Relation(Request):
 
 
 class SceneRequest(Request):
-    """The scene that the robot observes, and the model to ask."""
+    """A request: the scene that the robot observes, and the model that answers."""
 
     objects: Annotated[
         list[SceneObject],
