@@ -109,7 +109,7 @@ _EXAMPLES: Final = {
     "intruder": Example("a toilet in a bedroom", WITH_TOILET),
     **SCENES,
     "misplaced": Example(
-        "stated relations, one of which may be wrong",
+        "relations that the request states and that may be wrong",
         {
             "objects": ["bed", "pillow", "nightstand"],
             "relations": [

@@ -123,7 +123,7 @@ _EXAMPLES: Final = {
         {"objects": ["chair", "chair", "desk"], "top_k": 10},
     ),
     "pairs": Example(
-        "one ordered pair, all eight relations",
+        "all eight relations of one ordered pair of objects",
         {
             **BEDROOM,
             "pairs": [{"subject": "lamp_1", "object": "bed"}],
