@@ -20,7 +20,8 @@ def main() -> int:
     """Serve until the process is stopped.
 
     Returns:
-        The exit status: 2 for invalid settings, otherwise the exit status of `serve`.
+        Exit status of the process: 2 for invalid settings, otherwise the exit status that `serve`
+        returns.
     """
     began = monotonic()
     try:
@@ -33,12 +34,13 @@ def main() -> int:
     return serve(settings, began)
 
 
-# Number of new objects that starts a garbage collection. Reference counting already frees the
-# about 200 containers of an answer. The default of 700 costs 4 to 8 % of a request's time.
+# Number of new objects after which Python starts a garbage collection. Python's default of 700
+# costs 4 to 8 % of a request's time. Reference counting already frees the containers of an answer
+# (about 200).
 _YOUNG = 10_000
 
 
-# Name and value of the option for mallopt(3).
+# The C function mallopt(3) takes these two numbers: option M_MMAP_THRESHOLD, limit in bytes.
 _M_MMAP_THRESHOLD, _LARGE = -3, 128 * 1024
 
 
@@ -56,10 +58,11 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
     """Bind sockets to all addresses of a host, without listening.
 
     Args:
-        host: name or address.
-        port: number of the port, or 0 for any free port.
+        host: host name or IP address to listen on.
+        port: TCP port to listen on. 0 means any free port.
         send_timeout: seconds after which Linux closes a connection whose client does not
-            acknowledge the bytes sent. On other systems only a proxy can limit this time.
+            acknowledge the bytes sent. On other operating systems, only a proxy can limit this
+            time.
 
     Raises:
         OSError: the host does not have a usable address, or the port is in use.
@@ -73,7 +76,7 @@ def _bind(host: str, port: int, send_timeout: float) -> list[socket.socket]:
             place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if family == socket.AF_INET6:
                 place.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            if hasattr(socket, "TCP_USER_TIMEOUT"):  # connections inherit the option
+            if hasattr(socket, "TCP_USER_TIMEOUT"):  # accepted connections inherit the option
                 milliseconds = int(send_timeout * 1e3)
                 place.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, milliseconds)
             place.bind(address)
@@ -109,19 +112,19 @@ def serve(settings: Settings, began: float) -> int:
         began: `time.monotonic()` at the start of the process.
 
     Returns:
-        The exit status: 0, or 3 if the service could not start.
+        Exit status of the process: 0, or 3 if the service could not start.
     """
     try:
         sockets = _bind(settings.host, settings.port, settings.client_timeout)
     except OSError as error:
         return _refuse_address(settings, error)
-    # Objects that the start creates stay in use. A search for garbage among them would take a fifth
-    # of the startup time. The runtime enables the garbage collector again after the start.
+    # The start creates only objects that stay in use. A search for garbage among them would take a
+    # fifth of the startup time. After the start, the runtime enables the garbage collector again.
     gc.disable()
     gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
     _give_back_what_is_large()
-    # A question needs only small matrix products. More threads would take cores from other
-    # processes. numpy reads this variable at its import.
+    # The service computes only small matrix products, so one thread of OpenBLAS is enough. More
+    # threads would take cores from other processes. numpy reads this variable at its import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from app.registry import StoreError
     from app.server import build

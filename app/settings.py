@@ -26,7 +26,7 @@ _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT
 def _is_installed(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ModuleNotFoundError:  # the parent package is missing
+    except ModuleNotFoundError:  # the parent package is not installed
         return False
 
 
@@ -39,17 +39,17 @@ def _words(value: object) -> object:
 
 
 LOOPBACK: Final = frozenset(("127.0.0.1", "localhost", "[::1]"))
-"""Names in a Host header that mean the machine itself."""
+"""Values of a Host header that mean the local machine."""
 
 _ANY_HOST: Final = "*"
 _HOST: Final = re.compile(r"[a-z0-9_]([a-z0-9._-]*[a-z0-9_])?")
 
 
 def _in_host_header(text: str) -> str:
-    """Return a name or an address in the spelling of a Host header.
+    """Convert a host name or an IP address to the spelling of a Host header.
 
     Raises:
-        ValueError: the text is neither a name nor an address.
+        ValueError: the text is neither a host name nor an IP address.
     """
     name = text.lower()
     if _HOST.fullmatch(name):
@@ -145,15 +145,15 @@ class Settings(BaseSettings):
     admin_key: Annotated[
         SecretStr | None,
         Field(
-            description="key of the admin routes, at least 16 characters; without it, these routes "
-            "refuse every request"
+            description="key of the administration routes, at least 16 characters; without a key, "
+            "these routes refuse every request"
         ),
     ] = None
     api_key: Annotated[
         SecretStr | None,
         Field(
-            description="key of all routes except health checks and pages; at least 16 characters, "
-            "different from the admin key; without it, these routes are open"
+            description="key of all routes except health checks and pages, at least 16 characters, "
+            "different from the admin key; without a key, these routes are open"
         ),
     ] = None
     cors_origins: Annotated[
@@ -161,7 +161,7 @@ class Settings(BaseSettings):
         NoDecode,
         BeforeValidator(_words),
         Field(
-            description="origins whose pages may use the service, separated by commas, for example "
+            description="web origins whose pages may use the service, separated by commas, such as "
             "`https://panel.example:8443`; none by default"
         ),
     ] = ()
@@ -170,8 +170,8 @@ class Settings(BaseSettings):
         NoDecode,
         BeforeValidator(_words),
         Field(
-            description="names and addresses that clients may use for this service, separated by "
-            "commas, without ports; `*` allows all; default: the names of this machine, and "
+            description="host names and addresses that clients may use for this service, separated "
+            "by commas, without ports; `*` allows all; default: the names of this machine, and "
             "SCENE_HOST if it is a single address"
         ),
     ] = ()
@@ -180,7 +180,7 @@ class Settings(BaseSettings):
         Field(
             ge=1,
             le=2**20,
-            description="maximum number of connections; beyond it, requests get a plain 503",
+            description="maximum number of connections; the service answers further ones with 503",
         ),
     ] = 1024
     max_body_bytes: Annotated[
@@ -212,7 +212,7 @@ class Settings(BaseSettings):
         Field(
             ge=256,
             le=2**20,
-            description="maximum number of scenes that wait for a model or are being computed",
+            description="maximum number of scenes per model that wait or are being computed",
         ),
     ] = 4096
     queue_requests: Annotated[
@@ -223,7 +223,7 @@ class Settings(BaseSettings):
         Field(
             ge=1,
             le=600_000,
-            description="deadline in milliseconds of requests without X-Request-Timeout-Ms",
+            description="time limit in milliseconds of a request without X-Request-Timeout-Ms",
         ),
     ] = 10_000
     max_request_timeout_ms: Annotated[
@@ -231,7 +231,7 @@ class Settings(BaseSettings):
         Field(
             ge=1,
             le=600_000,
-            description="maximum deadline in milliseconds that a client may choose",
+            description="maximum time limit in milliseconds that a client may choose",
         ),
     ] = 60_000
     max_streams: Annotated[
@@ -251,7 +251,12 @@ class Settings(BaseSettings):
         Field(ge=0, le=300, description="seconds from SIGTERM until the listening socket closes"),
     ] = 1.0
     drain_timeout: Annotated[
-        int, Field(ge=1, le=3600, description="seconds after that for requests in progress")
+        int,
+        Field(
+            ge=1,
+            le=3600,
+            description="maximum seconds for requests in progress after the socket closes",
+        ),
     ] = 25
     client_timeout: Annotated[
         float,
@@ -264,15 +269,18 @@ class Settings(BaseSettings):
         ),
     ] = 20
     retry_after: Annotated[
-        int, Field(ge=1, le=3600, description="seconds in the Retry-After header of 429 and 503")
+        int,
+        Field(
+            ge=1, le=3600, description="seconds in the Retry-After header of responses 429 and 503"
+        ),
     ] = 2
     metrics: Annotated[bool, Field(description="answer GET /metrics")] = True
     opentelemetry: Annotated[
         bool, Field(description="send traces to the collector in OTEL_EXPORTER_OTLP_ENDPOINT")
     ] = False
-    docs: Annotated[bool, Field(description="serve the board, /docs, /redoc and /openapi.json")] = (
-        True
-    )
+    docs: Annotated[
+        bool, Field(description="serve the scene editor, /docs, /redoc and /openapi.json")
+    ] = True
     root_path: Annotated[
         str, Field(description="path prefix that a reverse proxy strips", pattern=r"^(/[^/?#]+)*$")
     ] = ""
@@ -286,7 +294,7 @@ class Settings(BaseSettings):
 
     @property
     def secrets(self) -> list[str]:
-        """The configured keys. The log masks them."""
+        """The configured keys, which every log line masks."""
         return [key.get_secret_value() for key in (self.admin_key, self.api_key) if key]
 
     @property
@@ -373,7 +381,7 @@ class Settings(BaseSettings):
                 "SCENE_OPENTELEMETRY needs the packages of the dependency group telemetry "
                 "(pip install '.[telemetry]')"
             )
-        # Without an endpoint, the service would start but never send a trace.
+        # Without the URL of a collector, the service would start but never send a trace.
         if not any(map(os.environ.get, _ENDPOINTS)):
             raise ValueError(
                 f"SCENE_OPENTELEMETRY needs the URL of a collector: set {_ENDPOINTS[0]}"
@@ -386,7 +394,7 @@ class Settings(BaseSettings):
         if value is None:
             return None
         key = value.get_secret_value()
-        # The key must be a valid header value. An attacker could guess a short key.
+        # The key must be valid in an HTTP header. An attacker could guess a short key.
         if len(key) < 16 or not (key.isascii() and key.isprintable()) or " " in key:
             raise ValueError(
                 f"SCENE_{str(info.field_name).upper()} must have at least 16 printable ASCII "

@@ -1,4 +1,4 @@
-"""The runtime of the process: it holds the current snapshot of models and replaces it."""
+"""The runtime of the process. It contains the current snapshot of the models."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ T = TypeVar("T")
 
 _logger = logging.getLogger("app.serving")
 
-# Time in seconds that an administration request waits for another writer of the store.
+# Maximum time in seconds that an administration request waits for the lock of the store.
 _LOCK_TIMEOUT = 5.0
 
 # While a remote store is unreachable, the time between two polls doubles up to so many times.
 _MAX_DOUBLINGS = 4
 
-# Time in seconds after which the interpreter switches from a worker thread to the event loop. The
-# default of 5 ms would delay answers by a quarter of a robot's control cycle.
+# Time in seconds after which the interpreter switches from a worker thread to the event loop.
+# Python's default of 5 ms would delay answers by a quarter of a robot's control cycle (20 ms).
 _SWITCH_INTERVAL = 5e-4
 
 
@@ -61,7 +61,7 @@ def _counted(
     [Callable[Concatenate[Runtime, P], Awaitable[T]]],
     Callable[Concatenate[Runtime, P], Awaitable[T]],
 ]:
-    """Return a decorator for methods that change the served models. It counts their outcomes."""
+    """Return a decorator that counts the outcomes of a method that changes the served models."""
 
     def decorate(
         method: Callable[Concatenate[Runtime, P], Awaitable[T]],
@@ -85,7 +85,7 @@ def _counted(
 
 
 class Runtime:
-    """The runtime of the service, with the current snapshot of models.
+    """The runtime of the service. It contains the current snapshot of the models.
 
     Args:
         settings: settings of the service.
@@ -121,10 +121,10 @@ class Runtime:
 
     @property
     def models(self) -> ServedModels:
-        """The current snapshot.
+        """The current snapshot of the models.
 
         Raises:
-            NotReadyError: the models are not loaded yet.
+            NotReadyError: the service has not loaded the models yet.
         """
         if self._models is None:
             raise NotReadyError("The service is starting.")
@@ -137,12 +137,12 @@ class Runtime:
         record: Record | None = None,
         is_gone: Callable[[], Awaitable[bool]] | None = None,
     ) -> Request:
-        """Create a request that keeps the current snapshot until its end.
+        """Create a request that uses the current snapshot of the models until its end.
 
         Args:
-            deadline, is_gone: attributes of `Ticket`.
-            request_id: request id. Every answer contains it.
-            record: values for the log and the metrics.
+            deadline, is_gone: deadline and connection check of the request, as in `Ticket`.
+            request_id: id of the request. Every answer contains the id.
+            record: values of the request for the log and the metrics.
 
         Raises:
             NotReadyError: the models are not loaded yet.
@@ -163,7 +163,7 @@ class Runtime:
         return self.backlog.draining
 
     def check_ready(self) -> None:
-        """Check that the service accepts requests and its default model is usable.
+        """Check that the service accepts requests and that its default model is usable.
 
         Raises:
             NotReadyError: the default model is not usable, or the local copy of a remote store is
@@ -196,13 +196,13 @@ class Runtime:
     async def start(self) -> None:
         """Load, verify and warm up all versions in the store.
 
-        `models.failures` then contains the refused versions and aliases.
+        Afterwards, `models.failures` contains the refused versions and aliases.
         """
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self.metrics.started()
         check_cache()
-        # The models load on this thread. The service has no requests yet, and another thread would
-        # cost time and memory.
+        # The models load on this thread, because the service has no requests yet. Another thread
+        # would cost time and memory.
         self._serve(self._load(None))
         for failure in self.models.failures.values():
             _logger.error("%s: %s: %s", failure.subject, failure.reason, failure.detail)
@@ -210,23 +210,24 @@ class Runtime:
             self._polling = asyncio.create_task(self._follow())
 
     def stop(self) -> None:
-        """Stop the worker threads. Work that has not started is dropped."""
+        """Stop the worker threads and drop the computations that have not started."""
         if self._polling is not None:
             self._polling.cancel()
         self._threads.stop()
 
     @_counted("refresh")
     async def refresh(self, request_id: str) -> RefreshAnswer:
-        """Serve the current state of the store, or keep the served models.
+        """Load the current state of the store and serve it, or keep the served models.
 
-        The service refuses a state with a new failure, and a state without a usable default model.
+        The service refuses a state of the store with a new failure or without a usable default
+        model.
 
         Raises:
             RefreshRefusedError: the service refused the new state. The served models are unchanged.
-            NotReadyError: the models are not loaded yet.
+            NotReadyError: the service has not loaded the models yet.
         """
         async with self._changing:
-            # These sets contain only names, so the memory of the old snapshot can be freed.
+            # These sets contain only names, so Python can free the memory of the old snapshot.
             failed, served = set(self.models.failures), set(self.models.served)
             new = await self._take_over(lambda subject: subject == DEFAULT or subject not in failed)
             return RefreshAnswer(
@@ -243,8 +244,8 @@ class Runtime:
 
         Raises:
             RequestError: the name is not valid for an alias.
-            UnknownModelError: the model or version is not served.
-            ModelUnusableError: the version was refused.
+            UnknownModelError: the service does not serve the model or version.
+            ModelUnusableError: the service refused the version.
             AliasConflictError: the alias has another target than expected, or a model has the name
                 of the alias.
             StoreNotWritableError: this process cannot write to the store.
@@ -268,7 +269,7 @@ class Runtime:
             )
 
     async def _follow(self) -> None:
-        """Check the store regularly for changes by other processes, and serve these changes."""
+        """Check the store regularly for changes by other processes, and serve the new state."""
         while True:
             await asyncio.sleep(self._wait())
             try:
@@ -303,8 +304,8 @@ class Runtime:
     async def _take_over_changes(self) -> None:
         """Serve the changes in the store, if every usable version and alias stays usable.
 
-        If a new version fails, the service lists it as refused. The other changes still take
-        effect.
+        If a new version fails, the service lists this version as refused and serves the other
+        changes.
 
         Raises:
             RefreshRefusedError: a usable version or alias would become unusable. The served models
@@ -314,16 +315,16 @@ class Runtime:
             await self._take_over(self.models.usable.__contains__)
 
     async def _take_over(self, matters: Callable[[str], bool]) -> ServedModels:
-        """Load the store and serve it.
+        """Load the state of the store and serve it.
 
         Args:
-            matters: function that returns whether a failure of this subject makes the service
-                refuse the new state.
+            matters: function from the name of an unusable entry (``name@version``, an alias or
+                "store") to True, if this failure makes the service refuse the new state.
 
         Raises:
             RefreshRefusedError: the service refused the new state.
         """
-        # The load runs in a thread, so that the old snapshot answers in the meantime.
+        # `_load` runs in a thread, so that the event loop can answer from the old snapshot.
         new = await asyncio.to_thread(self._load, self.models)
         worse = [
             failure
@@ -344,7 +345,8 @@ class Runtime:
 
     def _load(self, previous: ServedModels | None) -> ServedModels:
         self._store.sync()
-        # The state is read before the files. So the next poll finds changes made during the load.
+        # Read the state before the files. So the next check of the store finds changes that other
+        # processes make during the load.
         self._seen = self._store.state()
         known = None if previous is None else previous.store
         with progress():
@@ -358,7 +360,7 @@ class Runtime:
             found = self.models.resolve(reference).reference
         except (ModelUnavailableError, NotReadyError):
             raise ModelUnusableError("The service refused to load this version.") from None
-        # If the reference is a name without version, the alias follows the newest version.
+        # If the reference is a name without a version, the alias follows the newest version.
         newest = reference == found.name
         return AliasTarget(name=found.name, version=None if newest else found.version)
 
@@ -372,7 +374,7 @@ def _expected(request: AliasRequest) -> AliasTarget | Literal["any"] | None:
     try:
         return AliasTarget(name=name, version=version if at else None)
     except ValueError:
-        raise AliasConflictError("The value of expected is not a model or version.") from None
+        raise AliasConflictError("`expected` is not the name of a model or version.") from None
 
 
 def _refusal(error: StoreError) -> Exception:
@@ -396,12 +398,13 @@ def _names(keys: Iterable[Key]) -> list[str]:
 
 
 def _settle_memory() -> None:
-    """Exclude long-lived objects from garbage collection.
+    """Exclude long-lived objects from garbage collection, and release unused memory.
 
-    A full collection stops every thread for tens of milliseconds. The function first unfreezes all
-    objects, because the collector never frees frozen reference cycles of a replaced snapshot. If
-    the C library supports it, the function returns unused memory (about 30 MB after the load) to
-    the operating system.
+    A full collection of all objects would stop every thread for tens of milliseconds. So the
+    function freezes the objects of the current snapshot. It first unfreezes all objects, because
+    the collector never frees frozen reference cycles of a replaced snapshot. At the end, the
+    function returns unused memory (about 30 MB after the load) to the operating system, if the C
+    library supports this.
     """
     gc.unfreeze()
     if gc.isenabled():
