@@ -143,10 +143,15 @@ def _conditions(
     sizes = {"h1": spec.H1, "h2": spec.H2}
     for layer, units in context.items():
         if not sizes.get(layer):
-            raise ValueError(f"the model has no layer {layer!r}")
+            raise ValueError(
+                f"the model has no layer {layer!r}; layers are h1, and h2 in two-layer models"
+            )
         for unit in units:
             if not 0 <= unit < sizes[layer]:
-                raise ValueError(f"unit {unit} of {layer} must be below {sizes[layer]}")
+                raise ValueError(
+                    f"unit {unit} of {layer} does not exist: a unit must be at least 0 and below "
+                    f"{sizes[layer]}"
+                )
     held = [np.unique(np.array(context.get(layer, ()), dtype=np.int64)) for layer in sizes]
     return Conditions(
         classes.classes,
