@@ -167,7 +167,7 @@ class Completions:
 def _contexts(weights: Weights, generator: np.random.Generator) -> Floats:
     """Draw hidden units h_f ~ p(h1 | v_f) for each of the N stored samples, (N, H1).
 
-    The units of a second layer, if the machine has one, are fixed at their mean-field means.
+    If the machine has a second layer, its units are fixed at their means by a mean-field iteration.
     """
     base = weights["c1"] + weights.scenes @ weights["W"]
     if weights.spec.C:

@@ -81,7 +81,7 @@ class ContextScorer:
 
     def __init__(self, W: Floats) -> None:
         if not np.isfinite(W).all():
-            raise ValueError("W must be finite")
+            raise ValueError("W contains NaN or infinity; all weights must be finite")
         self.V, self.H1 = W.shape
         self._W, self.group = W, group_size(W)
         if self.group:
@@ -138,8 +138,9 @@ def gains(x, exp_w, group, classes):
 
     Args:
         x: (M, H1) logits of the hidden units.
-        exp_w, group: attributes of `ContextScorer`.
-        classes: number of classes V.
+        exp_w: exp(W) in tiles; see `ContextScorer`.
+        group: maximum number of factors per product.
+        classes: number V of classes.
     """
     (tiles, units, width), M = exp_w.shape, len(x)
     found, off, on = np.empty((M, classes), np.float32), np.empty_like(x), np.empty_like(x)
@@ -179,7 +180,7 @@ def _gain(off, on, growth, group, product):
     Args:
         off, on: (H1,) sigmoid(-x) and sigmoid(x) of the logits x of the hidden units.
         growth: (H1,) e^W of the class.
-        group: attribute of `ContextScorer`.
+        group: maximum number of factors per product; see `ContextScorer`.
         product: (32,) buffer for intermediate products.
     """
     size, total = len(off), np.float32(0.0)
@@ -207,7 +208,7 @@ def gains_without(y, share, W, group):
         y: (H1,) logits of the hidden units.
         share: (n, H1) contribution of each class and its relations to y.
         W: (n, H1) weights between each class and the hidden units.
-        group: attribute of `ContextScorer`.
+        group: maximum number of factors per product; see `ContextScorer`.
     """
     found, growth = np.empty(len(W), np.float32), _exps(W)
     off, on, product = np.empty_like(y), np.empty_like(y), np.empty(_SIDE_BY_SIDE, np.float32)
@@ -228,8 +229,9 @@ def gains_without_others(y, share, W, rows, common, index, group):
         share: (n, H1) contribution of each class and its relations to y.
         W: (n, H1) weights between each class and the hidden units.
         rows: (N,) row of each class i in ``share`` and W.
-        common, index: results of `RelationUnits.common`.
-        group: attribute of `ContextScorer`.
+        common: (P, H1) contribution to y of the relations between two classes, for P pairs.
+        index: (n, n) row of each pair of classes in ``common``, or -1 for a pair without relations.
+        group: maximum number of factors per product; see `ContextScorer`.
     """
     n, size = share.shape
     found, both = np.zeros((len(rows), n), np.float32), np.empty_like(y)
@@ -264,7 +266,7 @@ def reasons_for_absent(y, share, W, group):
         y: (H1,) logits of the hidden units.
         share: (n, H1) contribution of each present class and its relations to y.
         W: (N, H1) weights between each absent class and the hidden units.
-        group: attribute of `ContextScorer`.
+        group: maximum number of factors per product; see `ContextScorer`.
     """
     n, growth = len(share), _exps(W)
     found, all_of = np.empty((len(W), n), np.float32), np.empty(len(W), np.float32)
@@ -340,7 +342,8 @@ def completed_log_odds(y, picked, against, most, usable, bias, W, exp_w, group):
         usable: (V,) bool, classes that a completion may add.
         bias: (V,) log-odds of each class without the hidden units.
         W: (V, H1) weights between classes and hidden units.
-        exp_w, group: attributes of `ContextScorer`.
+        exp_w: exp(W) in tiles; see `ContextScorer`.
+        group: maximum number of factors per product.
     """
     (V, size), M = W.shape, len(picked)
     completed, added = np.empty((M, size), np.float32), np.zeros((M, V), np.bool_)

@@ -48,10 +48,10 @@ def unit_terms(w, g, a, ends):
     """Return the logits of E units without the term U_e·h1, (E,), and the factors z_e (E, K).
 
     Args:
-        w: `relations.SharedArrays`.
+        w: weights of the units; see `relations.SharedArrays`.
         g: (A, K) weights of the factors z_e. The logit of unit e contains the product g[a_e]·z_e.
         a: (E,) indices of the relations.
-        ends: `relations.Ends` with arrays of shape (E,).
+        ends: subject and object classes of the relations; see `relations.Ends`.
     """
     S, O, s, o, n, residual = w.S, w.O, w.s, w.o, w.n, w.residual  # noqa: E741
     i, j, log_i, log_j = ends.i, ends.j, ends.log_i, ends.log_j
@@ -75,9 +75,9 @@ def pair_terms(w, first, ends, z, base):
     The function writes its results to z and base, for R relations of P pairs in each of B batches.
 
     Args:
-        w: `relations.SharedArrays`.
+        w: weights of the units; see `relations.SharedArrays`.
         first: index of the first of the R consecutive relations.
-        ends: `relations.Ends` with arrays of shape (B, P).
+        ends: subject and object classes of the pairs, (B, P); see `relations.Ends`.
         z: (B, K, P') output array for the factors z_e. P' is P plus padding.
         base: (B, R, P') output array for the terms without z_e.
     """
@@ -254,7 +254,8 @@ def normal_without_itself(y, U, base, slopes):
         y: (H1,) logits of h1.
         U: (E, H1) weights between the units and h1.
         base: (E,) logits of the units without the term U_e·h1.
-        slopes: (E,) slopes of the units; see `RelationUnits.fixed_point`.
+        slopes: (E,) factor slope_e with which each unit acts on y; see
+            `RelationUnits.fixed_point`.
     """
     mean, spread = np.empty(len(U), np.float32), np.empty(len(U), np.float32)
     rest, m = np.empty_like(y), np.empty_like(y)
@@ -285,7 +286,9 @@ def fixed_point(x, G, a, base, z, r, gate, sweeps):
     Args:
         x: (H1,) logits of h1 given the objects.
         G: (A, K, H1) shared weights. U_e is G[a_e]'z_e. If G is empty, z (E, H1) is the array U.
-        a, base, z: attributes of `relations.Units`.
+        a: (E,) indices of the relations.
+        base: (E,) logits of the units without the term U_e·h1.
+        z: (E, K) factors z_e of each unit.
         r: (E,) 1 if the relation holds, else 0.
         gate: (E,) product of the presence of subject and object class of each relation.
         sweeps: number of iterations.

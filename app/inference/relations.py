@@ -272,8 +272,10 @@ class RelationUnits(ABC):
 
             y = x + sum_e slope_e U_e,   slope_e = g_e (r_e - sigmoid(base_e + U_e·m))
 
+        The slope of a unit is the factor with which the observed relation acts on y.
+
         Returns:
-            The logits y (H1,), the units of the observed relations, and the slopes (E,).
+            The logits y (H1,), the units of the observed relations, and their slopes (E,).
         """
         units = self.select(given.a, ends)
         G, z = self.G, units.z
@@ -355,7 +357,7 @@ class RelationUnits(ABC):
             context: hidden units of the scene.
             a: (E,) indices of the relations.
             i, j: (E,) indices of the subject and object classes in the scene.
-            slopes: (E,) slopes of the relations; see `fixed_point`.
+            slopes: (E,) factor with which each relation acts on y; see `fixed_point`.
             shift: (A, n, n) value `shift` of `Between`, or an empty array.
         """
         units = self.select(a, context.ends(i, j))
@@ -452,7 +454,7 @@ class RelationUnits(ABC):
             units: E relation units.
             keys: (E,) key of each unit, or (2, E) for two keys per unit. Units with the key -1 are
                 ignored.
-            slopes: (E,) slopes of the units.
+            slopes: (E,) factor slope_e with which each unit acts on y; see `fixed_point`.
             size: number of keys. The keys are 0 to size - 1.
         """
         if not len(self.G):

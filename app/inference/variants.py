@@ -219,4 +219,4 @@ class MachineSpec:
         try:
             return cls(**values)
         except TypeError as error:
-            raise ValueError(f"incomplete machine spec: {error}") from error
+            raise ValueError(f"a machine spec lacks required fields: {error}") from error

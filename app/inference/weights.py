@@ -83,7 +83,10 @@ class Weights:
                 "must be from 0 to V - 1"
             )
         if (np.diff(self.triple_keys) <= 0).any():
-            raise ValueError("triples must be distinct and sorted by (a, i, j)")
+            raise ValueError(
+                "triples must be distinct and sorted by (a, i, j), but two rows are equal or not "
+                "sorted"
+            )
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.arrays[name]

@@ -42,10 +42,12 @@ def read_aliases(path: Path) -> dict[str, AliasTarget]:
     except FileNotFoundError:
         return {}
     except OSError as error:
-        raise StoreError("invalid_aliases", f"{path.name}: {cause(error)}") from None
+        raise StoreError("invalid_aliases", f"{path.name} cannot be read: {cause(error)}") from None
     except ValidationError as error:
         detail = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        raise StoreError("invalid_aliases", f"{path.name}: {detail['msg']}") from None
+        raise StoreError(
+            "invalid_aliases", f"{path.name} is not a valid table of aliases: {detail['msg']}"
+        ) from None
 
 
 def write_aliases(path: Path, aliases: Mapping[str, AliasTarget], *, prefix: str) -> None:

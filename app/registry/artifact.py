@@ -198,12 +198,14 @@ def _weights(manifest: Manifest, tensors: Mapping[str, NDArray[Any]]) -> Weights
         spec = MachineSpec.from_dict(dict(manifest.spec))
         expected = layout(spec)
     except (ValueError, TypeError) as error:
-        raise ArtifactError("invalid_manifest", f"spec: {error}") from None
+        raise ArtifactError(
+            "invalid_manifest", f"the manifest has an invalid spec: {error}"
+        ) from None
     require_equal(
         {name: (array.dtype.name, array.shape) for name, array in tensors.items()},
         {name: (_DTYPES[kind], shape) for name, (kind, shape) in expected.items()},
-        "the artifact holds",
-        f"a {spec.variant} of this spec needs",
+        "the artifact has",
+        f"but a {spec.variant} machine of this spec needs",
     )
     try:
         weights = Weights(spec, tensors)

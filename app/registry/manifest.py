@@ -100,7 +100,9 @@ class Manifest(Description):
         try:
             return cls.model_validate(members)
         except ValidationError as error:
-            raise ArtifactError("invalid_manifest", f"{MANIFEST}: {_first(error)}") from None
+            raise ArtifactError(
+                "invalid_manifest", f"{MANIFEST} has an invalid field: {_first(error)}"
+            ) from None
 
 
 def _parse(data: bytes, *, complete: bool) -> dict[str, Any]:

@@ -90,7 +90,7 @@ class Offsets:
                 )
         offsets = cls(**{name: tensors[f"{PREFIX}{name}"] for name in shapes})
         if complaint := offsets._complaint(A * V * V):
-            raise ArtifactError("invalid_tensor", f"offsets: {complaint}")
+            raise ArtifactError("invalid_tensor", f"the offset tensors are invalid: {complaint}")
         return offsets
 
     def _complaint(self, most: int) -> str | None:

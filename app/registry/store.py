@@ -96,7 +96,9 @@ class Store:
         try:
             found = [entry.name for entry in folder.iterdir() if not _is_unfinished(entry)]
         except OSError as error:
-            raise StoreError("unreadable", f"model '{name}': {cause(error)}") from None
+            raise StoreError(
+                "unreadable", f"the folder of model '{name}' cannot be read: {cause(error)}"
+            ) from None
         return tuple(sorted(filter(is_version, found), key=version_key))
 
     def latest(self, name: str) -> str:
@@ -207,7 +209,10 @@ class Store:
             folder = self._prepare_folder(name)
             place = folder / version
             if os.path.lexists(place):
-                raise StoreError("version_exists", f"{name}@{version} is already published")
+                raise StoreError(
+                    "version_exists",
+                    f"{name}@{version} is already published; publish under another version",
+                )
             temporary = folder / f"{_TEMPORARY}{version}-{token_hex(8)}"
             try:
                 write_artifact(temporary, description, state, storage_dtype=storage_dtype)
@@ -270,7 +275,7 @@ class Store:
         try:
             return sorted(entry.name for entry in self.root.iterdir() if is_name(entry.name))
         except OSError as error:
-            raise StoreError("unreadable", f"the store: {cause(error)}") from None
+            raise StoreError("unreadable", f"the store cannot be read: {cause(error)}") from None
 
     def _may_hold_versions(self, name: str) -> bool:
         try:
@@ -315,7 +320,9 @@ class Store:
                 self._clear_leftovers()
                 yield
         except OSError as error:
-            raise StoreError("not_writable", f"the store: {cause(error)}") from error
+            raise StoreError(
+                "not_writable", f"the store cannot be written: {cause(error)}"
+            ) from error
 
     def _clear_leftovers(self) -> None:
         folders = [self.root, *(self.root / name for name in self._folders())]

@@ -77,7 +77,7 @@ def unpack(data: bytes, entries: Mapping[str, TensorEntry]) -> dict[str, NDArray
         raise ArtifactError("not_safetensors", f"{WEIGHTS} is not a safetensors file") from None
     found = {name: (_DTYPES.get(e["dtype"]), tuple(e["shape"])) for name, e in stored.items()}
     promised = {name: (entry.dtype, entry.shape) for name, entry in entries.items()}
-    require_equal(found, promised, f"{WEIGHTS} holds", "the manifest says")
+    require_equal(found, promised, f"{WEIGHTS} has", "but the manifest has")
     return {
         name: _loaded(name, entry["data"], entries[name]) for name, entry in sorted(stored.items())
     }

@@ -59,7 +59,9 @@ def read_verified(directory: Path, max_weights_bytes: int = MAX_WEIGHTS_BYTES) -
     except FileNotFoundError:
         raise ArtifactError("missing_file", "the artifact's directory does not exist") from None
     except OSError as error:
-        raise ArtifactError("unreadable", f"the artifact's directory: {cause(error)}") from None
+        raise ArtifactError(
+            "unreadable", f"the artifact's directory cannot be read: {cause(error)}"
+        ) from None
     try:
         _require_no_other_file(folder)
         text = _read(folder, MANIFEST, MAX_MANIFEST_BYTES)
@@ -81,7 +83,9 @@ def _require_no_other_file(folder: int) -> None:
         with os.scandir(folder) as entries:
             extra = {entry.name for entry in entries} - {MANIFEST, WEIGHTS, CARD}
     except OSError as error:
-        raise ArtifactError("unreadable", f"the artifact's directory: {cause(error)}") from None
+        raise ArtifactError(
+            "unreadable", f"the artifact's directory cannot be read: {cause(error)}"
+        ) from None
     if extra:
         names = ", ".join(sorted(ascii(name) for name in extra))
         raise ArtifactError(
@@ -101,9 +105,9 @@ def _read(folder: int, name: str, limit: int) -> bytes:
     try:
         descriptor = os.open(name, flags, dir_fd=folder)
     except FileNotFoundError:
-        raise ArtifactError("missing_file", f"{name} is missing") from None
+        raise ArtifactError("missing_file", f"the artifact has no file {name}") from None
     except OSError as error:
-        raise ArtifactError("unreadable", f"{name}: {cause(error)}") from None
+        raise ArtifactError("unreadable", f"{name} cannot be read: {cause(error)}") from None
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
@@ -113,7 +117,7 @@ def _read(folder: int, name: str, limit: int) -> bytes:
             # size of the file plus 1, so that the buffer is not larger than needed.
             return file.read(min(status.st_size, limit) + 1)
     except OSError as error:
-        raise ArtifactError("unreadable", f"{name}: {cause(error)}") from None
+        raise ArtifactError("unreadable", f"{name} cannot be read: {cause(error)}") from None
     finally:
         os.close(descriptor)
 
@@ -124,5 +128,7 @@ def _read_checked(folder: int, name: str, entry: FileEntry, limit: int) -> bytes
     if len(data) < entry.bytes:
         raise ArtifactError("truncated", f"{name} has only {len(data)} of {entry.bytes} bytes")
     if hashlib.sha256(data).hexdigest() != entry.sha256:
-        raise ArtifactError("checksum_mismatch", f"{name} does not match its checksum")
+        raise ArtifactError(
+            "checksum_mismatch", f"{name} does not match its checksum: the file was altered"
+        )
     return data

@@ -139,8 +139,8 @@ def class_evidence(scene: Scene) -> ClassEvidence:
 
     Instances whose label is outside the vocabulary are left out. If the scene has poses,
     ``scene.poses`` defines which relations hold and which are observed. Otherwise, stated relations
-    are on. All other relations are off if ``scene.relations_complete`` is True. If it is False,
-    they are unobserved.
+    are on. Relations that are not stated are off if ``scene.relations_complete`` is True, and
+    unobserved otherwise.
     """
     kept = [i for i, thing in enumerate(scene.objects) if thing.class_index is not None]
     size = len(kept)

@@ -122,7 +122,7 @@ def derive_relations(
     if not _are_finite(points, extents, turns):
         raise ValueError("positions, sizes and yaws must not be infinite, and yaws must not be NaN")
     if not _are_positive(extents):
-        raise ValueError("sizes must be positive")
+        raise ValueError("sizes must be positive or NaN, but a size is zero or negative")
     holds = np.zeros((len(CANONICAL), n, n), dtype=np.bool_)
     observed = np.zeros_like(holds)
     _relate_all(points, extents, turns, horizontal, holds, observed)

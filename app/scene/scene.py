@@ -92,7 +92,9 @@ class Scene:
             raise ValueError("two objects of the scene have the same id; each id must be unique")
         if self.relations is None:
             if self.relations_complete:
-                raise ValueError("relations_complete is True, but the scene has no relations")
+                raise ValueError(
+                    "relations_complete is True, but relations is None; pass a tuple of relations"
+                )
         elif self.poses is None:
             for triple in self.relations:
                 relation, subject, anchor = triple
@@ -103,8 +105,8 @@ class Scene:
                 (relation, i, j), _ = clash
                 first, second = self.objects[i].id, self.objects[j].id
                 raise ValueError(
-                    f"{CANONICAL[relation]!r} is stated both for {first!r} to {second!r} and for "
-                    f"{second!r} to {first!r}"
+                    f"{CANONICAL[relation]!r} is stated from {first!r} to {second!r} and also from "
+                    f"{second!r} to {first!r}, but both cannot hold"
                 )
         if self.poses is not None and self.poses.holds.shape != (len(CANONICAL), n, n):
             raise ValueError(
@@ -120,7 +122,10 @@ class Scene:
         for end in (subject, anchor):
             if not 0 <= end < n:
                 raise ValueError(f"the object index {end} of a relation is not from 0 to {n - 1}")
-        raise ValueError(f"{self.objects[subject].id!r} cannot be {CANONICAL[relation]} itself")
+        raise ValueError(
+            f"{self.objects[subject].id!r} has the relation {CANONICAL[relation]} to itself; a "
+            "relation needs two different objects"
+        )
 
 
 def _are_finite(point: Sequence[float]) -> bool:

@@ -208,7 +208,7 @@ class Vocabulary:
                 reasons.
         """
         if not isinstance(values.get("objects"), list):
-            raise ValueError("a vocabulary must have a list 'objects'")
+            raise ValueError("a vocabulary must have the field 'objects' with a list of classes")
         rooms = values.get("room_types", [])
         if not isinstance(rooms, list):
             raise ValueError(f"'room_types' must be a list, not {rooms!r}")
