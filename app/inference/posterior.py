@@ -207,8 +207,8 @@ class ScenePosterior:
     ) -> tuple[Floats, Floats]:
         """Return the log-odds of relations between absent candidate classes and anchor classes.
 
-        Each candidate is judged as if it were present. Implications of observed relations are left
-        out.
+        Each candidate is judged as if it were present. The observed relations change the result
+        only through the hidden units h1.
 
         Args:
             candidates: (N,) indices of absent classes.

@@ -428,8 +428,8 @@ def _implied(known, weight, direct):
 def implied(weight, n, a, i, j):
     """Return how much the relations that hold change the logit of each relation, (2, n, n, A).
 
-    Index 0 of the first axis has the changes by all relations. Index 1 has the changes without
-    those by relations between the same two classes.
+    Index 0 of the first axis has the changes by all relations that hold. At index 1, relations
+    between the same two classes do not change each other's logits.
 
     Args:
         weight: (F, A) weights of the F features of relations that hold; see

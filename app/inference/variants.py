@@ -49,7 +49,7 @@ class RBM:
 
 
 class GBM(RBM):
-    """GBM: a machine with a second hidden layer and one relation unit for each training triple.
+    """GBM: a machine with two hidden layers and one relation unit for each training triple.
 
     The logit of unit t is ℓ_t = d_t + g_t v_i + g'_t v_j + U_t·h1.
     """

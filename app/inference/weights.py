@@ -60,7 +60,7 @@ class Weights:
             int32.
 
     Raises:
-        ValueError: an array is missing, unexpected or of a wrong shape. Or a triple has an invalid
+        ValueError: an array is missing, unexpected or of a wrong shape, a triple has an invalid
             index, or the triples are not distinct and sorted.
     """
 

@@ -120,10 +120,10 @@ def outliers(
     The score of an object is the log-odds of its class given the rest of the scene. The rest does
     not contain the instances of the class and their relations. So all instances of a class have the
     same score. Intruders are often common objects in the wrong room. The prior of an intruder is
-    therefore proportional to popularity^alpha, where popularity is the odds that a training scene
-    has the class. So the function subtracts alpha times the log of the popularity. Structural
-    classes, such as wall, always have the probability 0. A scene with few objects gives little
-    evidence, so its threshold is higher.
+    therefore proportional to popularity^alpha. The popularity of a class is the odds that a
+    training scene has the class. So the function subtracts alpha times the log of the popularity.
+    Structural classes, such as wall, always have the probability 0. A scene with few objects gives
+    little evidence, so its threshold is higher.
 
     Args:
         artifact: the model.

@@ -50,7 +50,7 @@ class RegistryError(Exception):
 
 
 class ArtifactError(RegistryError):
-    """An artifact is not usable.
+    """An artifact (the files of one model version) is invalid or cannot be read.
 
     Attributes:
         code: machine-readable kind of failure.

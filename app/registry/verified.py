@@ -51,8 +51,8 @@ def read_verified(directory: Path, max_weights_bytes: int = MAX_WEIGHTS_BYTES) -
             reads the file.
 
     Raises:
-        ArtifactError: a file is missing, unexpected, unreadable, too large, truncated or altered.
-            Or this release cannot read the manifest.
+        ArtifactError: a file is missing, unexpected, unreadable, too large, truncated or altered,
+            or this release cannot read the manifest.
     """
     try:
         folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)

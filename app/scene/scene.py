@@ -75,9 +75,9 @@ class Scene:
             relations were derived from poses.
 
     Raises:
-        ValueError: two objects have the same id, or a triple is invalid. Or `relations_complete` is
-            True without relations. A triple is invalid if it has an invalid index, relates an
-            object to itself or contradicts another triple.
+        ValueError: two objects have the same id, a triple is invalid, or `relations_complete` is
+            True although `relations` is None. A triple is invalid if it has an invalid index,
+            relates an object to itself or contradicts another triple.
     """
 
     objects: tuple[SceneObject, ...]
