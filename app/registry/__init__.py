@@ -1,4 +1,4 @@
-"""Published models: their file format, the model store, and verified snapshots of the store."""
+"""Published models: their file format, the store of models, and loaded snapshots of the store."""
 
 from app.registry.artifact import Artifact, load_artifact, write_artifact
 from app.registry.description import (
