@@ -281,7 +281,7 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.addmm(self.b, h1, self.W.T)
 
     def begin_independent(self, machine: BoltzmannMachine) -> None:
-        """Set this machine's relation weights to the weights of `machine` at beta = 0 (`scaled`)."""
+        """Set the relation weights to those of `machine.scaled(beta=0)`."""
 
     def relation_log_partition(self) -> float:
         """Return the contribution of the relation units to log Z at beta = 0 (`scaled`)."""

@@ -121,7 +121,7 @@ class RBM(BoltzmannMachine):
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Multiply every weight by beta. With a `base`, d and b are interpolated with its values."""
+        """Multiply every weight by beta; with a `base`, interpolate the biases d and b instead."""
         return scale(self, beta, base, keep=("b", "d"))
 
 
