@@ -199,7 +199,7 @@ class _Shown:
         listed: number of listed classes.
         share: share of listed classes as text, such as "75 %".
         source: index of the data source of the scene.
-        weight: weight of the scene. A near-duplicate has a lower weight.
+        weight: number of scenes of the data source that this sampled scene represents.
     """
 
     closed: Floats
@@ -241,7 +241,7 @@ def fit_coverage(
 def _choose_coverage(cases: Sequence[_Shown]) -> tuple[float, float]:
     """Return the coverage and the coverage weight with the best MRR of hidden classes.
 
-    On nearly complete lists, their MRR must be at most `_COMPLETE_LOSS` below the best MRR.
+    On nearly complete lists, their MRR must be at most `_COMPLETE_LOSS` below the MRR of weight 0.
     """
     nearly = [[case for case in cases if case.share == share] for share in _NEARLY_COMPLETE]
     least = [_mrr(some, 0.5, 0.0) - _COMPLETE_LOSS for some in nearly]
