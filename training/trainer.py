@@ -303,8 +303,8 @@ class Trainer:
         finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
         if not math.isfinite(loss) or not finite:
             raise FloatingPointError(
-                f"the training diverged in epoch {number}, with a loss of {loss}: lower "
-                "training.learning_rate"
+                f"the training diverged in epoch {number}, with a loss of {loss}: lower the "
+                "learning rate (training.learning_rate)"
             )
         self._close_epoch(number, loss, began)
 
