@@ -148,7 +148,10 @@ def subset(scenes: SceneTensors, index: Tensor) -> SceneTensors:
 
 
 def relation_units(machine: BoltzmannMachine, batch: Batch) -> tuple[Edges, Tensor, Tensor]:
-    """Return the relations of a batch as (edges, r, observed), in the layout of the machine."""
+    """Return the relations of a batch in the layout of the machine.
+
+    The result is (edges, r, observed): layout, values and observed flags of the relation units.
+    """
     return machine.lay_out(batch.classes, batch.counts, batch.holds, batch.observed)
 
 

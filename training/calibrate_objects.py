@@ -140,7 +140,7 @@ def calibrate_objects(
 
 
 def recalibrated(artifact: Artifact, **entries: Any) -> Artifact:
-    """Return a copy of the model with some entries of its calibration replaced."""
+    """Return a copy of the model in which some entries of the calibration are replaced."""
     return replace(artifact, calibration=artifact.calibration.model_copy(update=entries))
 
 

@@ -129,7 +129,10 @@ class ObjectiveConfig(_Section):
 
 
 class ObjectsConfig(_Section):
-    """The first training phase: objects only, by persistent Gibbs chains (local form)."""
+    """The first training phase: objects only, by persistent Gibbs chains.
+
+    The phase needs a machine of the local form (`training.machines.machine`).
+    """
 
     epochs: int = Field(default=0, ge=0, description="passes over the scenes; 0 skips the phase")
     learning_rate: float = Field(default=0.2, gt=0, description="initial rate; falls to 0")
@@ -138,7 +141,10 @@ class ObjectsConfig(_Section):
 
 
 class PolishConfig(_Section):
-    """The last training phase: it fine-tunes the weights of objects (local form)."""
+    """The last training phase, which fine-tunes the weights of objects by persistent chains.
+
+    The phase needs a machine of the local form (`training.machines.machine`).
+    """
 
     updates: int = Field(default=0, ge=0)
     chains: int = Field(default=512, ge=1)

@@ -1,6 +1,7 @@
 """Train the object weights of a machine by maximum likelihood with persistent Gibbs chains.
 
-In the local form, the sum over relations is 1, so the gradient of log p(v) is free of relations:
+In the local form of the energy (`training.machines.machine`), the sum over relations is 1. The
+gradient of log p(v) is therefore independent of relations:
 
     d log p(v) / dW = v' E[h1 | v] - E_model[v' h1]
 
@@ -81,7 +82,7 @@ def fit_objects(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> None:
-    """Train b, c1, c2, W, J and Q of a machine of the local form, in place.
+    """Train the object weights b, c1, c2, W, J and Q of a machine of the local form, in place.
 
     Args:
         train: training scenes. Scenes with incomplete object lists are left out.

@@ -9,8 +9,9 @@ variance s for each pair of classes:
 
 All pairs of classes share mu, kappa, alpha and beta. Training alternates between these parameters,
 by maximum likelihood over all pairs, and the class effects u and v. Given all these values, the
-distribution of the offset of a pair has a closed form. For a frequent pair, it depends mainly on
-the data of the pair. For a rare pair, it depends mainly on the two classes and the relation.
+distribution of the offset of a pair has a closed form. The distribution of a frequent pair depends
+mainly on the data of the pair. The distribution of a rare pair depends mainly on the two classes
+and the relation.
 `docs/decisions/offsets.md` describes the alternatives.
 """
 

@@ -158,7 +158,9 @@ class Baseline(Generic[Score]):
                 f"{tuple(structure.shape)}"
             )
         if not train.v.any():
-            raise ValueError(f"the {len(train)} training scenes contain no objects")
+            raise ValueError(
+                f"the {len(train)} training scenes contain no objects; a baseline needs objects"
+            )
         trials: list[Trial] = []
         chosen: list[Score] = []
         highest = -math.inf

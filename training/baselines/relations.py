@@ -56,7 +56,10 @@ def count_triples(scenes: SceneTensors, structure: Tensor) -> TripleCounts:
     V = scenes.v.shape[1]
     related = [scene.evidence for scene in scenes.scenes if scene.evidence.observed.any()]
     if not related:
-        raise ValueError(f"the {len(scenes)} training scenes contain no observed relation")
+        raise ValueError(
+            f"the {len(scenes)} training scenes contain no observed relation; this baseline needs "
+            "annotated relations"
+        )
     A = related[0].holds.shape[0]
     held = np.zeros((A, V, V), dtype=np.float32)
     together = np.zeros((V, V), dtype=np.float32)

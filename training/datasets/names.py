@@ -53,7 +53,9 @@ class Names:
                         raise ValueError(f"{title}: {other!r} names both {first!r} and {name!r}")
         for name in (*self.base, *self.household):
             if (other := self.canonical(name)) != name:
-                raise ValueError(f"the base class {name!r} is an alias of {other!r}")
+                raise ValueError(
+                    f"the base class {name!r} is an alias of {other!r}: remove it from `base`"
+                )
         for name, kinds in self.kinds.items():
             for kind in (name, *kinds):
                 if (other := self.canonical(kind)) != kind:

@@ -28,7 +28,8 @@ SOURCE: Final = "placing_priors"
 
 # Names of sources that list places of objects: VirtualHome, AI2-THOR and TidyBot.
 PLACES: Final = frozenset({"virtualhome_placing", "ithor_receptacles", "tidybot"})
-# Names of all sources. The last three contain locations, votes and counts of parts.
+# Accepted values of the column ``source``. The three values after `PLACES` mean tables of
+# locations, of votes and of part counts.
 _SOURCES: Final = PLACES | {"conceptnet_atlocation", "housekeep_votes", "vg80k_partof_counts"}
 
 
@@ -80,6 +81,8 @@ def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
             if tuple(values) != COLUMNS:
                 raise DatasetError(path, where, f"must name the columns {', '.join(COLUMNS)}")
         elif len(values) != len(COLUMNS):
-            raise DatasetError(path, where, f"has {len(values)} columns, not {len(COLUMNS)}")
+            raise DatasetError(
+                path, where, f"the row has {len(values)} columns, not {len(COLUMNS)}"
+            )
         else:
             yield where, values

@@ -120,7 +120,8 @@ class AnnotatedScene:
         for thing in self.objects:
             if thing.supported_by is not None and thing.supported_by not in ids:
                 raise ValueError(
-                    f"supported_by of {thing.id!r} is {thing.supported_by!r}, which is no object"
+                    f"supported_by of {thing.id!r} is {thing.supported_by!r}, which is no object "
+                    "of the scene"
                 )
         for subject, relation, anchor in (*(self.relations or ()), *self.false_relations):
             if relation not in RELATIONS:

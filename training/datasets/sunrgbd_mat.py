@@ -73,7 +73,7 @@ def _load(path: Path) -> Any:
     except (OSError, ValueError, TypeError, NotImplementedError, MatReadError) as error:
         raise DatasetError(path, "", f"is not a MATLAB 5 file: {error}") from error
     if "SUNRGBDMeta" not in content:
-        raise DatasetError(path, "", "lacks the variable SUNRGBDMeta")
+        raise DatasetError(path, "", "the file lacks the variable SUNRGBDMeta of SUN RGB-D")
     return content["SUNRGBDMeta"]
 
 

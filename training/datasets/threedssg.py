@@ -100,7 +100,7 @@ def _rooms(path: Path) -> dict[str, str]:
     rooms: dict[str, str] = {}
     entries = load_json(path)
     if not isinstance(entries, list):
-        raise DatasetError(path, "", "must be a list of reference scans")
+        raise DatasetError(path, "", "the file must contain a list of reference scans")
     for number, entry in enumerate(entries):
         where = f"[{number}]"
         reference = take(path, where, entry, "reference", str)

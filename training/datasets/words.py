@@ -109,16 +109,16 @@ def read_word_vectors(path: Path) -> WordVectors:
         raise DatasetError(path, "", f"cannot be read: {error}") from error
     words, vectors, scale = (arrays[name] for name in _MEMBERS)
     if words.ndim != 1 or words.dtype.kind != "U" or not 0 < len(words) <= MAX_WORDS:
-        raise DatasetError(path, "words", f"must be 1 to {MAX_WORDS} strings")
+        raise DatasetError(path, "words", f"must be 1 to {MAX_WORDS} strings in one dimension")
     if vectors.dtype != np.int8 or vectors.ndim != 2 or len(vectors) != len(words):
-        raise DatasetError(path, "vectors", f"must be {len(words)} rows of int8")
+        raise DatasetError(path, "vectors", f"must be {len(words)} rows of int8, one per word")
     if not vectors.shape[1]:
         raise DatasetError(path, "vectors", "must have at least one column")
     if scale.shape != () or scale.dtype.kind != "f" or not 0 < float(scale) < np.inf:
         raise DatasetError(path, "scale", "must be one positive number")
     names = tuple(word.casefold() for word in words.tolist())
     if len(set(names)) < len(names):
-        raise DatasetError(path, "words", "contains a word twice")
+        raise DatasetError(path, "words", "contains a word twice; words must be distinct")
     return WordVectors(names, vectors, float(scale))
 
 
@@ -132,7 +132,7 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
     with archive.open(f"{name}.npy") as file:
         version = npy.read_magic(file)
         if version not in ((1, 0), (2, 0)):
-            raise DatasetError(path, name, f"has the unsupported format version {version}")
+            raise DatasetError(path, name, f"has the unsupported .npy version {version}")
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, dtype = read(file)
         size = dtype.itemsize

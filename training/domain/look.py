@@ -78,7 +78,7 @@ def look(scenes: Sequence[AnnotatedScene], names: Names) -> Facts:
         ValueError: the list of scenes is empty.
     """
     if not scenes:
-        raise ValueError("the list of scenes is empty; pass at least one scene")
+        raise ValueError("there are no scenes to analyse; pass at least one scene")
     sizes = [len(scene.objects) for scene in scenes]
     rooms = Counter(
         room for scene in scenes if (room := names.canonical_room(scene.room_type)) is not None

@@ -47,7 +47,7 @@ class Edges(ABC):
 
     @abstractmethod
     def ends_present(self, v: Tensor) -> Tensor:
-        """Return (..., B, E) floats: 1 where both ends of a unit are present in v (..., B, V)."""
+        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class TripleEdges(Edges):
         return self
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """Return 1 where both classes of a unit are present, else 0, (..., scenes, units)."""
+        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
         present: Tensor = v[..., self.subject[0]] * v[..., self.object[0]] * self.valid
         return present
 
@@ -143,7 +143,7 @@ class PairEdges(Edges):
         return self._flat(pairs.unsqueeze(1))
 
     def ends_present(self, v: Tensor) -> Tensor:
-        """Return (..., B, E) floats: 1 where both ends of a unit are present in v (..., B, V)."""
+        """Return 1 where both classes of a unit are present in v, else 0, (..., scenes, units)."""
         lead = v.shape[:-1]
         subject = v.gather(-1, self.subjects.expand(*lead, -1)) * self.valid_subjects
         object_ = v.gather(-1, self.objects.expand(*lead, -1)) * self.valid_objects

@@ -4,6 +4,7 @@
                    - sum_t r_t (d_t + g_t v_i + g'_t v_j + U_t·h1)
 
 The sum runs over the triples t = (relation a, subject class i, object class j) seen in training.
+This is the seed form of the energy. `training.machines.machine` also defines the local form.
 """
 
 from __future__ import annotations
@@ -62,10 +63,11 @@ class GBM(RBM):
         return bernoulli(logits.sigmoid_(), generator)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return the change of candidate i's log-odds by its unobserved relations, (..., B, N).
+        """Return the part of each candidate's log-odds that comes from its unobserved relations.
 
-        In the seed form, the change is the sum of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0)
-        over the relations of i. In the local form, the change is 0.
+        The result has the shape (..., scenes, candidates). In the seed form, the part of candidate
+        i is the sum of softplus(ℓ at v_i = 1) - softplus(ℓ at v_i = 0) over the relations of i. In
+        the local form, the part is 0.
         """
         if not self.relations_act:
             return super().attraction(v, h1, edges, candidates)

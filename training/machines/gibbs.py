@@ -44,9 +44,13 @@ _PRESENT = 0.12
 
 @dataclass(frozen=True)
 class State:
-    """The state of B Gibbs chains: v (B, V), h1 (B, H1), h2 (B, H2) and relations r (B, E).
+    """The state of several Gibbs chains.
 
-    `edges` contains the layout of the E relation units in r.
+    Attributes:
+        v: presence of objects, (chains, classes).
+        h1, h2: hidden units of each layer, (chains, hidden units).
+        r: values of the relation units, (chains, units).
+        edges: layout of the relation units in r.
     """
 
     v: Tensor
@@ -84,7 +88,7 @@ class Clamp:
 
     @property
     def relations(self) -> tuple[Edges, Tensor, Tensor] | None:
-        """The tuple (edges, r, observed), or None if the clamp has no observed relations."""
+        """Layout, values and observed flags of the observed relations, or None without them."""
         if self.edges is None or self.r is None or self.observed is None:
             return None
         return self.edges, self.r, self.observed

@@ -4,7 +4,8 @@
     relation  log p(r_e = 1 | rest) - log p(r_e = 0 | rest)
 
 In the first formula, all relations of object i are unobserved. In the second formula, relation e is
-unobserved. "rest" means all other observed units of the scene (`Evidence`).
+unobserved. "rest" means all other observed units of the scene (`Evidence`). The energy has two
+forms, seed and local, with different formulas (`training.machines.machine`).
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from training.machines.mean_field import Evidence, mean_field
 
 
 class _ContextGain(torch.autograd.Function):
-    """Compute G[b,i] = sum_k [softplus(x_bk + W_ik) - softplus(x_bk)] without a (B, V, H1) tensor.
+    """Compute G[b,i] = sum_k [softplus(x_bk + W_ik) - softplus(x_bk)] for scene b and class i.
 
-    Each term is computed as log(1 + sigmoid(x)(exp(W) - 1)), which needs only one logarithm. All
-    scenes share exp(W). The backward pass recomputes the terms scene by scene to save memory: it
-    needs a block of (V, H1) numbers.
+    A tensor of shape (scenes, classes, hidden units) would be too large, so the function computes
+    the sum scene by scene. Each term is log(1 + sigmoid(x)(exp(W) - 1)), which needs only one
+    logarithm. All scenes share exp(W). To save memory, the backward pass computes the terms again.
     """
 
     @staticmethod

@@ -16,8 +16,7 @@ Both forms have the same p(r | v, h1). In the local form, unobserved relations h
 other units. The seed form is the energy of the paper. A relation that is summed out in the seed
 form raises the probability of its two objects; the weight κ (0 in the paper) compensates for this.
 
-Tensor dimensions: first samples ("..."), then B scenes, then units. Sizes: V classes, A relations,
-E relation units, H1 and H2 hidden units, N candidates.
+Tensor dimensions: "..." stands for samples. They come first, then scenes, then units.
 """
 
 from __future__ import annotations
@@ -137,70 +136,79 @@ class BoltzmannMachine(nn.Module, ABC):
         """Find the machine's unit for each relation in `pairs`.
 
         Returns:
-            The units of the machine; the index of the unit of each relation, (B, A·n·m); and bool,
-            (B, A·n·m), False if the machine has no unit for the relation. The index is then
-            arbitrary.
+            Three values: the units of the machine, the index of the unit of each relation, and True
+            where the machine has a unit for the relation. The last two have the shape (scenes,
+            relations of `pairs`). Where the last value is False, the index is arbitrary.
         """
 
     @abstractmethod
     def lay_out(
         self, classes: Tensor, counts: Tensor, holds: Tensor, observed: Tensor
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relations between classes as (edges, r, observed) in this machine's layout.
+        """Return the relations between classes in the layout of this machine.
 
+        The result is (edges, r, observed): layout, values and observed flags of the relation units.
         In an RBM or GBM, the units of absent classes are 0. They count as observed if the scene has
         any annotated relation.
 
         Args:
-            classes, counts: class indices and numbers of instances, (B, n), as in `edges`.
-            holds: values of the relations between the classes, (B, A, n, n).
-            observed: True where the relation is observed, (B, A, n, n).
+            classes, counts: class indices and numbers of instances, (scenes, n), as in `edges`.
+            holds: values of the relations between the classes, (scenes, relations, n, n).
+            observed: True where the relation is observed, (scenes, relations, n, n).
         """
 
     @abstractmethod
     def open_units(
         self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
     ) -> tuple[Edges, Tensor, Tensor]:
-        """Return the relation units that can be 1 given the objects v, as (edges, r, observed).
+        """Return the relation units that can be 1 given the objects v.
+
+        The result is (edges, r, observed): layout, values and observed flags of the relation units.
 
         Args:
-            v: presence of objects, (B, V).
+            v: presence of objects, (scenes, classes).
             given: (edges, r, observed) of observed relations. The result keeps their values in r.
         """
 
     @abstractmethod
     def gate(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return 1 for each unit that can be 1 given the objects v, else 0, (..., B, E)."""
+        """Return the gate of each unit, (..., scenes, units).
+
+        The gate is 1 if the unit can be 1 given the objects v, else 0.
+        """
 
     @abstractmethod
     def relation_logits(self, edges: Edges, v: Tensor, h1: Tensor) -> Tensor:
-        """Return the logit ℓ_e(v, h1) of each relation unit e, (..., B, E).
+        """Return the logit ℓ_e(v, h1) of each relation unit e, (..., scenes, units).
 
         Args:
-            h1: binary states or means of the hidden units, (..., B, H1).
+            h1: binary states or means of the hidden units, (..., scenes, hidden units).
         """
 
     @abstractmethod
     def hidden_input(self, edges: Edges, weight: Tensor) -> Tensor:
-        """Return sum_e weight_e U_e, (..., B, H1): the relations' input to the hidden units h1.
+        """Return sum_e weight_e U_e, the input of relations to h1, (..., scenes, hidden units).
 
         Args:
-            weight: factor of each relation unit, (..., B, E).
+            weight: factor of each relation unit, (..., scenes, units).
         """
 
     def linear_relations(self, edges: Edges, v: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sum_e r_e ℓ_e(v, 0), (..., B), and sum_e r_e U_e, (..., B, H1)."""
+        """Return sum_e r_e ℓ_e(v, 0) and sum_e r_e U_e over relation units e.
+
+        The shapes are (..., scenes) and (..., scenes, hidden units).
+        """
         bare = self.relation_logits(edges, v, v.new_zeros(*v.shape[:-1], self.spec.H1))
         return (r * bare).sum(-1), self.hidden_input(edges, r)
 
     def implied(self, edges: Edges, given: Tensor, h1: Tensor, *, apart: bool = False) -> Tensor:
-        """Return the change of each relation logit due to the given relations, (B, E).
+        """Return the change of each relation logit due to the given relations, (scenes, units).
 
         The change is zero in a machine without implication weights (`training.machines.triway`).
 
         Args:
-            given: given relations, (B, E). 1 means that the relation holds.
-            h1: means of the hidden units given the objects, (B, H1).
+            given: given relations, (scenes, units). 1 means that the relation holds.
+            h1: means of the hidden units given the objects, (scenes, hidden units).
             apart: True leaves out the effects between relations of the same two classes.
         """
         del edges, h1, apart
@@ -208,9 +216,9 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return the weights U_e between each relation unit and h1, (B or 1, E, H1).
+        """Return the weights U_e between each relation unit e and the hidden units h1.
 
-        The result is large, so pass only a few units.
+        The result has the shape (scenes or 1, units, hidden units). It is large, so pass few units.
         """
 
     @abstractmethod
@@ -218,26 +226,28 @@ class BoltzmannMachine(nn.Module, ABC):
         """Return the part of each candidate's log-odds that comes from its unobserved relations.
 
         Args:
-            v: presence of objects, (..., B, V). Each candidate counts as absent.
-            h1: hidden units, (..., B, H1).
+            v: presence of objects, (..., scenes, classes). Each candidate counts as absent.
+            h1: hidden units, (..., scenes, hidden units).
             edges: relation units of the scene. The units of a candidate are unobserved.
-            candidates: class indices, (B or 1, N) int64.
+            candidates: class indices, (scenes or 1, candidates) int64.
 
         Returns:
-            Change of the log-odds of candidate i, (..., B, N). The change is log sum_{R_i} exp(-E)
-            at v_i = 1 minus log sum_{R_i} exp(-E) at v_i = 0, given h1. R_i are the relations of i.
-            The part b_i + W_i·h1 is left out.
+            Part of the log-odds of each candidate i, (..., scenes, candidates). The part is
+            log sum_{R_i} exp(-E) at v_i = 1 minus log sum_{R_i} exp(-E) at v_i = 0, given h1. R_i
+            are the relations of i. The terms b_i + W_i·h1 are left out.
         """
 
     @abstractmethod
     def between(self, edges: Edges, values: Tensor, classes: Tensor) -> Tensor:
-        """Return values of relation units, (B, E), as a table over pairs of classes, (B, A, n, n).
+        """Return values of relation units as a table over pairs of n classes.
 
-        The value is -inf for a relation without a unit.
+        The table has the shape (scenes, relations, n, n). The value of a relation without a unit is
+        -inf.
 
         Args:
             edges: the relation units between `classes`.
-            classes: class indices, (B, n) int64. Padding is -1.
+            values: values of the relation units, (scenes, units).
+            classes: class indices, (scenes, n) int64. Padding is -1.
         """
 
     @property
@@ -265,7 +275,7 @@ class BoltzmannMachine(nn.Module, ABC):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """Sample the objects v given the hidden units h1, (B, V); see `gibbs`.
+        """Sample the objects v given the hidden units h1, (scenes, classes); see `gibbs`.
 
         In some forms of the energy, v also depends on the relations r.
 
@@ -298,10 +308,12 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- the relation part ----------------------------------------------------------------------
 
     def relation_term(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Return each relation's part of log sum_{unobserved r} exp(-E), given h1, (..., B, E).
+        """Return the term of each relation unit in log sum_{unobserved r} exp(-E), given h1.
+
+        The result has the shape (..., scenes, units).
 
         Args:
-            logits, gate: logit ℓ_e and gate of each relation unit, (..., B, E).
+            logits, gate: logit ℓ_e and gate of each relation unit, (..., scenes, units).
             r: values of the observed relations. Values of unobserved relations are ignored.
             observed: bool, broadcastable to `logits`.
         """
@@ -311,7 +323,7 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.where(observed, r * logits, summed) * gate
 
     def relation_slope(self, logits: Tensor, gate: Tensor, r: Tensor, observed: Tensor) -> Tensor:
-        """Return the derivative of `relation_term` with respect to the logit, (..., B, E)."""
+        """Return the derivative of `relation_term` by the logit ℓ_e, (..., scenes, units)."""
         mean = logits.sigmoid()
         if not self.relations_act:
             return torch.where(observed, r - mean, 0.0) * gate
@@ -320,10 +332,10 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- energies -------------------------------------------------------------------------------
 
     def context_bias(self, room: Tensor | None) -> Tensor:
-        """Return the bias c1 + Q[t] of the hidden units, (B or 1, H1).
+        """Return the bias c1 + Q[t] of the hidden units, (scenes or 1, hidden units).
 
         Args:
-            room: index t of the room type of each scene, (B,) int64. -1 means unknown.
+            room: index t of the room type of each scene, (scenes,) int64. -1 means unknown.
         """
         if room is None or not self.spec.C:
             return self.c1.unsqueeze(0)
@@ -338,7 +350,10 @@ class BoltzmannMachine(nn.Module, ABC):
         edges: Edges,
         room: Tensor | None = None,
     ) -> Tensor:
-        """Return the energy E(v, r, h1, h2), (..., B). It is +inf if a unit with gate 0 is 1."""
+        """Return the energy E(v, r, h1, h2), (..., scenes).
+
+        The energy is +inf if a relation unit with gate 0 is 1.
+        """
         gate = self.gate(edges, v)
         logits = self.relation_logits(edges, v, h1)
         observed = torch.ones_like(gate, dtype=torch.bool)
@@ -347,12 +362,12 @@ class BoltzmannMachine(nn.Module, ABC):
         return torch.where((r > gate).any(-1), torch.inf, energy)
 
     def object_energy(self, v: Tensor, h1: Tensor, h2: Tensor, room: Tensor | None) -> Tensor:
-        """Return the energy without the terms of relations, (..., B)."""
+        """Return the energy without the terms of relations, (..., scenes)."""
         context = (h1 * (self.context_bias(room) + v @ self.W)).sum(-1)
         return -(v @ self.b + h2 @ self.c2 + context + ((h1 @ self.J) * h2).sum(-1))
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the sum of κ_a over relation units with an open gate, (..., B).
+        """Return the sum of κ_a over relation units with an open gate, (..., scenes).
 
         The sum is 0 in a machine without κ.
         """
@@ -382,7 +397,7 @@ class BoltzmannMachine(nn.Module, ABC):
         h2: Tensor | None = None,
         room: Tensor | None = None,
     ) -> Tensor:
-        """Return the free energy F = -log sum_{h1} exp(-E), (..., B), where a closed form exists.
+        """Return the free energy F = -log sum_{h1} exp(-E), (..., scenes), in closed form.
 
         In the seed form, r contains the observed values of all units in `edges`. Other units are 0.
         In the local form, all relations must be unobserved (r = None). A machine with a second
@@ -415,12 +430,12 @@ class BoltzmannMachine(nn.Module, ABC):
     def free_energy_given(
         self, v: Tensor, context: Tensor, h2: Tensor | None = None, room: Tensor | None = None
     ) -> Tensor:
-        """Return the free energy of the object part, (..., B).
+        """Return the free energy of the object part, (..., scenes).
 
         The value is -b·v - c2·h2 - sum_k softplus(c1 + v'W + J h2 + context)_k.
 
         Args:
-            context: addition to the logits of the hidden units h1, (..., B, H1).
+            context: addition to the logits of the hidden units h1, (..., scenes, hidden units).
         """
         free = -(v @ self.b)
         x = self.context_bias(room) + v @ self.W + context
@@ -431,9 +446,12 @@ class BoltzmannMachine(nn.Module, ABC):
     # -- conditionals of the other blocks -------------------------------------------------------
 
     def second_layer_logits(self, h1: Tensor) -> Tensor:
-        """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., B, H2)."""
+        """Return the logits c2 + h1'J of p(h2 = 1 | h1), (..., scenes, units of h2)."""
         return self.c2 + h1 @ self.J
 
     def object_logits(self, h1: Tensor) -> Tensor:
-        """Return the log-odds b + W h1 of each object given h1, without relations, (..., B, V)."""
+        """Return the log-odds b + W h1 of each object given h1, (..., scenes, classes).
+
+        The contributions of relations are left out.
+        """
         return self.b + h1 @ self.W.T

@@ -5,10 +5,11 @@ mean of h2.
 
     m2 = sigmoid(c2 + m1'J),   y = c1 + v'W + J m2 + sum_e slope_e(m1) U_e,   m1 = sigmoid(y)
 
-In the seed form, slope_e is r_e for an observed relation unit e. For other units, slope_e is the
-derivative of `BoltzmannMachine.relation_term` with respect to the logit. With one hidden layer, the
-result is exact in two cases: a seed form with all relations observed, and a local form with all
-relations unobserved.
+The energy has two forms, seed and local (`training.machines.machine`). In the seed form, slope_e is
+r_e for an observed relation unit e. For other units, slope_e is the derivative of
+`BoltzmannMachine.relation_term` with respect to the logit. With one hidden layer, the result is
+exact in two cases: a seed form with all relations observed, and a local form with all relations
+unobserved.
 """
 
 from __future__ import annotations
@@ -43,9 +44,10 @@ class Evidence:
     room: Tensor | None = None
 
     def relations(self, machine: BoltzmannMachine) -> tuple[Edges, Tensor, Tensor] | None:
-        """Return (edges, r, observed), or None if relations do not affect the hidden units.
+        """Return layout, values and observed flags of the relation units.
 
-        In the local form, only observed relations affect the hidden units.
+        The result is None if relations do not affect the hidden units. In the local form, only
+        observed relations affect the hidden units.
         """
         if self.edges is None or not self.edges.shape[-1]:
             return None

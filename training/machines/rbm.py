@@ -3,7 +3,8 @@
     E(v,r,h1) = - b·v - c1·h1 - v'W h1 - sum_t r_t (d_t + U_t·h1)
 
 Only triples t = (a,i,j) seen in training have a relation unit. All other relations are always 0.
-The units have no gate, so r_t depends on its two objects only through the hidden units h1.
+The units have no gate, so r_t depends on its two objects only through the hidden units h1. This is
+the seed form of the energy. `training.machines.machine` also defines the local form.
 """
 
 from __future__ import annotations

@@ -22,13 +22,13 @@ independent given h1 cannot represent such a rule.
 The model is conditioned on r_G and has no energy term for r_G. All other conditionals keep their
 closed form. Without observed relations, x = 0. The strength of the rules depends on the hidden
 units through z, because some data sets annotate every visible pair and others only a few. The
-features phi_f use the A relations in both directions, so b and c are 2A relations. They never use
-r_e itself:
+features phi_f use the A relations in both directions, so b and c are 2A relations. The features of
+r_e never use r_e itself:
 
     pair      r_b(i, j)                                              2A features
     path      there is a class k with r_b(i, k) and r_c(k, j)        (2A)² features
-    degree    number of other classes k with r_b(i, k), and with     4A features, each at most 3
-              r_b(k, j)
+    degree    number of classes k other than j with r_b(i, k)        2A features, each at most 3
+              number of classes k other than i with r_b(k, j)        2A features, each at most 3
 
 Forms of the energy: `seed` is the energy above, minus κ_a for each pair of present classes and each
 relation a. κ is 0 in the paper. `local` adds softplus(ℓ_e) instead.
@@ -138,9 +138,10 @@ class Triway(BoltzmannMachine):
         return logits.flatten(-3)
 
     def _end_weights(self, pairs: PairEdges) -> tuple[Tensor, Tensor]:
-        """Return s[a,i] + n[a,0] log n_i, (B, A, n), and o[a,j] + n[a,1] log n_j, (B, A, m).
+        """Return the terms of the relation logits that depend only on the subject or object class.
 
-        These are the parts of the logits that depend on one class only.
+        The terms are s[a,i] + n[a,0] log n_i, (scenes, relations, n), for subjects i, and
+        o[a,j] + n[a,1] log n_j, (scenes, relations, m), for objects j.
         """
         counts = self.n[:, 0, None] * pairs.log_subjects.unsqueeze(1)
         subject = self.s[:, pairs.subjects].transpose(0, 1) + counts
@@ -148,7 +149,10 @@ class Triway(BoltzmannMachine):
         return subject, self.o[:, pairs.objects].transpose(0, 1) + counts
 
     def _residuals(self, pairs: PairEdges) -> Tensor:
-        """Return the residual weights w_e', (B, A, n, m). Triples unseen in training have 0."""
+        """Return the residual weight w_e' of each relation unit, (scenes, relations, n, m).
+
+        The weight of a triple that did not occur in training is 0.
+        """
         keys = triple_keys(pairs.relation, pairs.subject, pairs.object, self.spec.V)
         position, found = find_triples(self.triple_keys, keys)
         return pairs.unflatten(self.residual[position] * found)
@@ -180,7 +184,7 @@ class Triway(BoltzmannMachine):
         return bare, self._context_input(factors, count)
 
     def _factors(self, pairs: PairEdges, weight: Tensor) -> Tensor:
-        """Return sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., B, A, K)."""
+        """Return sum_{i,j} weight[a,i,j] S[i,k] O[j,k], (..., scenes, relations, K)."""
         # A product of (A·n, m) by (m, K) for each scene avoids a copy of O for each relation a.
         product: Tensor = weight.flatten(-3, -2) @ embedding(pairs.objects, self.O)
         product = product.unflatten(-2, weight.shape[-3:-1])
@@ -188,11 +192,14 @@ class Triway(BoltzmannMachine):
         return (product * subjects).sum(-2)
 
     def _context_input(self, factors: Tensor, count: Tensor) -> Tensor:
-        """Return sum_{a,k} factors[a,k] M[a,k] + sum_a count_a P[a], (..., B, H1)."""
+        """Return the sum over a and k of factors[a,k] M[a,k], plus the sum over a of count_a P[a].
+
+        The result has the shape (..., scenes, hidden units).
+        """
         return factors.flatten(-2) @ self.M.flatten(0, 1) + count @ self.P
 
     def held_objects(self, edges: Edges, r: Tensor) -> Tensor:
-        """Return 1 for each object that takes part in a relation with r = 1, else 0, (B, V)."""
+        """Return 1 for each class with a relation r = 1, else 0, (scenes, classes)."""
         pairs = _pairs(edges)
         grid = pairs.unflatten(r).amax(-3)
         held = r.new_zeros(len(r), self.spec.V)
@@ -201,7 +208,7 @@ class Triway(BoltzmannMachine):
         return held
 
     def relation_context(self, edges: Edges) -> Tensor:
-        """Return the weights U_e between each relation unit and h1, (B, E, H1)."""
+        """Return the weights U_e between relation units and h1, (scenes, units, hidden units)."""
         pairs = _pairs(edges)
         subject, object_ = self.S[pairs.subjects], self.O[pairs.objects]
         product = subject.unsqueeze(-2) * object_.unsqueeze(-3)
@@ -209,9 +216,9 @@ class Triway(BoltzmannMachine):
         return (rows + self.P[:, None, None]).flatten(1, 3)
 
     def attraction(self, v: Tensor, h1: Tensor, edges: Edges, candidates: Tensor) -> Tensor:
-        """Return the sum of softplus(ℓ_e) + κ_a over the relations of each candidate, (..., B, N).
+        """Return the sum of softplus(ℓ_e) + κ_a over the relations of each candidate.
 
-        In the local form, the sum is 0.
+        The sum has the shape (..., scenes, candidates). In the local form, the sum is 0.
         """
         pairs = _pairs(edges)
         return self._attraction(
@@ -252,7 +259,10 @@ class Triway(BoltzmannMachine):
         return total + (softplus(loop) + self.kappa).sum(-1)
 
     def _loop_logits(self, candidates: Tensor, h1: Tensor) -> Tensor:
-        """Return the logits of the relations of each candidate to its own class, (..., B, N, A)."""
+        """Return the logits of the relations of each candidate to its own class.
+
+        The logits have the shape (..., scenes, candidates, relations).
+        """
         shared = self.R + torch.einsum("akh,...bh->...bak", self.M, h1)
         product = (self.S * self.O)[candidates] @ shared.mT
         bias = (self.d + h1 @ self.P.T).unsqueeze(-2)
@@ -301,7 +311,7 @@ class Triway(BoltzmannMachine):
         held: Tensor | None = None,
         collapsed: bool = True,
     ) -> Tensor:
-        """Sample the objects v given the hidden units h1, (B, V).
+        """Sample the objects v given the hidden units h1, (scenes, classes).
 
         In the seed form with `collapsed`, the objects are sampled one after another. In the seed
         form without `collapsed`, objects of relations with r = 1 stay present.
@@ -334,7 +344,7 @@ class Triway(BoltzmannMachine):
         return v
 
     def pair_offset(self, edges: Edges, v: Tensor) -> Tensor:
-        """Return the sum of κ_a over relation units between present classes, (..., B)."""
+        """Return the sum of κ_a over relation units between present classes, (..., scenes)."""
         if not bool(self.kappa.any()):
             return super().pair_offset(edges, v)
         gate = self.gate(edges, v)

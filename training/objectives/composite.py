@@ -70,8 +70,8 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
     Return None if the batch has no such scene.
 
     Args:
-        structure: True for structure classes such as walls, (classes,) bool. They are never removed
-            or ranked.
+        structure: True for structure classes such as walls, (classes,) bool. Structure classes are
+            never removed or ranked.
     """
     removable = batch.v * ~structure
     enough = removable.sum(1) >= 2
@@ -87,8 +87,8 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
 class ObjectChains:
     """Persistent Gibbs chains over objects and hidden units, for machines of the local form.
 
-    In the local form, the sum over relations is 1, so the chains contain only v, h1 and h2. The
-    loss is a difference of free energies, in which h1 is summed out:
+    In the local form (`training.machines.machine`), the sum over relations is 1, so the chains
+    contain only v, h1 and h2. The loss is a difference of free energies, in which h1 is summed out:
 
         mean F(data, h2) - mean F(chains, h2),   F = -b·v - c2·h2 - sum softplus(c1 + v'W + J h2)
 

@@ -2,8 +2,9 @@
 
 The gradient of the negative log-likelihood is <dE>_data - <dE>_model. The loss is the difference
 between the energies of data states and of model samples. Automatic differentiation then gives the
-update for every machine variant. In the seed form, h1 is summed out (Rao–Blackwell), so the loss
-uses free energies given v, r and h2.
+update for every machine variant. The energy has two forms, seed and local
+(`training.machines.machine`). In the seed form, h1 is summed out (Rao–Blackwell), so the loss uses
+free energies given v, r and h2.
 
 In the local form, the sum over relations is 1 given v and h1. The gradient of the relation term
 under the model has mean zero, so the loss leaves it out. The loss is the difference of the energies

@@ -47,7 +47,8 @@ class _Between(NamedTuple):
 class DrawnPosterior:
     """An implementation of `app.questions.posterior.Posterior` by weighted draws of h1.
 
-    In the local form without observed relations, the log-odds of objects have a closed form.
+    The energy has two forms, seed and local (`training.machines.machine`). In the local form
+    without observed relations, the log-odds of objects have a closed form.
     """
 
     def __init__(self, artifact: Artifact, scene: Scene) -> None:

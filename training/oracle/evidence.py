@@ -5,8 +5,9 @@ gives the mean energy over v_i ~ Bernoulli(c). The hidden units are computed onc
 of averaged over v_i, which is a first-order approximation. Unseen classes have v = 0.
 
 Listed relations and relations derived from poses are observed. All other relations are unobserved.
-In the local form, unobserved relations have no effect, so only classes with an observed relation
-have relation units. A relation for which the machine has no unit is ignored.
+In the local form of the energy (`training.machines.machine`), unobserved relations have no effect,
+so only classes with an observed relation have relation units. A relation for which the machine has
+no unit is ignored.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Score of a sampled scene: its log-likelihood up to a constant of the machine.
 
-The score of objects v and relations r, at temperature 1, is:
+The energy has two forms (`training.machines.machine`). At temperature 1, the score of objects v and
+relations r is:
 
     local form   b·v + sum_k softplus(x_k) + log p(r | v, h1)
     seed form    b·v + sum_k softplus(x_k + sum_e r_e U_ek) + sum_e r_e ℓ⁰_e
@@ -30,7 +31,7 @@ def log_score(
     h1: Tensor,
     room: Tensor | None,
 ) -> Tensor:
-    """Return the score of each scene, (B,).
+    """Return the score of each scene, (scenes,).
 
     Args:
         v: presence of objects, (scenes, classes).
