@@ -187,7 +187,7 @@ class _Fit:
     """Fitted parameters of one relation. The last dimension of each array is x, y and z.
 
     Attributes:
-        kappa, alpha, beta, mu: parameters of the prior, (3,); see the module.
+        kappa, alpha, beta, mu: parameters of the prior (see the module), one for each axis, (3,).
         u, v: effects of the class of the relation's subject (u) and object (v), (classes, 3).
         doubt_u, doubt_v: variances of u and v in units of s / kappa, (classes, 3).
     """

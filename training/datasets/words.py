@@ -79,8 +79,8 @@ class WordVectors:
 def class_vectors(words: WordVectors, vocabulary: Vocabulary) -> tuple[Vectors, NDArray[np.bool_]]:
     """Return the word vectors of the classes of a vocabulary.
 
-    The vector of a class is that of its label. If the label has no vector, the first alias with a
-    vector is used.
+    The vector of a class is the vector of its label. If the label has no vector, the vector of the
+    first alias with a vector is used.
 
     Returns:
         Vectors of length 1, (classes, dimensions) float32, and a mask (classes,) bool. The mask is

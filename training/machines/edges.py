@@ -198,7 +198,11 @@ def pair_edges(
 
 
 def triple_edges(triples: Tensor) -> TripleEdges:
-    """Return the units of a table of triples (a, i, j) for all scenes; table (triples, 3)."""
+    """Return the relation units of a table of triples, which apply to all scenes.
+
+    Args:
+        triples: triples (relation a, subject class i, object class j), (triples, 3).
+    """
     relation, subject, object_ = triples.long().T.unsqueeze(1).unbind(0)
     return TripleEdges(relation, subject, object_, torch.ones_like(subject, dtype=torch.bool))
 

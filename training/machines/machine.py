@@ -14,7 +14,7 @@ Every variant has two forms of the relation part of the energy. A unit with an o
 
 Both forms have the same p(r | v, h1). In the local form, unobserved relations have no effect on
 other units. The seed form is the energy of the paper. A relation that is summed out in the seed
-form raises the probability of its two objects; the weight κ (0 in the paper) compensates for this.
+form raises the probability of its two objects. The weight κ (0 in the paper) compensates for this.
 
 Tensor dimensions: "..." stands for samples. They come first, then scenes, then units.
 """
@@ -167,7 +167,8 @@ class BoltzmannMachine(nn.Module, ABC):
 
         Args:
             v: presence of objects, (scenes, classes).
-            given: (edges, r, observed) of observed relations. The result keeps their values in r.
+            given: layout, values and observed flags of observed relations. The result contains the
+                same values for these relations.
         """
 
     @abstractmethod

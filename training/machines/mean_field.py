@@ -26,7 +26,7 @@ from training.machines.machine import BoltzmannMachine
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence of B scenes: the observed values of their units.
+    """The evidence of some scenes: their observed objects, relations and room types.
 
     Attributes:
         v: presence of objects, (scenes, classes).

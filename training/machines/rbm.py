@@ -122,7 +122,10 @@ class RBM(BoltzmannMachine):
 
     @torch.no_grad()
     def scaled(self, beta: float, base: BoltzmannMachine | None = None) -> Self:
-        """Multiply every weight by beta; with a `base`, interpolate the biases d and b instead."""
+        """Multiply every weight by beta.
+
+        If there is a `base`, the biases d and b are interpolated between `base` and this machine.
+        """
         return scale(self, beta, base, keep=("b", "d"))
 
 

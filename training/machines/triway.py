@@ -8,9 +8,9 @@
 The published code multiplies w by v_i v_j, but not U. Here, both are multiplied by v_i v_j, and a
 relation can be 1 only between present objects (r_e ≤ v_i v_j). Products of the factors S, O, R and
 M replace a free weight for each triple (a,i,j). Triples seen in training also have a free residual
-weight w'. n_i and n_j are the numbers of instances of the two classes. The weights n multiply their
-logs, because a relation of two classes holds if it holds for any pair of instances. If a number of
-instances is unknown, the mean log n_i of the class is used.
+weight w'. n_i and n_j are the numbers of instances of the two classes. Their logs enter with the
+weights n, because a relation between classes holds if it holds between any two instances. If a
+number of instances is unknown, the mean log n_i of the class is used.
 
 With G > 0 (local form), the observed relations r_G also change the logits of other relations. For
 example, if A is left of B and B is left of C, then A is left of C. Relation units that are

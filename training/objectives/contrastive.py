@@ -150,7 +150,7 @@ class PersistentCD(Objective):
         return energy_difference(machine, data, observed, chains, free, no_room)
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:
-        """Centre the gradients; see `centre_gradients`."""
+        """Replace the gradients by centred gradients, as `centre_gradients` describes."""
         centre_gradients(machine, *self.offsets)
 
     def _resume(self, machine: BoltzmannMachine, generator: torch.Generator) -> State:

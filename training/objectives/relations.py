@@ -90,7 +90,7 @@ class WordPrior(nn.Module):
 
 
 class RelationLikelihood(Objective):
-    """The loss of the module docstring.
+    """The negative conditional log-likelihood of annotated relations, plus priors.
 
     Args:
         config: weights of the terms, and precisions of the priors.

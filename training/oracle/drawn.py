@@ -279,7 +279,7 @@ class DrawnPosterior:
         observation = self.observation
         machine, n = observation.machine, len(observation.classes)
         where = torch.from_numpy(np.asarray(candidates, dtype=np.int64)).unsqueeze(0)
-        # The first row removes no class; each other row removes one class of the scene.
+        # The first row keeps all classes. Each other row removes one class of the scene.
         removed = torch.eye(n + 1, dtype=torch.bool)[:, 1:]
         size = observation.unit_count + where.shape[1] * max(1, machine.spec.H1)
         log_odds = torch.cat(

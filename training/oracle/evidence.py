@@ -40,7 +40,7 @@ def draw_context(
     rows: int | None = None,
     pull: float = 1.0,
 ) -> HiddenDraws:
-    """Return weighted draws of h1 given the evidence; equal evidence gives equal draws.
+    """Return weighted draws of h1 given the evidence. Equal evidence gives equal draws.
 
     The number of draws is `DRAWS`, or smaller if rows × relation units × draws would exceed a
     bound.

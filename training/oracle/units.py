@@ -46,9 +46,9 @@ class Units:
         return torch.where(self.exists, values[..., self.place], missing)
 
     def of_pairs(self, subjects: Tensor, objects: Tensor) -> Units:
-        """Return the relation units of pairs of classes.
+        """Return only the relation units of some pairs of classes.
 
-        `grid` of the result then returns tables (..., relations, pairs).
+        The method `grid` of the result returns tables of shape (..., relations, pairs).
 
         Args:
             subjects, objects: indices into the subject and object classes, (pairs,).
