@@ -1,7 +1,7 @@
 """The trainer of every machine and objective: updates, early stopping, checkpoints, curves.
 
-With one thread, two runs with the same seed give bit-identical weights, even if a run is
-interrupted and resumed after an epoch.
+With one thread, two runs with the same seed give bit-identical weights. This also holds for a run
+that is interrupted and resumed after an epoch.
 """
 
 from __future__ import annotations
@@ -38,26 +38,28 @@ from training.runs import (
 
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
-# Called during the training of the objects, with the finished share.
+# Function that is called in the first training phase (objects only) with the finished share of it.
 ObjectProgress = Callable[[float], None]
-# Weights with the full learning rate. The setting `relation_rate` can lower the rate of all other
-# weights, because relation weights may overfit within an epoch.
+# Names of the weights with the full learning rate. The setting `relation_rate` can lower the rate
+# of all other weights. Relation weights can overfit within one epoch.
 _FULL_RATE = frozenset({"b", "c1", "c2", "W", "J", "Q", "gamma", "B"})
 
-# Called after every update with (epoch, finished share of the epoch, mean loss so far).
+# Function that is called after every update. The arguments are the epoch, the finished share of the
+# epoch and the mean loss in the epoch so far.
 Progress = Callable[[int, float, float], None]
-# Called with every finished epoch.
+# Function that is called with the figures of every finished epoch.
 Ended = Callable[[Epoch], None]
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Tensors of the three parts, and the data that determines the machine's shape.
+    """Scenes of the train, validation and test part, and data for the sizes of the machine.
 
     Attributes:
         digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
             is unchanged.
-        words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
+        words: word vectors of the classes with length 1, (classes, dimensions). The vector of an
+            unknown word is 0. None means no word vectors.
     """
 
     train: SceneTensors
@@ -71,7 +73,10 @@ class TrainingData:
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
-    """Return a machine with small random matrices and with biases at the training frequencies."""
+    """Return an untrained machine.
+
+    Its weight matrices are small random numbers, and its biases are log-odds of training counts.
+    """
     shape = config.machine
     V = data.train.v.shape[1]
     triples = seen_triples(data.train.scenes, V, shape.min_triple_count)
@@ -91,8 +96,8 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
     machine = build(spec).set_triples(triples).initialise(generator, shape.initial_scale)
     with torch.no_grad():
         annotated = data.train.annotated_classes[data.train.source].sum(0)
-        # A class that no source annotates must start as rare. The formula alone would give even
-        # odds.
+        # If no data source annotates a class, its bias must mean a rare class. The formula alone
+        # would give a probability of 1/2.
         annotated = torch.where(annotated > 0, annotated, len(data.train))
         machine.b.copy_(log_odds_of(data.train.v.sum(0), annotated))
         machine.c1.fill_(shape.initial_c1)
@@ -104,12 +109,15 @@ def new_machine(config: Config, data: TrainingData, generator: torch.Generator) 
 
 
 def log_odds_of(count: Tensor, total: Tensor) -> Tensor:
-    """Return the log-odds of a frequency; 1/2 is added to both counts for smoothing."""
+    """Return the smoothed log-odds of `count` events in `total` trials.
+
+    1/2 is added to the number of events and to the number of other trials.
+    """
     return ((count + 0.5) / (total - count + 0.5)).log()
 
 
 def _start_relations(machine: BoltzmannMachine, scenes: SceneTensors) -> None:
-    """Set the relation biases to the frequencies in scenes with annotated relations."""
+    """Set the relation biases to the log-odds of relations in scenes with annotated relations."""
     A, V, T = machine.spec.A, machine.spec.V, machine.spec.T
     held, seen, per_unit = torch.zeros(A), torch.zeros(A), torch.zeros(T)
     logs, times, annotated = torch.zeros(V), torch.zeros(V), 0
@@ -138,9 +146,9 @@ class Trainer:
     """Train one configuration on one set of scenes.
 
     Args:
-        config: the configuration.
-        data: tensors of the split scenes.
-        folder: folder of `checkpoint.pt`, `curve.csv` and `curve.png`; None writes no files.
+        config: configuration of the run.
+        data: training, validation and test scenes.
+        folder: folder for `checkpoint.pt`, `curve.csv` and `curve.png`. None writes no files.
     """
 
     def __init__(self, config: Config, data: TrainingData, folder: Path | None = None) -> None:
@@ -189,7 +197,11 @@ class Trainer:
         return torch.optim.AdamW(groups, lr=t.learning_rate, fused=True)
 
     def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
-        """One cycle: linear rise over a tenth of the updates, then a cosine down to zero."""
+        """Return the schedule of the learning rate.
+
+        In the one-cycle schedule, the rate rises linearly over the first tenth of the updates. It
+        then falls to 0 along a cosine.
+        """
         t = self.config.training
         if t.schedule == "constant":
             return torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda _: 1.0)
@@ -206,7 +218,7 @@ class Trainer:
     # -- the run --------------------------------------------------------------------------------
 
     def resume(self) -> bool:
-        """Continue from the folder's checkpoint; return False without a checkpoint.
+        """Load the checkpoint in the folder of the run. Return False if there is no checkpoint.
 
         Raises:
             RunError: the checkpoint cannot be read or belongs to another configuration.
@@ -232,10 +244,11 @@ class Trainer:
         ended: Ended | None = None,
         objects: ObjectProgress = lambda _: None,
     ) -> TrainingResult:
-        """Train the objects if they have their own phase, then the epochs.
+        """Run the first training phase (objects only) if there is one, then all epochs.
 
-        Training ends after the last epoch, or earlier if the validation score stops improving
-        (patience). On KeyboardInterrupt, the checkpoint of the last finished epoch is on disk.
+        Training ends after the last epoch. It ends earlier if the validation score does not improve
+        for `training.patience` epochs. After a KeyboardInterrupt, the checkpoint of the last
+        finished epoch is on disk.
         """
         if not self.objects_trained:
             began = time.perf_counter()
@@ -290,7 +303,8 @@ class Trainer:
         finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
         if not math.isfinite(loss) or not finite:
             raise FloatingPointError(
-                f"epoch {number} diverged at a loss of {loss}: lower the learning rate"
+                f"the training diverged in epoch {number}, with a loss of {loss}: lower the "
+                "learning rate (training.learning_rate)"
             )
         self._close_epoch(number, loss, began)
 
@@ -304,7 +318,8 @@ class Trainer:
         self.updates += 1
         decay = self.config.training.averaging
         if decay:
-            # Bias correction: during the first updates, old weights count less.
+            # During the first updates, a smaller decay reduces the share of the initial weights in
+            # the average.
             weight = 1 - min(decay, self.updates / (self.updates + 10))
             for name, parameter in self.machine.named_parameters():
                 self.average[name].lerp_(parameter.detach(), weight)
@@ -312,7 +327,7 @@ class Trainer:
 
     @torch.no_grad()
     def _close_epoch(self, number: int, loss: float, began: float) -> None:
-        """Evaluate the (averaged) weights on validation scenes and keep the best."""
+        """Evaluate the weights, or their average, on validation scenes. Keep the best weights."""
         parameters = dict(self.machine.named_parameters())
         current = {name: p.detach().clone() for name, p in parameters.items()}
         if self.config.training.averaging:
@@ -344,7 +359,11 @@ class Trainer:
         )
 
     def _validate(self) -> tuple[float, float]:
-        """Return MRR of removed objects and R-precision of relations on fixed validation scenes."""
+        """Return two scores on a fixed set of validation scenes.
+
+        The scores are the mean reciprocal rank (MRR) of removed objects and the R-precision of
+        relations.
+        """
         generator = torch.Generator().manual_seed(0)
         pick = torch.randperm(len(self.data.validation), generator=generator)[:_VALIDATION_SCENES]
         sample = subset(self.data.validation, pick)
@@ -386,7 +405,8 @@ class Trainer:
         if not self.epochs:
             return
         write_csv(self.folder / "curve.csv", self.epochs)
-        # Limit the number of plots: with few scenes, a plot takes longer than an epoch.
+        # Plot at most once in _DRAWN_EVERY seconds. With few scenes, a plot takes longer than an
+        # epoch.
         if time.perf_counter() - self._drawn > _DRAWN_EVERY:
             self._draw()
 
@@ -397,6 +417,6 @@ class Trainer:
 
 
 def _with_relations(scenes: SceneTensors) -> SceneTensors:
-    """Return the scenes with any observed relation, or all scenes if there are none."""
+    """Return the scenes with an annotated relation, or all scenes if no scene has one."""
     kept = [k for k, scene in enumerate(scenes.scenes) if scene.evidence.observed.any()]
     return subset(scenes, torch.tensor(kept, dtype=torch.int64)) if kept else scenes

@@ -1,26 +1,27 @@
 """Composite conditional likelihood of masked objects, presence and relations.
 
-In each scene one present class i is removed, with all its instances and relations:
+In each scene, one present class i is removed with all its instances and relations. The loss then
+has two terms for objects:
 
-    ranking    - log softmax over absent candidates of the log-odds, at i
+    ranking    - log softmax_i of the log-odds, over all absent classes including i
     presence   n·softplus(-log-odds_i) + sum over the other absent classes of softplus(log-odds)
 
-n is the number of removable classes. The factor n makes the second term an unbiased estimate of the
-pseudo-likelihood, which balances present and absent units. With the ranking term alone, the
-log-odds of different objects are not comparable.
+n is the number of classes that can be removed. With the factor n, the presence term is an unbiased
+estimate of the negative pseudo-likelihood. With the ranking term alone, log-odds from different
+scenes would not be comparable.
 
-For scenes with annotated relations:
+Scenes with annotated relations have a third term:
 
-    relations  - sum over observed units of log p(r_e | v, E[h1 | v])
+    relations  - sum over observed relations e of log p(r_e | v, E[h1 | v])
 
-This term approximates the bound log p(r | v) ≥ E[log p(r | v, h1)] (Jensen, h1 from p(h1 | v)) by
-the mean of h1. Unannotated relations are summed out. Scenes without annotated relations train the
-object part only. For a machine with implications, the loss has a second relation term: a random
-share of the relations of each scene is given, and the term is the sum of
-- log p(r_e | r_given, v, E[h1 | v]) over the other relations.
+By Jensen's inequality, log p(r | v) ≥ E[log p(r | v, h1)] for h1 from p(h1 | v). The relation term
+approximates this bound by using the mean of h1. Unannotated relations are summed out. A machine
+with implication weights has a second relation term. That term is the sum of
+- log p(r_e | r_given, v, E[h1 | v]). r_given is a random share of the relations of a scene, and e
+runs over the other relations.
 
-A class that a source never mentions counts as absent from the scenes of the source. The reason is
-that a request has no source, and the service has to rank all classes.
+A class that a data source never mentions counts as absent in all scenes of that source. A request
+to the service has no source, so the service must rank all classes.
 
 Sources: Besag, "Statistical analysis of non-lattice data" (1975); Varin, Reid and Firth, "An
 overview of composite likelihood methods" (2011).
@@ -46,14 +47,14 @@ from training.objectives.base import Objective, relation_nll, withhold_counts, w
 
 @dataclass(frozen=True)
 class Masked:
-    """Scenes with one class removed.
+    """Scenes from each of which one class is removed.
 
     Attributes:
-        batch: the scenes that have a removable class.
-        v: (B, V) presence without the removed class.
-        target: (B,) the removed class.
-        absent: (B, V) bool, the candidates, which include the target.
-        removable: (B,) number of removable classes.
+        batch: the complete scenes.
+        v: presence of objects without the removed class, (scenes, classes).
+        target: index of the removed class, (scenes,).
+        absent: True for absent classes, which include the removed class, (scenes, classes).
+        removable: number of classes that can be removed, (scenes,).
     """
 
     batch: Batch
@@ -64,12 +65,13 @@ class Masked:
 
 
 def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) -> Masked | None:
-    """Remove one class from each scene with at least two removable classes.
+    """Remove one random class from each scene that has at least two removable classes.
 
-    The result is None if all scenes have fewer.
+    Return None if the batch has no such scene.
 
     Args:
-        structure: (V,) bool; structure classes are neither removed nor candidates.
+        structure: True for structure classes such as walls, (classes,) bool. Structure classes are
+            never removed or ranked.
     """
     removable = batch.v * ~structure
     enough = removable.sum(1) >= 2
@@ -83,21 +85,21 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
 
 
 class ObjectChains:
-    """Persistent chains over objects and context: a generative gradient for the local form.
+    """Persistent Gibbs chains over objects and hidden units, for machines of the local form.
 
-    In the local form, relations sum to one, so the chains need only (v, h1, h2). The loss is the
-    difference of free energies, in which h1 is summed out:
+    In the local form (`training.machines.machine`), the sum over relations is 1, so the chains
+    contain only v, h1 and h2. The loss is a difference of free energies, in which h1 is summed out:
 
         mean F(data, h2) - mean F(chains, h2),   F = -b·v - c2·h2 - sum softplus(c1 + v'W + J h2)
 
-    Each chain keeps a room type (or none) drawn from the training scenes. So data and chains have
-    the same distribution of room types.
+    Each chain keeps the room type of a random training scene, which can be unknown. The chains and
+    the data therefore have the same distribution of room types.
 
     Source: Tieleman, "Training RBMs using approximations to the likelihood gradient" (2008).
 
     Args:
         count: number of chains.
-        steps: Gibbs steps for each update.
+        steps: number of Gibbs steps before each update of the weights.
     """
 
     def __init__(self, count: int, steps: int) -> None:
@@ -107,10 +109,11 @@ class ObjectChains:
     def loss(
         self, machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """Run the chains, then return mean F(data) - mean F(chains).
+        """Run the chains, then return mean F(data) - mean F(chains). F is the free energy.
 
         Args:
-            v, room: (B, V) and (B,), the data.
+            v: presence of objects in the training scenes, (scenes, classes).
+            room: index of the room type of each training scene, (scenes,).
         """
         with torch.no_grad():
             h2 = bernoulli(mean_field(machine, Evidence(v, room=room)).h2, generator)
@@ -135,9 +138,8 @@ class ObjectChains:
 class CompositeLikelihood(Objective):
     """The loss ranking + presence_weight · presence + relation_weight · relations.
 
-    With a generative_weight (local form), the weighted persistent-chain gradient is added
-    (`ObjectChains`). Conditionals alone give a joint distribution whose samples differ from the
-    data.
+    With a `generative_weight` (local form), the loss also includes the term of `ObjectChains`.
+    Without that term, samples of the trained machine differ from the training scenes.
     """
 
     def __init__(
@@ -155,7 +157,7 @@ class CompositeLikelihood(Objective):
         self.chains.blocks = dict(state)
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the mean over scenes of the weighted terms."""
+        """Return the weighted sum of the terms, averaged over the scenes of the batch."""
         total = machine.b.sum() * 0.0
         if self.config.relation_weight:
             total = total + self.config.relation_weight * self.relation_part(
@@ -182,7 +184,10 @@ class CompositeLikelihood(Objective):
         masked: Masked,
         generator: torch.Generator,
     ) -> Tensor:
-        """Return the log-odds (B, V) of each class given the others, with relations unobserved."""
+        """Return the log-odds of each class given the other classes, (scenes, classes).
+
+        All relations are unobserved.
+        """
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
             drop = torch.rand(v.shape, generator=generator) < self.config.structure_dropout
@@ -199,9 +204,10 @@ class CompositeLikelihood(Objective):
     def relation_part(
         self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator
     ) -> Tensor:
-        """Return -log p(observed r | v, E[h1 | v]), summed over units, averaged over the batch.
+        """Return the relation term of the loss, averaged over the scenes of the batch.
 
-        A machine with implications adds the second term of `relation_nll`.
+        The term is -log p(observed r | v, E[h1 | v]). For a machine with implication weights, it
+        includes the second term of `relation_nll`.
         """
         annotated = batch.observed.flatten(1).any(1)
         if not bool(annotated.any()):
@@ -221,7 +227,10 @@ class CompositeLikelihood(Objective):
 
 
 def unlisted_off(batch: Batch, structure: Tensor) -> Batch:
-    """Return the batch with all relations between non-structure classes of a scene observed."""
+    """Return the batch with all relations between the classes of a scene observed.
+
+    Unlisted relations count as false. Relations of structure classes keep their status.
+    """
     n = batch.classes.shape[1]
     thing = (batch.classes >= 0) & ~structure[batch.classes.clamp(min=0)]
     pairs = thing[:, :, None] & thing[:, None, :] & ~torch.eye(n, dtype=torch.bool)
