@@ -53,7 +53,8 @@ if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
 INDEX: Final = "index.json"
-_PIECE: Final = 2**20
+# Size in bytes of one request of a download.
+_PIECE: Final = 4 * 2**20
 # Time in seconds after which a replica tries again to download a version.
 _RETRY: Final = 60.0
 # Errors of files that were valid after their download: the local disk has changed them.
@@ -290,12 +291,15 @@ class RemoteStore(Store):
 
     def _fetch(self, path: str, name: str, limit: int, folder: Path) -> bytes:
         """Download a file of at most `limit` bytes into a folder. Return a manifest's bytes."""
+        place = f"{path}/{name}"
         try:
-            found = obstore.get(self._bucket, f"{path}/{name}")
-            _require_size(name, found.meta["size"], limit)
+            size = obstore.head(self._bucket, place)["size"]
+            _require_size(name, size, limit)
             with (folder / name).open("wb") as file:
-                for piece in found.stream(min_chunk_size=_PIECE):
-                    file.write(piece)
+                # Each piece is a request of its own, so that the time-out does not limit the size.
+                for start in range(0, size, _PIECE):
+                    end = min(start + _PIECE, size)
+                    file.write(obstore.get_range(self._bucket, place, start=start, end=end))
         except FileNotFoundError:
             raise ArtifactError("missing_file", f"{name} is missing in the remote store") from None
         except BaseError as error:
