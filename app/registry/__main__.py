@@ -7,6 +7,7 @@ SCENE_TRUSTED_KEYS lists public keys. A publisher trusts its own key.
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
 from pathlib import Path
@@ -20,6 +21,8 @@ from app.registry.remote import RemoteStore
 def main(arguments: list[str] | None = None) -> int:
     """Run one command. Return the exit status: 0, or 1 after an error."""
     asked = _parser().parse_args(arguments)
+    # The messages of this command contain the errors.
+    logging.getLogger("app.registry").addHandler(logging.NullHandler())
     try:
         if asked.command == "key":
             _say(f"public key for SCENE_TRUSTED_KEYS: {Signer.create(Path(asked.file)).public}")

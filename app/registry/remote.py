@@ -145,7 +145,7 @@ class RemoteStore(Store):
                 os.utime(self._cache / INDEX)
             except StoreError as error:
                 if str(error) != str(self.error):
-                    _logger.error("the remote store: %s", error)
+                    _logger.error("%s", error)
                 self.error = error
             else:
                 if self.error is not None:

@@ -180,14 +180,10 @@ class Runtime:
     @property
     def store_health(self) -> StoreHealth | None:
         """The state of the contact to a remote store, or None for a store in a folder."""
-        if self._store.age is None:
+        if (age := self._store.age) is None:
             return None
         error = self._store.error
-        return StoreHealth(
-            age_s=self._store.age,
-            reason=None if error is None else error.code,
-            detail=None if error is None else error.reason,
-        )
+        return StoreHealth(age_s=round(age, 1), reason=None if error is None else error.code)
 
     def drain(self) -> None:
         """Refuse new requests, and answer readiness checks with 503."""

@@ -183,7 +183,6 @@ class StoreHealth(Reply):
     reason: Annotated[
         str | None, Field(description="stable code of the reason why the last reading failed")
     ] = None
-    detail: Annotated[str | None, Field(description="the reason in words")] = None
 
 
 class Health(Reply):
