@@ -98,12 +98,24 @@ async def at_rate(
     port: int, requests: Sequence[bytes], rate: float, seconds: float, connections: int = 64
 ) -> Window:
     """Run a window with requests at regular times, independent of earlier answers."""
+    count = max(1, round(rate * seconds))
+    return await at_times(port, requests, np.arange(count) / rate, connections)
+
+
+async def at_times(
+    port: int, requests: Sequence[bytes], times: NDArray[np.float64], connections: int = 64
+) -> Window:
+    """Run a window with requests at given times, independent of earlier answers.
+
+    Args:
+        times: times in seconds from the start of the window, ascending.
+    """
     latency: list[float] = []
     statuses: Counter[int] = Counter()
     due: dict[Connection, float] = {}
     waiting: deque[float] = deque()
     finished = asyncio.Event()
-    count = max(1, round(rate * seconds))
+    count = len(times)
     sent = answers = 0
 
     def send(connection: Connection, when: float) -> None:
@@ -127,8 +139,8 @@ async def at_rate(
     pool = await connect(port, connections, answered)
     free = list(pool)
     start = perf_counter()
-    for number in range(count):
-        when = start + number / rate
+    for time in times.tolist():
+        when = start + time
         while (pause := when - perf_counter()) > 0:  # noqa: ASYNC110 - a clock, not an event
             await asyncio.sleep(pause if pause > 0.002 else 0)
         if free:
