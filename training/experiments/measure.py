@@ -274,7 +274,7 @@ def claim(place: Path, row: Row, material: str) -> None:
         known = json.loads(path.read_text(encoding="utf-8"))
         if known["identity"] != row.identity:
             raise BenchmarkError(
-                f"{place} holds reports of {row.name} with another configuration: use --fresh or "
+                f"{place} holds reports of another configuration of {row.name}: use --fresh or "
                 "another folder"
             )
         if known.get("material") != material:
