@@ -351,7 +351,7 @@ def metric_from_dict(values: dict[str, Any]) -> Metric:
     rest = dict(values)
     kind = rest.pop("kind", None)
     if kind not in _KINDS:
-        raise ValueError(f"the kind of a metric must be one of {sorted(_KINDS)}, not {kind!r}")
+        raise ValueError(f"metric kind must be one of {sorted(_KINDS)}, not {kind!r}")
     found: Metric = _KINDS[kind](**{name: _array(name, value) for name, value in rest.items()})
     return found
 
