@@ -46,7 +46,7 @@ class Timings:
         return median(self.seconds[name])
 
     def ratio(self, name: str, yardstick: str) -> Ratio:
-        """Return how many times faster `name` is than `yardstick`."""
+        """Return the speed of `name` divided by the speed of `yardstick`."""
         pairs = zip(self.seconds[yardstick], self.seconds[name], strict=True)
         ratios = [other / own for other, own in pairs]
         if len(ratios) == 1:

@@ -87,7 +87,7 @@ def judge(output: str, trouble: str, required: set[str]) -> Outcome:
     if found:
         return Outcome(Verdict.FOUND, tuple(found))
     if unknown:
-        return Outcome(Verdict.NOT_RUN, (f"no answer about {', '.join(unknown)}",))
+        return Outcome(Verdict.NOT_RUN, (f"no answer about the packages {', '.join(unknown)}",))
     return Outcome(Verdict.OK, (f"no known vulnerability in {len(looked_at)} packages",))
 
 
@@ -126,7 +126,7 @@ def advisories() -> Outcome:
             files = [f"--requirement={lock}" for lock in LOCKS]
             return judge(*ask(service, *files), set().union(*map(pinned, LOCKS)))
         reasons.append(f"{service}: {known.lines[0]}")
-    return Outcome(Verdict.NOT_RUN, ("all advisory services failed", *reasons))
+    return Outcome(Verdict.NOT_RUN, ("all vulnerability databases failed", *reasons))
 
 
 def risky_code() -> Outcome:

@@ -399,7 +399,7 @@ def _lists(old: list[Json], new: list[Json], at: str) -> Iterator[str]:
     scored = [e for e in (*old, *new) if isinstance(e, dict) and _score(e) is not None]
     if not scored or len(scored) < len(old) + len(new):
         if len(old) != len(new):
-            yield f"{at}: {len(old)} entries → {len(new)}"
+            yield f"{at}: {len(old)} entries before, {len(new)} now"
         for k, (a, b) in enumerate(zip(old, new, strict=False)):
             yield from differences(a, b, f"{at}/{k}")
         return
@@ -541,7 +541,7 @@ def wait_until_ready(url: str) -> None:
 
 
 def main() -> int:
-    """Run the command line."""
+    """Run the command that the command line names, and return its exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("command", choices=("record", "compare"))
     parser.add_argument("url")

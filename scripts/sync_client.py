@@ -1,6 +1,6 @@
 """Generate the blocking Python client (sync.py) from the asynchronous client (asynchronous.py).
 
-Usage: python scripts/sync_client.py   (part of `make format`)
+Usage: python scripts/sync_client.py   (`make format` runs this script)
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def main(
     store: Annotated[Path, typer.Option(help="the model store to serve")] = Path("model_store"),
     seconds: Annotated[float, typer.Option(min=0.1, help="seconds per measurement")] = 1.5,
     kind: Annotated[list[str] | None, typer.Option(help="only these kinds of request")] = None,
-    json_path: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
+    json_path: Annotated[Path | None, typer.Option("--json", help="JSON file of results")] = None,
     plot: Annotated[Path | None, typer.Option(help="image file of latency distributions")] = None,
 ) -> None:
     """Send the same requests to the service and to a plain FastAPI app, and compare their speed.
@@ -138,7 +138,7 @@ def _line(c: Comparison) -> str:
 
 def _table(found: Sequence[Comparison]) -> Table:
     table = Table(
-        title="The service beside a plain FastAPI app (service / plain app; milliseconds)"
+        title="The service compared with a plain FastAPI app (service / plain app; milliseconds)"
     )
     for column in ("request", "load", "req/s", "ratio", "p50", "p90", "p99", "p99.9", "errors"):
         table.add_column(column, justify="left" if column in ("request", "load") else "right")

@@ -33,7 +33,7 @@ def bodies(kind: str, labels: Sequence[str], seed: int = 0) -> list[dict[str, An
 
 
 def requests(kind: str, route: str, labels: Sequence[str]) -> list[bytes]:
-    """Return the requests of one kind as bytes."""
+    """Return the requests of one kind to a route, as bytes."""
     return [prepared(route, body) for body in bodies(kind, labels)]
 
 

@@ -19,7 +19,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 class ServerError(RuntimeError):
-    """A server ended, or it was not ready in time."""
+    """A server process ended, or the server was not ready in time."""
 
 
 @dataclass(frozen=True)

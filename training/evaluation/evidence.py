@@ -54,7 +54,7 @@ _REMOVALS = 2
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One question, asked with and without additional evidence.
+    """One question about a scene, asked with labels only and with additional evidence.
 
     Attributes:
         place: index of the scene.

@@ -153,7 +153,7 @@ def compare_command(
         str, typer.Option("--store", help="the model store: a folder or a URL")
     ] = "model_store",
     limit: Annotated[int, typer.Option(min=2, help="maximum number of scenes")] = 300,
-    examples: Annotated[int, typer.Option(min=0, help="number of changed answers to show")] = 3,
+    examples: Annotated[int, typer.Option(min=0, help="number of example questions to show")] = 3,
     output: Annotated[Path | None, typer.Option("--json", help="write all results here")] = None,
 ) -> None:
     """Compare two models on scenes held out from both.
@@ -189,7 +189,7 @@ def _root(given: Path | None, *sides: Side) -> Path:
 
 
 def show(comparison: Comparison, console: Console) -> None:
-    """Print the table, the notes and the examples."""
+    """Print the metrics of a comparison as a table, with its notes and examples."""
     title = f"{comparison.scenes} held-out scenes of {comparison.groups} groups"
     table = Table(title=title, title_justify="left")
     for name in ("task", "metric", comparison.a, comparison.b, "difference", ""):
@@ -336,7 +336,7 @@ def _tensors(scenes: Sequence[AnnotatedScene], vocabulary: Vocabulary) -> SceneT
 
 
 def _notes(a: Side, b: Side, held: HeldOut, limit: int | None, groups: int) -> Iterator[str]:
-    """Return remarks on the results."""
+    """Generate remarks on the results, for the user."""
     yield from held.notes
     asked, other = a.vocabulary, b.vocabulary
     if asked is not None and other is not None and not same_classes(asked, other):

@@ -58,7 +58,7 @@ class Material:
         """Create the tensors of split scenes.
 
         Raises:
-            ConfigError: a part is empty.
+            ConfigError: the training, validation or test part contains no scenes.
         """
         for part, some in scenes.parts.items():
             if not some:
@@ -229,5 +229,5 @@ def _fit(
 
 
 def has_relations(scenes: SceneTensors) -> bool:
-    """Return True if a scene has an annotated relation."""
+    """Return True if any of the scenes has an annotated relation."""
     return any(scene.evidence.holds.any() for scene in scenes.scenes)

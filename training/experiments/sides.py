@@ -163,7 +163,7 @@ def _baselines(data: TrainingData, say: Say) -> Contender:
 
 # --------------------------------------------------------------------------------- held-out scenes
 
-# Filter of scenes: returns False if the model is known to have learnt from the scene.
+# Function that takes a scene. It returns False if a model is known to have learnt from the scene.
 Kept = Callable[[AnnotatedScene], bool]
 
 
@@ -224,7 +224,7 @@ def held_out(
     if dropped:
         notes.append(
             f"{dropped} of {len(candidates)} test scenes of {a.title} are left out: {b.title} has "
-            "learnt from them, or from scenes of their groups"
+            "learnt from these scenes or from near-duplicates (same group)"
         )
     return HeldOut(kept, dropped, tuple(notes), certain)
 

@@ -400,12 +400,12 @@ def _conclude(search: Search, study: Study, original: Config) -> None:
     figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
     comment = [
         f"{original.name}, {shown(settings)}.",
-        f"Validation scenes, {search.config.training.epochs} epochs: {figures}.",
+        f"Metrics on validation scenes, {search.config.training.epochs} epochs: {figures}.",
     ]
     if settings and base is not None:
         ours, theirs = search.metrics(digest), search.metrics(base.user_attrs["digest"])
         gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
-        comment.append(f"Difference to {original.name}, paired by scenes: {', '.join(gaps)}.")
+        comment.append(f"Paired difference from {original.name}: {', '.join(gaps)}.")
         comment.append(
             f"The figures of the best of {len(study.trials)} trials are optimistic: train both "
             "configurations with several seeds."
