@@ -179,7 +179,9 @@ def scene_sampler(scenes: SceneTensors) -> Sampler:
                 fits &= scenes.room == room[row]
             places = fits.nonzero().squeeze(1).numpy()
             if not len(places):
-                raise ValueError(f"no scene has the given classes and room type of row {row}")
+                raise ValueError(
+                    f"no real scene has the observed classes and the room type of test scene {row}"
+                )
             own = free and row in places
             chosen.append(row if own else int(rng.choice(places)))
         index = torch.tensor(chosen)

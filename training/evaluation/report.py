@@ -157,7 +157,7 @@ def run(
     """
     if report.scenes != digest(setting):
         raise ValueError(
-            f"the report on {report.source} belongs to other scenes or questions: delete it"
+            f"the file of the report on {report.source} is from other scenes or tasks: delete it"
         )
     wanted = list(tasks)
     if unknown := sorted(set(wanted) - set(EVERY_TASK)):
