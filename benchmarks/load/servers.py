@@ -52,7 +52,7 @@ def cores() -> tuple[set[int], set[int]]:
 @contextmanager
 def service(store: Path, **settings: str) -> Iterator[Server]:
     """Run ``python -m app``; settings by name become SCENE_* variables."""
-    port = _free_port()
+    port = free_port()
     variables = {"SCENE_STORE": str(store.resolve()), "SCENE_PORT": str(port)}
     variables |= {f"SCENE_{name.upper()}": value for name, value in settings.items()}
     with _running(["-m", "app"], port, variables) as server:
@@ -62,12 +62,13 @@ def service(store: Path, **settings: str) -> Iterator[Server]:
 @contextmanager
 def plain() -> Iterator[Server]:
     """Run ``python -m benchmarks.load.plain``."""
-    port = _free_port()
+    port = free_port()
     with _running(["-m", "benchmarks.load.plain", str(port)], port, {}) as server:
         yield server
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a free port of the loopback address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

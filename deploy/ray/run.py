@@ -112,13 +112,14 @@ class Engine:
         self._process.terminate()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(STOP_TIMEOUT)
+        # Ended children of Ray stay zombies until this process ends.
         for number in (None, signal.SIGTERM, signal.SIGKILL):
-            if number is not None:
-                for pid, name in _descendants().items():
-                    print(f"ending process {pid} ({name})", file=sys.stderr)
-                    os.kill(pid, number)
             deadline = time.monotonic() + 5
-            while _descendants() and time.monotonic() < deadline:
+            for pid, command in descendants(os.getpid()).items() if number else ():
+                print(f"ending process {pid} ({command})", file=sys.stderr)
+                with suppress(ProcessLookupError):
+                    os.kill(pid, number)
+            while descendants(os.getpid()) and time.monotonic() < deadline:
                 time.sleep(0.1)
 
 
@@ -213,23 +214,19 @@ def _status(
         connection.close()
 
 
-def _descendants() -> dict[int, str]:
-    """Reap ended children; return the names of the running descendants by process id."""
-    try:
-        while os.waitpid(-1, os.WNOHANG)[0]:
-            pass
-    except ChildProcessError:
-        return {}
+def descendants(ancestor: int) -> dict[int, str]:
+    """Return the commands of the running descendants of a process, by process id."""
     parents: dict[int, int] = {}
-    names: dict[int, str] = {}
     for pid, status in _processes("stat"):
-        name, _, rest = status.partition(b"(")[2].rpartition(b")")
-        names[pid], parents[pid] = name.decode(errors="replace"), int(rest.split()[1])
-    found, new = {}, {os.getpid()}
+        state, parent = status.rpartition(b")")[2].split()[:2]
+        if state != b"Z":
+            parents[pid] = int(parent)
+    found, new = set[int](), {ancestor}
     while new:
         new = {pid for pid, parent in parents.items() if parent in new}
-        found |= {pid: names[pid] for pid in new}
-    return found
+        found |= new
+    commands = dict(_processes("cmdline"))
+    return {pid: commands.get(pid, b"").replace(b"\0", b" ").decode() for pid in found}
 
 
 def _processes(file: str) -> list[tuple[int, bytes]]:
