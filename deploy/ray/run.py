@@ -112,7 +112,6 @@ class Engine:
         self._process.terminate()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(STOP_TIMEOUT)
-        # Ended children of Ray stay zombies until this process ends.
         for number in (None, signal.SIGTERM, signal.SIGKILL):
             deadline = time.monotonic() + 5
             for pid, command in descendants(os.getpid()).items() if number else ():
@@ -121,6 +120,9 @@ class Engine:
                     os.kill(pid, number)
             while descendants(os.getpid()) and time.monotonic() < deadline:
                 time.sleep(0.1)
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
 
 
 def _options() -> argparse.Namespace:
@@ -152,6 +154,8 @@ def _environment(scratch: str, token: str) -> dict[str, str]:
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
         # Otherwise Ray examines the stack for every line of the log.
         "RAY_SERVE_LOG_TO_STDERR": "1",
+        # By default, the controller takes a tenth of a core.
+        "RAY_SERVE_CONTROL_LOOP_INTERVAL_S": "0.5",
         # Nothing outside this machine balances the load, so a replica can end at once.
         "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
         "RAY_USAGE_STATS_ENABLED": "0",

@@ -7,6 +7,7 @@ from logging.config import dictConfig
 from ray import serve
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.__main__ import tune
 from app.main import create_app
 from app.serving.logs import log_config
 from app.settings import Settings
@@ -41,6 +42,7 @@ class Replica:
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
         """Build the application. Ray Serve calls this method in the replica's process."""
+        tune()
         settings = Settings()
         dictConfig(log_config(settings.log_level, settings.log_format, settings.secrets))
         app = create_app(settings)

@@ -188,78 +188,6 @@ def load(service: LiveService, connections: int) -> Iterator[Counter[int]]:
 
 
 @pytest.mark.slow
-@pytest.mark.system
-class TestTwoReplicas:
-    @pytest.fixture(scope="class")
-    def service(
-        self, repository: Path, tmp_path_factory: pytest.TempPathFactory
-    ) -> Iterator[LiveService]:
-        log = tmp_path_factory.mktemp("ray") / "log"
-        with running(repository, log, "--replicas=2") as service:
-            wait(lambda: len(replicas(service)) == 2, 60)
-            yield service
-
-    def test_answers_equal_those_of_the_plain_service(
-        self, service: LiveService, shipped: LiveService
-    ) -> None:
-        for _ in range(4):
-            assert service.control() == shipped.control()
-
-    @pytest.mark.parametrize(
-        ("path", "headers"),
-        [
-            ("/missing", {}),
-            ("/missing", {"X-Request-Id": "mine"}),
-            ("/missing", {"X-Request-Timeout-Ms": "soon"}),
-            ("/missing", {"Content-Type": "text/plain"}),
-            ("/missing", {"Host": "evil.example"}),
-            ("/nothing", {}),
-        ],
-    )
-    def test_headers_and_problems_equal_those_of_the_plain_service(
-        self, service: LiveService, shipped: LiveService, path: str, headers: dict[str, str]
-    ) -> None:
-        ours, plain = (
-            one.client.post(path, json=SCENE, headers=headers) for one in (service, shipped)
-        )
-        assert ours.status_code == plain.status_code
-        names = ours.headers.keys() - {"server"}
-        assert names == plain.headers.keys()
-        for name in names - {"date", "x-request-id", "content-length"}:
-            assert ours.headers[name] == plain.headers[name]
-        assert ours.json()["request_id"] == ours.headers["x-request-id"]
-        different = {"request_id", "instance"}
-        assert {k: v for k, v in ours.json().items() if k not in different} == {
-            k: v for k, v in plain.json().items() if k not in different
-        }
-
-    def test_a_body_above_the_limit_is_refused_by_the_service(self, service: LiveService) -> None:
-        response = service.client.post("/missing", content=b" " * (3 * 2**20))
-        assert response.status_code == 413
-        assert response.headers["content-type"] == "application/problem+json"
-
-    def test_a_stream_gives_the_answers_of_requests(
-        self, service: LiveService, shipped: LiveService
-    ) -> None:
-        with opened(service) as stream:
-            assert talk(stream, "open", ask=ASK)["type"] == "opened"
-            message = talk(stream, "scene", seq=1, **STREAMED)
-        assert answered(message) == posted(shipped.client, STREAMED, ASK)
-
-    def test_a_killed_replica_is_replaced(self, service: LiveService) -> None:
-        before = replicas(service)
-        connections = 4
-        with load(service, connections) as statuses:
-            wait(lambda: statuses[200] > 100, 30)
-            os.kill(min(before), signal.SIGKILL)
-            wait(lambda: len(replicas(service) - before) == 1, 60)
-            count = statuses[200]
-            wait(lambda: statuses[200] > count + 100, 30)
-        assert sum(statuses.values()) - statuses[200] <= connections, statuses
-
-
-@pytest.mark.slow
-@pytest.mark.system
 def test_load_adds_a_replica_and_rest_removes_it(
     repository: Path, tmp_path: Path, config: dict[str, Any]
 ) -> None:
@@ -278,3 +206,75 @@ def test_load_adds_a_replica_and_rest_removes_it(
             wait(lambda: len(replicas(service)) == 2, 90)
         wait(lambda: len(replicas(service)) == 1, 90)
         assert statuses.keys() == {200}
+
+
+@pytest.fixture(scope="module")
+def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    log = tmp_path_factory.mktemp("ray") / "log"
+    with running(repository, log, "--replicas=2") as service:
+        wait(lambda: len(replicas(service)) == 2, 60)
+        yield service
+
+
+@pytest.mark.slow
+def test_answers_equal_those_of_the_plain_service(
+    service: LiveService, shipped: LiveService
+) -> None:
+    for _ in range(4):
+        assert service.control() == shipped.control()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("/missing", {}),
+        ("/missing", {"X-Request-Id": "mine"}),
+        ("/missing", {"X-Request-Timeout-Ms": "soon"}),
+        ("/missing", {"Content-Type": "text/plain"}),
+        ("/missing", {"Host": "evil.example"}),
+        ("/nothing", {}),
+    ],
+)
+def test_headers_and_problems_equal_those_of_the_plain_service(
+    service: LiveService, shipped: LiveService, path: str, headers: dict[str, str]
+) -> None:
+    ours, plain = (one.client.post(path, json=SCENE, headers=headers) for one in (service, shipped))
+    assert ours.status_code == plain.status_code
+    names = ours.headers.keys() - {"server"}
+    assert names == plain.headers.keys()
+    for name in names - {"date", "x-request-id", "content-length"}:
+        assert ours.headers[name] == plain.headers[name]
+    assert ours.json()["request_id"] == ours.headers["x-request-id"]
+    different = {"request_id", "instance"}
+    assert {k: v for k, v in ours.json().items() if k not in different} == {
+        k: v for k, v in plain.json().items() if k not in different
+    }
+
+
+@pytest.mark.slow
+def test_a_body_above_the_limit_is_refused_by_the_service(service: LiveService) -> None:
+    response = service.client.post("/missing", content=b" " * (3 * 2**20))
+    assert response.status_code == 413
+    assert response.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.slow
+def test_a_stream_gives_the_answers_of_requests(service: LiveService, shipped: LiveService) -> None:
+    with opened(service) as stream:
+        assert talk(stream, "open", ask=ASK)["type"] == "opened"
+        message = talk(stream, "scene", seq=1, **STREAMED)
+    assert answered(message) == posted(shipped.client, STREAMED, ASK)
+
+
+@pytest.mark.slow
+def test_a_killed_replica_is_replaced(service: LiveService) -> None:
+    before = replicas(service)
+    connections = 4
+    with load(service, connections) as statuses:
+        wait(lambda: statuses[200] > 100, 30)
+        os.kill(min(before), signal.SIGKILL)
+        wait(lambda: len(replicas(service) - before) == 1, 60)
+        count = statuses[200]
+        wait(lambda: statuses[200] > count + 100, 30)
+    assert sum(statuses.values()) - statuses[200] <= connections, statuses
