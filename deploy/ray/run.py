@@ -90,7 +90,7 @@ class Engine:
                 "--include-log-monitor=false",
             ],
             cwd=ROOT,
-            env=_environment(scratch, self._token),
+            env=environment(scratch, self._token),
             stdout=subprocess.DEVNULL,
             start_new_session=True,
         )
@@ -144,11 +144,12 @@ def _config(options: argparse.Namespace) -> dict[str, Any]:
     return config
 
 
-def _environment(scratch: str, token: str) -> dict[str, str]:
+def environment(scratch: str, token: str) -> dict[str, str]:
     """Return the environment of Ray. Variables of the caller take precedence."""
     return {
         "RAY_SERVE_ENABLE_HA_PROXY": "1",
         "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
+        "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "deploy.ray.middleware.middlewares",
         "RAY_SERVE_HAPROXY_NBTHREAD": "1",
         # The service's own metrics contain the requests.
         "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",

@@ -21,7 +21,7 @@ import pytest
 import yaml
 
 from app.settings import Settings
-from deploy.ray.run import descendants
+from deploy.ray.run import descendants, environment
 from tests.http.streams import ASK, answered, opened, posted, talk
 from tests.services import LiveService
 
@@ -101,6 +101,15 @@ def test_the_manifest_confines_pods_and_asks_for_a_token(
         assert ports["serve"] == config["http_options"]["port"]
 
 
+def test_the_manifest_has_the_settings_of_the_local_start(cluster: dict[str, Any]) -> None:
+    local = environment("scratch", "token")
+    for pod in pods(cluster):
+        settings = {one["name"]: one.get("value") for one in pod["containers"][0]["env"]}
+        shared = settings.keys() & local.keys() - {"SCENE_API_KEY"}
+        assert len(shared) >= 7
+        assert {name: settings[name] for name in shared} == {name: local[name] for name in shared}
+
+
 def test_the_network_policy_hides_the_ports_of_ray(folder: Path, config: dict[str, Any]) -> None:
     _, policy = yaml.safe_load_all((folder / "rayservice.yaml").read_text("utf-8"))
     assert policy["spec"]["policyTypes"] == ["Ingress"]
@@ -124,11 +133,11 @@ def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[Liv
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("SCENE_", "RAY_"))}
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("SCENE_", "RAY_"))}
     with log.open("w") as stream:
         process = subprocess.Popen(
             [python, repository / "deploy" / "ray" / "run.py", f"--port={port}", *arguments],
-            env=environment,
+            env=inherited,
             stdout=stream,
             stderr=stream,
             text=True,
@@ -230,6 +239,8 @@ def test_answers_equal_those_of_the_plain_service(
     [
         ("/missing", {}),
         ("/missing", {"X-Request-Id": "mine"}),
+        ("/missing", {"X-Request-Id": "not valid"}),
+        ("/missing", {"X-Request-Timeout-Seconds": "0.000001"}),
         ("/missing", {"X-Request-Timeout-Ms": "soon"}),
         ("/missing", {"Content-Type": "text/plain"}),
         ("/missing", {"Host": "evil.example"}),
