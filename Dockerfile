@@ -1,5 +1,6 @@
-# Stages: `runtime` (the default) serves; `train` trains into the same store.
+# Stages: `runtime` (the default) serves; `ray` serves by Ray Serve; `train` trains into the same store.
 #   docker build -t scene-boltzmann .
+#   docker build -t scene-boltzmann-ray --target ray .
 #   docker build -t scene-boltzmann-train --target train .
 
 FROM python:3.11-slim-bookworm AS base
@@ -36,6 +37,26 @@ ENV HOME=/tmp \
 USER 10001:10001
 ENTRYPOINT ["python", "-m", "training"]
 CMD ["--help"]
+
+# ---- the service by Ray Serve; deploy/ray/rayservice.yaml gives the command
+FROM packages AS ray-packages
+COPY requirements-ray.lock ./
+RUN /opt/venv/bin/python -m pip install --no-cache-dir --disable-pip-version-check -q \
+        -r requirements-ray.lock
+
+FROM base AS ray
+COPY --from=ray-packages /opt/venv /opt/venv
+COPY clients/python/scene_client ./scene_client
+COPY app ./app
+COPY deploy/ray ./deploy/ray
+COPY --chown=10001:10001 model_store ./model_store
+RUN NUMBA_CACHE_DIR=compiled python -m app.compile && chmod -R a+rX compiled
+ENV HOME=/tmp \
+    NUMBA_CACHE_DIR=/tmp/compiled \
+    PYTHONPATH=/srv/scene \
+    SCENE_STORE=/srv/scene/model_store
+USER 10001:10001
+CMD ["ray", "--help"]
 
 # ---- the service
 FROM base AS runtime

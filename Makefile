@@ -10,6 +10,8 @@ ARGS ?=
 MINUTES ?= 10
 
 VENV := .venv
+# Environment of the service with Ray.
+RAY_VENV := .venv-ray
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 # One worker more than cores, because the tests spend a third of their time waiting.
@@ -22,9 +24,10 @@ INDEX := $(if $(TORCH_INDEX_URL),--extra-index-url $(TORCH_INDEX_URL))
 # one environment.
 SERVICE := $(VENV)/.installed-service
 EVERYTHING := $(VENV)/.installed-everything
+RAY := $(RAY_VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: checks help run test test-fast test-slow docs chaos soak audit setup format bench lock clean
+.PHONY: checks help run ray test test-fast test-slow docs chaos soak audit setup format bench lock clean
 .DELETE_ON_ERROR:
 
 help:  ## show this help
@@ -32,6 +35,9 @@ help:  ## show this help
 
 run: $(SERVICE)  ## serve the shipped models on 127.0.0.1 (port: PORT=8000)
 	SCENE_HOST=127.0.0.1 SCENE_PORT=$(PORT) exec $(BIN)/python -m app
+
+ray: $(RAY)  ## serve by two replicas with Ray Serve on 127.0.0.1 (port: PORT=8000)
+	exec $(RAY_VENV)/bin/python deploy/ray/run.py --port $(PORT) --replicas 2
 
 test: checks  ## check lint, format, types and imports, then run all tests except the slow ones
 	$(PYTEST) -m "not slow" $(ARGS)
@@ -84,7 +90,7 @@ lock: $(BIN)/python  ## resolve the dependencies of pyproject.toml into requirem
 	$(BIN)/python scripts/lock.py $(INDEX) $(ARGS)
 
 clean:  ## remove the environment and all caches
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .numba_cache
+	rm -rf $(VENV) $(RAY_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .numba_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(SERVICE): requirements.lock pyproject.toml clients/python/pyproject.toml | $(BIN)/python
@@ -101,8 +107,16 @@ $(EVERYTHING): requirements-dev.lock pyproject.toml clients/python/pyproject.tom
 	@$(PIP) install -qq --no-deps --editable clients/python --editable .
 	@touch $(SERVICE) $@
 
+$(RAY): requirements-ray.lock pyproject.toml clients/python/pyproject.toml | $(RAY_VENV)/bin/python
+	@echo "Installing the service and Ray into $(RAY_VENV) ..."
+	@$(RAY_VENV)/bin/python -m pip --disable-pip-version-check install -qq -r requirements-ray.lock
+	@$(RAY_VENV)/bin/python -m pip --disable-pip-version-check install -qq --no-deps --editable clients/python --editable .
+	@echo "Compiling kernels for this machine ..."
+	@$(RAY_VENV)/bin/python -m app.compile
+	@touch $@
+
 # This target is an order-only prerequisite above, so an existing environment is never created again.
-$(BIN)/python:
+$(BIN)/python $(RAY_VENV)/bin/python:
 	@set -eu; for candidate in $(PYTHON) python3.13 python3.12 python3.11; do \
 	    if $$candidate -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
 	        found=$$candidate; break; fi; done; \
@@ -111,4 +125,4 @@ $(BIN)/python:
 	if ! $$found -c 'import ensurepip, venv' 2>/dev/null; then \
 	    echo "error: $$found cannot create virtual environments: its venv or ensurepip module is missing" \
 	         "(on Debian and Ubuntu: apt-get install python3-venv)" >&2; exit 1; fi; \
-	$$found -m venv --clear $(VENV) || { rm -rf $(VENV); exit 1; }
+	$$found -m venv --clear $(@:/bin/python=) || { rm -rf $(@:/bin/python=); exit 1; }

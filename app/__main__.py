@@ -44,6 +44,21 @@ _YOUNG = 10_000
 _M_MMAP_THRESHOLD, _LARGE = -3, 128 * 1024
 
 
+def tune() -> None:
+    """Set the garbage collector, the C library and OpenBLAS of this process for the service.
+
+    Call this function before the first import of numpy.
+    """
+    # Objects that the start creates stay in use. A search for garbage among them would take a fifth
+    # of the startup time. The runtime enables the garbage collector again after the start.
+    gc.disable()
+    gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
+    _give_back_what_is_large()
+    # A question needs only small matrix products. More threads would take cores from other
+    # processes. numpy reads this variable at its import.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 def _give_back_what_is_large() -> None:
     """Make the C library return freed blocks of 128 KiB or more to the operating system at once.
 
@@ -118,14 +133,7 @@ def serve(settings: Settings, began: float) -> int:
         sockets = _bind(settings.host, settings.port, settings.client_timeout)
     except OSError as error:
         return _refuse_address(settings, error)
-    # The start creates only objects that stay in use. A search for garbage among them would take a
-    # fifth of the startup time. After the start, the runtime enables the garbage collector again.
-    gc.disable()
-    gc.set_threshold(_YOUNG, *gc.get_threshold()[1:])
-    _give_back_what_is_large()
-    # The service computes only small matrix products, so one thread of OpenBLAS is enough. More
-    # threads would take cores from other processes. numpy reads this variable at its import.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    tune()
     from app.registry import StoreError
     from app.server import build
 

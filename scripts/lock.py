@@ -80,6 +80,7 @@ def main(pip_arguments: list[str]) -> None:
             ("requirements-dev.lock", "Everything: service, training, checks", development),
             ("requirements-training.lock", "The service and training", training),
             ("requirements.lock", "The service alone", runtime),
+            ("requirements-ray.lock", "The service and Ray Serve", runtime + extras["ray"]),
         ):
             if wanted is not development:
                 locked = resolve(wanted, pins, pip_arguments)

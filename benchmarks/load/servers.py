@@ -60,7 +60,7 @@ def service(store: Path, **settings: str) -> Iterator[Server]:
         store: folder of the model store.
         settings: further settings of the service. `name` sets the variable SCENE_NAME.
     """
-    port = _free_port()
+    port = free_port()
     variables = {"SCENE_STORE": str(store.resolve()), "SCENE_PORT": str(port)}
     variables |= {f"SCENE_{name.upper()}": value for name, value in settings.items()}
     with _running(["-m", "app"], port, variables) as server:
@@ -70,12 +70,13 @@ def service(store: Path, **settings: str) -> Iterator[Server]:
 @contextmanager
 def plain() -> Iterator[Server]:
     """Run the plain app (``python -m benchmarks.load.plain``)."""
-    port = _free_port()
+    port = free_port()
     with _running(["-m", "benchmarks.load.plain", str(port)], port, {}) as server:
         yield server
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a free port of the loopback address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

@@ -61,7 +61,7 @@ def test_compose_file_fits_the_compose_specification(
     run(checker, schema, repository / "docker-compose.yml")
 
 
-@pytest.mark.parametrize("name", ["runtime", "train"])
+@pytest.mark.parametrize("name", ["runtime", "ray", "train"])
 def test_final_stages_run_as_a_fixed_unprivileged_user(
     stages: dict[str, list[Instruction]], compose: dict[str, Any], name: str
 ) -> None:
@@ -149,22 +149,23 @@ def test_the_store_is_one_volume_where_the_image_keeps_its_models(
         assert f"models:{store}" in service["volumes"]
 
 
-@pytest.mark.parametrize("lock", ["", "-training", "-dev"])
+@pytest.mark.parametrize("lock", ["", "-ray", "-training", "-dev"])
 def test_locks_pin_every_package_and_name_no_build_or_index(repository: Path, lock: str) -> None:
     lines = (repository / f"requirements{lock}.lock").read_text("utf-8").splitlines()
     pins = [line for line in lines if not line.startswith("#")]
-    assert ("torch==2.13.0" in pins) == (lock != "")
+    assert ("torch==2.13.0" in pins) == (lock in {"-training", "-dev"})
     for pin in pins:
         assert re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*(; .+)?", pin), pin
 
 
 def test_smaller_locks_are_subsets_of_the_larger(repository: Path) -> None:
-    service, training, development = (
+    service, ray, training, development = (
         {
             line
             for line in (repository / f"requirements{which}.lock").read_text("utf-8").splitlines()
             if not line.startswith("#")
         }
-        for which in ("", "-training", "-dev")
+        for which in ("", "-ray", "-training", "-dev")
     )
     assert service < training < development
+    assert service < ray

@@ -1,0 +1,291 @@
+"""Ray Serve: its configuration, and two replicas on this machine (with .venv-ray)."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import yaml
+
+from app.settings import Settings
+from deploy.ray.run import descendants, environment
+from tests.http.streams import ASK, answered, opened, posted, talk
+from tests.services import LiveService
+
+SCENE = {"objects": ["bed", "lamp"]}
+STREAMED = {"objects": ["bed", "lamp", {"id": "desk_1", "label": "desk"}]}
+
+
+@pytest.fixture(scope="module")
+def folder(repository: Path) -> Path:
+    return repository / "deploy" / "ray"
+
+
+@pytest.fixture(scope="module")
+def config(folder: Path) -> dict[str, Any]:
+    return yaml.safe_load((folder / "serve.yaml").read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def cluster(folder: Path) -> dict[str, Any]:
+    service, _ = yaml.safe_load_all((folder / "rayservice.yaml").read_text("utf-8"))
+    return service["spec"]
+
+
+def pods(cluster: dict[str, Any]) -> list[dict[str, Any]]:
+    """The specifications of the head's pod and of the workers' pods."""
+    spec = cluster["rayClusterConfig"]
+    groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
+    return [group["template"]["spec"] for group in groups]
+
+
+def test_the_manifest_has_the_same_configuration_for_another_host(
+    config: dict[str, Any], cluster: dict[str, Any]
+) -> None:
+    copy = yaml.safe_load(cluster["serveConfigV2"])
+    assert config["http_options"]["host"] == "127.0.0.1"
+    assert copy["http_options"]["host"] == "0.0.0.0"
+    copy["http_options"]["host"] = "127.0.0.1"
+    assert copy == config
+
+
+def test_the_configuration_agrees_with_the_application(
+    folder: Path, repository: Path, config: dict[str, Any]
+) -> None:
+    (application,) = config["applications"]
+    module, _, attribute = application["import_path"].partition(":")
+    source = (repository / f"{module.replace('.', '/')}.py").read_text("utf-8")
+    assert re.search(rf"^{attribute} = ", source, re.MULTILINE)
+    (deployment,) = application["deployments"]
+    assert f'@serve.deployment(name="{deployment["name"]}")' in source
+    assert application["route_prefix"] == "/"
+    fields = Settings.model_fields
+    assert config["http_options"]["port"] == fields["port"].default
+    # The service answers with its own problems before Ray Serve refuses requests.
+    most = deployment["max_ongoing_requests"] + deployment["max_queued_requests"]
+    assert most >= fields["max_connections"].default
+    assert deployment["max_ongoing_requests"] > fields["max_streams"].default
+    assert deployment["graceful_shutdown_timeout_s"] > fields["drain_timeout"].default
+
+
+def test_the_manifest_confines_pods_and_asks_for_a_token(
+    cluster: dict[str, Any], config: dict[str, Any], repository: Path
+) -> None:
+    spec = cluster["rayClusterConfig"]
+    assert spec["authOptions"] == {"mode": "token"}
+    lock = (repository / "requirements-ray.lock").read_text("utf-8")
+    assert f"ray=={spec['rayVersion']}" in lock.splitlines()
+    most = config["applications"][0]["deployments"][0]["autoscaling_config"]["max_replicas"]
+    assert spec["workerGroupSpecs"][0]["maxReplicas"] == most
+    for pod in pods(cluster):
+        assert pod["securityContext"]["runAsNonRoot"]
+        for container in (*pod["initContainers"], *pod["containers"]):
+            assert container["resources"].keys() == {"requests", "limits"}
+            confined = container["securityContext"]
+            assert confined["readOnlyRootFilesystem"]
+            assert not confined["allowPrivilegeEscalation"]
+        ports = {port["name"]: port["containerPort"] for port in pod["containers"][0]["ports"]}
+        assert ports["serve"] == config["http_options"]["port"]
+
+
+def test_the_manifest_has_the_settings_of_the_local_start(cluster: dict[str, Any]) -> None:
+    local = environment("scratch", "token")
+    for pod in pods(cluster):
+        settings = {one["name"]: one.get("value") for one in pod["containers"][0]["env"]}
+        shared = settings.keys() & local.keys() - {"SCENE_API_KEY"}
+        assert len(shared) >= 7
+        assert {name: settings[name] for name in shared} == {name: local[name] for name in shared}
+
+
+def test_the_network_policy_hides_the_ports_of_ray(folder: Path, config: dict[str, Any]) -> None:
+    _, policy = yaml.safe_load_all((folder / "rayservice.yaml").read_text("utf-8"))
+    assert policy["spec"]["policyTypes"] == ["Ingress"]
+    labels = {"app": "scene-ray"}
+    assert policy["spec"]["podSelector"]["matchLabels"] == labels
+    for rule in policy["spec"]["ingress"]:
+        peer = rule["from"][0]["podSelector"]["matchLabels"]
+        if peer["app" if "app" in peer else "app.kubernetes.io/name"] == "scene-proxy":
+            assert [entry["port"] for entry in rule["ports"]] == [config["http_options"]["port"]]
+
+
+# ---------------------------------------------------------------------------- running replicas
+
+
+@contextmanager
+def running(repository: Path, log: Path, *arguments: str | Path) -> Iterator[LiveService]:
+    """Run `deploy/ray/run.py` on a free port, and check that no process remains after it."""
+    python = repository / ".venv-ray" / "bin" / "python"
+    if not python.with_name("ray").exists():
+        pytest.skip("Ray is not installed; make ray installs it")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("SCENE_", "RAY_"))}
+    with log.open("w") as stream:
+        process = subprocess.Popen(
+            [python, repository / "deploy" / "ray" / "run.py", f"--port={port}", *arguments],
+            env=inherited,
+            stdout=stream,
+            stderr=stream,
+            text=True,
+        )
+    started: dict[int, str] = {}
+    try:
+        wait(lambda: "ready:" in log.read_text() or process.poll() is not None, 240)
+        assert process.poll() is None, log.read_text()
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
+            yield LiveService(process, client, port, log)
+    finally:
+        started = descendants(process.pid)
+        process.send_signal(signal.SIGTERM)
+        process.wait(timeout=120)
+    assert process.returncode == 0, log.read_text()
+    assert "ending process" not in log.read_text()
+    assert not [command for pid, command in started.items() if Path(f"/proc/{pid}").exists()]
+
+
+def wait(condition: Callable[[], bool], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "the condition is still false"
+        time.sleep(0.2)
+
+
+def replicas(service: LiveService) -> set[int]:
+    """Process ids of the replicas."""
+    found = descendants(service.process.pid).items()
+    return {pid for pid, command in found if command.startswith("ray::ServeReplica")}
+
+
+@contextmanager
+def load(service: LiveService, connections: int) -> Iterator[Counter[int]]:
+    """Ask on several connections without pauses; count the answers by status, 0 without one."""
+    statuses: Counter[int] = Counter()
+    ends = threading.Event()
+
+    def ask() -> None:
+        with httpx.Client(base_url=service.url, timeout=30) as client:
+            while not ends.is_set():
+                try:
+                    status = client.post("/missing", json=SCENE).status_code
+                except httpx.TransportError:
+                    status = 0
+                statuses[status] += 1
+
+    threads = [threading.Thread(target=ask) for _ in range(connections)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield statuses
+    finally:
+        ends.set()
+        for thread in threads:
+            thread.join()
+
+
+@pytest.mark.slow
+def test_load_adds_a_replica_and_rest_removes_it(
+    repository: Path, tmp_path: Path, config: dict[str, Any]
+) -> None:
+    file = tmp_path / "serve.yaml"
+    config = deepcopy(config)
+    config["applications"][0]["deployments"][0]["autoscaling_config"] |= {
+        "max_replicas": 2,
+        "upscale_delay_s": 1,
+        "downscale_delay_s": 5,
+        "look_back_period_s": 5,
+    }
+    file.write_text(yaml.safe_dump(config), "utf-8")
+    with running(repository, tmp_path / "log", "--config", file) as service:
+        assert len(replicas(service)) == 1
+        with load(service, 24) as statuses:
+            wait(lambda: len(replicas(service)) == 2, 90)
+        wait(lambda: len(replicas(service)) == 1, 90)
+        assert statuses.keys() == {200}
+
+
+@pytest.fixture(scope="module")
+def service(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    log = tmp_path_factory.mktemp("ray") / "log"
+    with running(repository, log, "--replicas=2") as service:
+        wait(lambda: len(replicas(service)) == 2, 60)
+        yield service
+
+
+@pytest.mark.slow
+def test_answers_equal_those_of_the_plain_service(
+    service: LiveService, shipped: LiveService
+) -> None:
+    for _ in range(4):
+        assert service.control() == shipped.control()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("/missing", {}),
+        ("/missing", {"X-Request-Id": "mine"}),
+        ("/missing", {"X-Request-Id": "not valid"}),
+        ("/missing", {"X-Request-Timeout-Seconds": "0.000001"}),
+        ("/missing", {"X-Request-Timeout-Ms": "soon"}),
+        ("/missing", {"Content-Type": "text/plain"}),
+        ("/missing", {"Host": "evil.example"}),
+        ("/nothing", {}),
+    ],
+)
+def test_headers_and_problems_equal_those_of_the_plain_service(
+    service: LiveService, shipped: LiveService, path: str, headers: dict[str, str]
+) -> None:
+    ours, plain = (one.client.post(path, json=SCENE, headers=headers) for one in (service, shipped))
+    assert ours.status_code == plain.status_code
+    names = ours.headers.keys() - {"server"}
+    assert names == plain.headers.keys()
+    for name in names - {"date", "x-request-id", "content-length"}:
+        assert ours.headers[name] == plain.headers[name]
+    assert ours.json()["request_id"] == ours.headers["x-request-id"]
+    different = {"request_id", "instance"}
+    assert {k: v for k, v in ours.json().items() if k not in different} == {
+        k: v for k, v in plain.json().items() if k not in different
+    }
+
+
+@pytest.mark.slow
+def test_a_body_above_the_limit_is_refused_by_the_service(service: LiveService) -> None:
+    response = service.client.post("/missing", content=b" " * (3 * 2**20))
+    assert response.status_code == 413
+    assert response.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.slow
+def test_a_stream_gives_the_answers_of_requests(service: LiveService, shipped: LiveService) -> None:
+    with opened(service) as stream:
+        assert talk(stream, "open", ask=ASK)["type"] == "opened"
+        message = talk(stream, "scene", seq=1, **STREAMED)
+    assert answered(message) == posted(shipped.client, STREAMED, ASK)
+
+
+@pytest.mark.slow
+def test_a_killed_replica_is_replaced(service: LiveService) -> None:
+    before = replicas(service)
+    connections = 4
+    with load(service, connections) as statuses:
+        wait(lambda: statuses[200] > 100, 30)
+        os.kill(min(before), signal.SIGKILL)
+        wait(lambda: len(replicas(service) - before) == 1, 60)
+        count = statuses[200]
+        wait(lambda: statuses[200] > count + 100, 30)
+    assert sum(statuses.values()) - statuses[200] <= connections, statuses
