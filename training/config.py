@@ -162,6 +162,12 @@ class TrainingConfig(_Section):
     patience: int | None = Field(default=None, ge=1)
     seed: int = 0
     threads: int = Field(default=1, ge=1)
+    # Left out of the dump when auto, so that digests of earlier runs stay valid.
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto",
+        exclude_if=lambda device: device == "auto",
+        description="device of the epochs; auto: a GPU if there is one",
+    )
 
 
 class Config(_Section):

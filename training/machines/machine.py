@@ -70,7 +70,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def index_triples(self) -> None:
         """Check the table of triples and build its search keys."""
         table = self.triples.long()
-        limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V])
+        limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V], device=table.device)
         if bool((table < 0).any()) or bool((table >= limits).any()):
             raise ValueError("triples must hold (a, i, j) within (A, V, V)")
         relation, subject, object_ = table.unbind(1)
@@ -144,11 +144,14 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
         """Return the units that may be on given v, as (edges, r, observed).
 
         r contains the values of the given units.
+
+        Args:
+            least: least number of classes between which there are units, with padding.
         """
 
     @abstractmethod

@@ -69,7 +69,7 @@ class RBM(BoltzmannMachine):
         return edges, r, known
 
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
         """Return all T units with the given values."""
         if given is not None:

@@ -257,7 +257,7 @@ class Triway(BoltzmannMachine):
         return logits + self.residual[position] * found
 
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
         """Return the units between present classes; the classes of the given units come first.
 
@@ -267,7 +267,8 @@ class Triway(BoltzmannMachine):
         frame = None if given is None else _pairs(given[0])
         if frame is not None and len(frame.subjects) != len(v):
             raise ValueError(f"observed relations must have one row per chain, {len(v)} rows")
-        edges = self.edges(present_classes(v, None if frame is None else frame.subjects))
+        leading = None if frame is None else frame.subjects
+        edges = self.edges(present_classes(v, leading, least))
         r = self.b.new_zeros(edges.shape)
         known = torch.zeros_like(r, dtype=torch.bool)
         if frame is not None and given is not None:
