@@ -131,6 +131,7 @@ class Options:
         baselines: baselines to measure; None means all.
         limit: maximum scenes of a source for slow tasks.
         workers: number of processes.
+        ray: address of a Ray cluster; empty measures in local processes.
         quick: use few scenes, epochs and baselines.
         fresh: delete earlier reports.
     """
@@ -141,6 +142,7 @@ class Options:
     baselines: tuple[str, ...] | None = None
     limit: int = 300
     workers: int = 1
+    ray: str = ""
     quick: bool = False
     fresh: bool = False
 
@@ -192,6 +194,9 @@ def benchmark(
         int, typer.Option(min=1, help="maximum scenes of a source for slow tasks")
     ] = 300,
     workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
+    ray: Annotated[
+        str, typer.Option(help="address of a Ray cluster that measures the rows; local: a new one")
+    ] = "",
     seed_protocol: Annotated[
         bool, typer.Option("--seed-protocol", help="also run the protocol of the seed paper")
     ] = False,
@@ -218,6 +223,7 @@ def benchmark(
             baselines=QUICK_BASELINES if quick and wanted is None else wanted,
             limit=_QUICK_LIMIT if quick else limit,
             workers=workers,
+            ray=ray,
             quick=quick,
             fresh=fresh,
         )
@@ -412,7 +418,10 @@ def _plan(
 def _measured(plan: Plan, rows: Sequence[Row], options: Options, title: str) -> Reports:
     with shown(console, title, len(rows) * len(plan.settings)) as progress:
         reports, _ = measure_rows(
-            plan, rows, progress, workers=options.workers, fresh=options.fresh
+            *(plan, rows, progress),
+            workers=options.workers,
+            ray=options.ray,
+            fresh=options.fresh,
         )
     return reports
 
