@@ -9,12 +9,12 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -40,6 +40,9 @@ from training.runs import (
     write_plot,
 )
 
+if TYPE_CHECKING:
+    from training.shards import Shards
+
 _VALIDATION_SCENES = 400
 _DRAWN_EVERY = 20.0  # s
 # Called during the training of the objects, with the finished share.
@@ -62,6 +65,7 @@ class TrainingData:
         digest: digest of the scenes, their vocabulary and split. A run resumes only if the digest
             is unchanged.
         words: (V, D) unit word vectors of the classes, 0 where unknown; None without word vectors.
+        shards: the training scenes of a sharded source, of which `train` is a sample.
     """
 
     train: SceneTensors
@@ -72,6 +76,7 @@ class TrainingData:
     room_types: int
     digest: str = ""
     words: Tensor | None = None
+    shards: Shards | None = None
 
 
 def new_machine(config: Config, data: TrainingData, generator: torch.Generator) -> BoltzmannMachine:
@@ -178,7 +183,7 @@ class Trainer:
                 self.machine.get_parameter(name).requires_grad_(False)
         self.loss = distributed.parallel(_Loss(self.objective, self.machine))
         self.optimiser = self._optimiser()
-        self.steps_per_epoch = max(1, math.ceil(len(self.train) / config.training.batch_size))
+        self.steps_per_epoch = self._steps()
         self.scheduler = self._scheduler()
         self.average = {k: p.detach().clone() for k, p in self.machine.named_parameters()}
         self.updates = 0
@@ -233,7 +238,7 @@ class Trainer:
         def factor(step: int) -> float:
             if step < rise:
                 return (step + 1) / rise
-            return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(total - rise, 1)))
+            return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(total - rise, 1))))
 
         return torch.optim.lr_scheduler.LambdaLR(self.optimiser, factor)
 
@@ -322,15 +327,15 @@ class Trainer:
     def _epoch(self, progress: Progress | None) -> None:
         began = time.perf_counter()
         number = len(self.epochs)
-        order = torch.randperm(len(self.train), generator=self.generator)
-        total = 0.0
-        size = self.config.training.batch_size
-        for step in range(self.steps_per_epoch):
-            total += self._update(order[step * size : (step + 1) * size])
-            if progress is not None:
-                progress(number, (step + 1) / self.steps_per_epoch, total / (step + 1))
+        total, steps = 0.0, 0
+        for scenes in self._parts():
+            order = torch.randperm(len(scenes), generator=self.generator)
+            for index in order.split(self.config.training.batch_size):
+                total, steps = total + self._update(scenes, index), steps + 1
+                if progress is not None:
+                    progress(number, min(1.0, steps / self.steps_per_epoch), total / steps)
         everyone = distributed.total(torch.tensor(total, dtype=torch.float64))
-        loss = float(everyone) / distributed.size() / self.steps_per_epoch
+        loss = float(everyone) / distributed.size() / steps
         finite = all(bool(p.isfinite().all()) for p in self.machine.parameters())
         if not math.isfinite(loss) or not finite:
             raise FloatingPointError(
@@ -338,9 +343,24 @@ class Trainer:
             )
         self._close_epoch(number, loss, began)
 
-    def _update(self, index: Tensor) -> float:
-        width = max(len(self.train.scenes[k].evidence.classes) for k in index.tolist())
-        batch = self.train.batch(distributed.share(index), width).to(self.device)
+    def _steps(self) -> int:
+        """Return the updates of an epoch; with shards an estimate from the sample."""
+        scenes = len(self.train)
+        if self.data.shards is not None:
+            scenes = round(scenes * self.data.shards.scale)
+        return max(1, math.ceil(scenes / self.config.training.batch_size))
+
+    def _parts(self) -> Iterator[SceneTensors]:
+        """Yield the scenes of an epoch, shard by shard."""
+        if self.data.shards is None:
+            yield self.train
+            return
+        for scenes in self.data.shards.parts(self.generator):
+            yield _with_relations(scenes) if self.config.objects.epochs else scenes
+
+    def _update(self, scenes: SceneTensors, index: Tensor) -> float:
+        width = max(len(scenes.scenes[k].evidence.classes) for k in index.tolist())
+        batch = scenes.batch(distributed.share(index), width).to(self.device)
         with self._placed():
             loss = self.loss(batch, self.generator)
             self.optimiser.zero_grad()
