@@ -2,8 +2,8 @@
 
 The processes hold the same weights and see the same global batch, split by rows. Their losses add
 up to the loss of one process, and DistributedDataParallel adds their gradients. Every process draws
-the random numbers of the whole batch and keeps those of its rows (`SharedGenerator`), so a run does
-not depend on the number of processes, up to the rounding of sums.
+the random numbers of the whole batch and keeps those of its rows (`SharedGenerator`). So a run with
+another number of processes differs by the rounding of sums only. Rounding may change a Gibbs draw.
 
 Without `torchrun`, there is one process, and all functions return their input unchanged.
 """

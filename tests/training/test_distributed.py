@@ -35,7 +35,7 @@ SEED = {
     "machine.form": "seed",
     "training.optimiser": "sgd",
     "training.schedule": "constant",
-    "training.learning_rate": 0.01,
+    "training.learning_rate": 0.001,
 }
 CASES = {
     "composite": {"objective.object_dropout": 0.1, "objective.count_dropout": 0.2},
@@ -104,7 +104,7 @@ def test_two_processes_follow_one_for_200_updates(tmp_path, case):
     result = CliRunner().invoke(app, ["train", config, "--runs", str(one)])
     assert result.exit_code == 0, result.output
     output = torchrun(2, "-m", "training", "train", config, "--runs", str(two))
-    assert output.count("best epoch") == 2  # in the table and below it, by one process
+    assert output.count("curve in") == 1  # one process prints
     single, split = (folder / "small/seed-0" for folder in (one, two))
     assert len(losses(single)) == 50
     assert losses(split) == pytest.approx(losses(single), rel=1e-4)

@@ -44,7 +44,7 @@ class Messages(Protocol):
         """Remove and return the oldest message."""
 
     def empty(self) -> bool:
-        """Return whether there is no message."""
+        """Return whether all messages were read."""
 
 
 def measure_in_workers(
