@@ -44,6 +44,10 @@ class Batch:
     def __len__(self) -> int:
         return len(self.v)
 
+    def to(self, device: torch.device) -> Batch:
+        """Return the batch on a device."""
+        return Batch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
     def rows(self, index: Tensor) -> Batch:
         """Return the scenes at the given indices. A mask selects the scenes where it is True."""
         return Batch(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
@@ -82,11 +86,11 @@ class SceneTensors:
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def batch(self, index: Tensor) -> Batch:
-        """Return the scenes at the given indices as one batch."""
+    def batch(self, index: Tensor, width: int = 0) -> Batch:
+        """Return the scenes at the given indices as one batch, with at least `width` classes."""
         chosen = [self.scenes[k].evidence for k in index.tolist()]
-        n = max((len(e.classes) for e in chosen), default=0)
-        relations = chosen[0].holds.shape[0] if chosen else 0
+        n = max([width, *(len(e.classes) for e in chosen)])
+        relations = self.scenes[0].evidence.holds.shape[0] if self.scenes else 0
         classes = np.full((len(chosen), n), -1, dtype=np.int64)
         counts = np.ones((len(chosen), n), dtype=np.int64)
         holds = np.zeros((len(chosen), relations, n, n), dtype=np.float32)

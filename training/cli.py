@@ -31,6 +31,7 @@ from training.config import (
     with_settings,
 )
 from training.datasets import DatasetError
+from training.distributed import is_first, process_group
 from training.domain.command import example, fail, init
 from training.evaluation.everyday import EVERYDAY
 from training.evaluation.report import Row, evaluate
@@ -94,19 +95,22 @@ def train(
 ) -> None:
     """Train a configuration. With --publish, also calibrate, evaluate and publish the model."""
     try:
-        config = load_config(configuration, seed=seed)
-        root = data_folder(configuration, config, data)
-        scenes = _prepare(config, root)
-        folder = runs / config.name / f"seed-{config.training.seed}"
-        measured = None
-        if final:
-            if publish is not None:
-                measured = load_run(folder), scenes
-            config = with_settings(config, {"data.split": "final"})
+        with process_group():
+            first = is_first()
+            console.quiet = not first
+            config = load_config(configuration, seed=seed)
+            root = data_folder(configuration, config, data)
             scenes = _prepare(config, root)
-            folder = folder.with_name(f"final-{folder.name}")
-        _train(config, scenes, folder, root, fresh, tensorboard)
-        if publish is not None:
+            folder = runs / config.name / f"seed-{config.training.seed}"
+            measured = None
+            if final:
+                if publish is not None:
+                    measured = load_run(folder), scenes
+                config = with_settings(config, {"data.split": "final"})
+                scenes = _prepare(config, root)
+                folder = folder.with_name(f"final-{folder.name}")
+            _train(config, scenes, folder, root, fresh, tensorboard)
+        if publish is not None and first:
             _publish(load_run(folder), scenes, store, publish, alias, measured)
     except (
         *(ConfigError, DatasetError, RegistryError, RunError),
@@ -254,7 +258,7 @@ def _train(
     fresh: bool,
     tensorboard: Path | None,
 ) -> None:
-    if fresh:
+    if fresh and is_first():
         for name in ("checkpoint.pt", "result.json"):
             (folder / name).unlink(missing_ok=True)
     trainer = Trainer(config, scenes.training_data(), folder)
@@ -262,13 +266,15 @@ def _train(
         console.print(f"resuming after epoch {len(trainer.epochs)}")
     console.print(f"{config.name}: {trainer.machine.parameter_count:,} weights")
     try:
-        with Display(trainer, console, tensorboard) as display:
+        with Display(trainer, console, tensorboard if is_first() else None) as display:
             result = trainer.run(display.progress, display.ended, display.objects)
     except KeyboardInterrupt:
         # Count the epochs in the checkpoint, because the last epoch may be finished but not saved.
         kept = len(trainer.epochs) if trainer.resume() else 0
         console.print(f"stopped after epoch {kept}; run the same command to continue")
         raise typer.Exit(130) from None
+    if not is_first():
+        return
     save_run(folder, config, result, data=root, scenes=scenes.digest)
     summarise(result, trainer, folder, console)
 

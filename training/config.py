@@ -28,8 +28,15 @@ def is_file(source: str) -> bool:
 
 
 def source_name(source: str) -> str:
-    """Return the name of a data source. A file name is cut at its first dot."""
+    """Return the name of a source; for a file, the part of its name before the first dot."""
+    if is_sharded(source):
+        return Path(source).name.partition("*")[0].strip("-_.") or Path(source).parent.name
     return Path(source).name.partition(".")[0] if is_file(source) else source
+
+
+def is_sharded(source: str) -> bool:
+    """Return whether a source is a pattern of many files, see `training.shards`."""
+    return "*" in source
 
 
 class _Section(BaseModel):
@@ -52,6 +59,13 @@ class DataConfig(_Section):
     split_seed: int = 0
     rooms: int = Field(default=0, ge=0, description="scenes to generate where `rooms` is a source")
     limit: int | None = Field(default=None, ge=10, description="maximum scenes of each source")
+    # Left out of the dump by default, so that digests of earlier runs stay valid.
+    sample: int = Field(
+        default=1,
+        ge=1,
+        exclude_if=lambda count: count == 1,
+        description="number of files of a sharded source whose scenes stay in memory",
+    )
     words: str = Field(
         default="", description="file of word vectors in the data folder; empty: no vectors"
     )
@@ -65,7 +79,9 @@ class DataConfig(_Section):
     def _distinct(self) -> DataConfig:
         names = [source_name(source) for source in self.sources]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two sources are called {', '.join(twice)}; rename one of the files")
+            raise ValueError(f"two sources are called {', '.join(twice)}: rename a file")
+        if any(map(is_sharded, self.sources)) and (len(self.sources) > 1 or self.split != "stable"):
+            raise ValueError('a sharded source must be the only source, with data.split = "stable"')
         return self
 
     @property
@@ -168,6 +184,12 @@ class TrainingConfig(_Section):
     patience: int | None = Field(default=None, ge=1)
     seed: int = 0
     threads: int = Field(default=1, ge=1)
+    # Left out of the dump when auto, so that digests of earlier runs stay valid.
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto",
+        exclude_if=lambda device: device == "auto",
+        description="device of the epochs; auto: a GPU if there is one",
+    )
 
 
 class Config(_Section):

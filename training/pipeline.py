@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from app.scene import CANONICAL, Vocabulary
 from training.batches import SceneTensors, scene_tensors
-from training.config import DATA, Config, ConfigError, DataConfig, is_file, source_name
+from training.config import DATA, Config, ConfigError, DataConfig, is_file, is_sharded, source_name
 from training.datasets import (
     AnnotatedScene,
     EncodedScene,
@@ -30,6 +31,7 @@ from training.datasets import (
     with_typical_sizes,
 )
 from training.datasets.words import class_vectors, read_word_vectors
+from training.shards import Shards, read_shard, shard_files, shards_digest
 from training.trainer import TrainingData
 
 
@@ -38,14 +40,13 @@ class SplitScenes:
     """The encoded scenes of the train, validation and test part, and their origin.
 
     Attributes:
-        data: section `data` of the configuration. It names the data sources.
-        vocabulary: object classes, relations and room types. The scenes contain their indices.
-        parts: maps the name of each part to the encoded scenes of all data sources.
-        counts: maps the name of each data source to its number of scenes.
-        digests: maps the name of each data source to the sha256 of its scenes.
-        shuffle: seed of the permutation of objects between scenes. None means no permutation.
-        words: word vectors of the classes with length 1, (classes, dimensions). None means no word
-            vectors.
+        data: the configuration section that names the sources.
+        vocabulary: classes; the scenes use their indices.
+        parts: scenes of all sources, by part.
+        counts, digests: number of scenes and sha256 of their contents, by source.
+        shuffle: seed of the permutation of objects; None if the objects are not permuted.
+        words: (V, D) unit word vectors of the classes; None without word vectors.
+        shards: files of a sharded source, of which `parts` are a sample.
     """
 
     data: DataConfig
@@ -55,6 +56,7 @@ class SplitScenes:
     digests: dict[str, str]
     shuffle: int | None = None
     words: torch.Tensor | None = None
+    shards: tuple[str, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -98,6 +100,17 @@ class SplitScenes:
             room_types=len(self.vocabulary.room_types),
             digest=self.digest,
             words=self.words,
+            shards=self._sharded(annotated) if self.shards else None,
+        )
+
+    def _sharded(self, annotated: dict[str, np.ndarray]) -> Shards:
+        return Shards(
+            files=self.shards,
+            source=source_name(self.data.sources[0]),
+            sample=self.data.sample,
+            vocabulary=self.vocabulary,
+            annotated=annotated,
+            seed=self.data.split_seed,
         )
 
     def shuffled(self, seed: int) -> SplitScenes:
@@ -122,7 +135,13 @@ def read_sources(data: DataConfig, root: Path) -> dict[str, list[AnnotatedScene]
     scenes: dict[str, list[AnnotatedScene]] = {}
     for source in data.sources:
         name = source_name(source)
-        if source == "rooms":
+        if is_sharded(source):
+            found = [
+                scene
+                for file in shard_files(source, root)[: data.sample]
+                for scene in read_shard(file, name)
+            ]
+        elif source == "rooms":
             found = generate_rooms(data.rooms, seed=data.split_seed)
         elif source == priors.SOURCE:
             found = priors.read_prior_scenes(root / "extra" / f"{source}.tsv.gz")
@@ -199,13 +218,18 @@ def split_and_encode(
     parts = split(everything, seed=data.split_seed, protocol=data.split)
     if vocabulary is None:
         vocabulary = build_vocabulary(data, list(parts["train"]), root)
+    shards = shard_files(data.sources[0], root) if is_sharded(data.sources[0]) else ()
+    digests = {source: digest_of(some) for source, some in scenes.items()}
+    if shards:
+        digests = {source: shards_digest(shards) for source in scenes}
     return SplitScenes(
         data=data,
         vocabulary=vocabulary,
         parts={part: encode(some, vocabulary) for part, some in parts.items()},
         counts={source: len(some) for source, some in scenes.items()},
-        digests={source: digest_of(some) for source, some in scenes.items()},
+        digests=digests,
         words=_word_vectors(data, vocabulary, root),
+        shards=shards,
     )
 
 

@@ -165,7 +165,7 @@ def load_checkpoint(path: Path, digest: str) -> dict[str, Any]:
         RunError: the file cannot be read, or belongs to another configuration or other scenes.
     """
     try:
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise RunError(f"{path.name} cannot be read: {error}") from error
     if state.get("digest") != digest:

@@ -139,8 +139,9 @@ class Options:
         baselines: names of the baselines to measure. None means all baselines.
         limit: maximum number of scenes per data source in slow tasks.
         workers: number of processes.
-        quick: True uses few scenes, epochs and baselines, to test the command.
-        fresh: True deletes earlier reports.
+        ray: address of a Ray cluster; empty measures in local processes.
+        quick: use few scenes, epochs and baselines.
+        fresh: delete earlier reports.
     """
 
     root: Path
@@ -149,6 +150,7 @@ class Options:
     baselines: tuple[str, ...] | None = None
     limit: int = 300
     workers: int = 1
+    ray: str = ""
     quick: bool = False
     fresh: bool = False
 
@@ -199,7 +201,10 @@ def benchmark(
     limit: Annotated[
         int, typer.Option(min=1, help="maximum scenes per data source in slow tasks")
     ] = 300,
-    workers: Annotated[int, typer.Option(min=1, help="number of single-threaded processes")] = 2,
+    workers: Annotated[int, typer.Option(min=1, help="processes with one thread each")] = 2,
+    ray: Annotated[
+        str, typer.Option(help="address of a Ray cluster that measures the rows; local: a new one")
+    ] = "",
     seed_protocol: Annotated[
         bool, typer.Option("--seed-protocol", help="also use the protocol of Bozcan et al. (2018)")
     ] = False,
@@ -226,6 +231,7 @@ def benchmark(
             baselines=QUICK_BASELINES if quick and wanted is None else wanted,
             limit=_QUICK_LIMIT if quick else limit,
             workers=workers,
+            ray=ray,
             quick=quick,
             fresh=fresh,
         )
@@ -431,7 +437,10 @@ def _plan(
 def _measured(plan: Plan, rows: Sequence[Row], options: Options, title: str) -> Reports:
     with shown(console, title, len(rows) * len(plan.settings)) as progress:
         reports, _ = measure_rows(
-            plan, rows, progress, workers=options.workers, fresh=options.fresh
+            *(plan, rows, progress),
+            workers=options.workers,
+            ray=options.ray,
+            fresh=options.fresh,
         )
     return reports
 

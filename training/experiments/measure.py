@@ -14,22 +14,15 @@ Several processes fill these files in parallel. One process with one thread meas
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
-import pickle  # nosec B403
 import re
 import shutil
-import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
-import torch
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
@@ -41,11 +34,10 @@ from training.evaluation.report import SourceReport, digest, measure, pooled, wr
 from training.evaluation.setting import Setting
 from training.evaluation.tasks import ONCE, WHOLE_SET
 from training.experiments.rows import Material, Rival, Row
+from training.experiments.workers import Progress, measure_in_workers
 from training.runs import RunError
 
-# A progress function receives the row, the source, and a note on the current step.
-Progress = Callable[[str, str, str], None]
-# Last note on a row and data source: the report was measured now, or it was read from a file.
+# The last note on a row and source tells whether the report was measured now or read from a file.
 DONE, KNOWN = "done", "known"
 Reports = dict[tuple[str, int], dict[str, SourceReport]]
 
@@ -167,6 +159,7 @@ def measure_rows(
     progress: Progress,
     *,
     workers: int = 1,
+    ray: str = "",
     fresh: bool = False,
     failures: tuple[type[Exception], ...] = (),
 ) -> tuple[Reports, dict[str, str]]:
@@ -176,8 +169,8 @@ def measure_rows(
     disk.
 
     Args:
-        workers: number of worker processes. With 1, this process measures the rows.
-        fresh: True deletes earlier reports of these rows.
+        workers, ray: see `measure_in_workers`.
+        fresh: delete earlier reports of these rows.
         failures: exception types that end only the row in which they occur.
 
     Returns:
@@ -195,12 +188,14 @@ def measure_rows(
     for row in rows:
         if row not in missing:
             plan.measure(row, progress)
-    if workers > 1 and missing:
-        count = min(workers, len(missing))
-        failed = _in_workers(plan, missing, progress, count, failures)
+    if ray:  # tasks may start in another folder
+        plan = replace(plan, folder=plan.folder.resolve())
+    work = partial(_failure, plan, failures)
+    if missing and (ray or workers > 1):
+        failed = measure_in_workers(work, missing, progress, min(workers, len(missing)), ray)
     else:
         for row in missing:
-            if error := _failure(plan, row, progress, failures):
+            if error := work(row, progress):
                 failed[row.name, row.seed] = error
     reasons = {name: f"seed {seed}: {error}" for (name, seed), error in failed.items()}
     kept = [row for row in rows if row.name not in reasons]
@@ -208,7 +203,7 @@ def measure_rows(
 
 
 def _failure(
-    plan: Plan, row: Row, progress: Progress, failures: tuple[type[Exception], ...]
+    plan: Plan, failures: tuple[type[Exception], ...], row: Row, progress: Progress
 ) -> Exception | None:
     try:
         plan.measure(row, progress)
@@ -307,81 +302,3 @@ def _note_parameters(place: Path, count: int | None) -> None:
     values = json.loads(path.read_text(encoding="utf-8"))
     if values.get("parameters") != count:
         write_whole(path, json.dumps(values | {"parameters": count}))
-
-
-# ------------------------------------------------------------------------------------- processes
-
-_Message = tuple[str, str, str]
-# Seconds between two checks for progress messages of the worker processes.
-_TICK = 0.2
-# Linear algebra libraries read their number of threads from these variables when they are loaded.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-_plan: Plan
-_messages: SimpleQueue[_Message]
-
-
-def _in_workers(
-    plan: Plan,
-    rows: Sequence[Row],
-    progress: Progress,
-    workers: int,
-    failures: tuple[type[Exception], ...],
-) -> dict[tuple[str, int], Exception]:
-    """Measure rows in worker processes. Return the exceptions of failed rows by (name, seed).
-
-    Only exceptions of the types `failures` are returned; others are raised.
-    """
-    # Pickling avoids the shared memory of torch, which is small in containers.
-    material = pickle.dumps(plan)
-    context = multiprocessing.get_context("spawn")
-    # SimpleQueue has no sending thread. All messages of a finished row are therefore already in it.
-    messages: SimpleQueue[_Message] = context.SimpleQueue()
-    with (
-        _one_thread(),
-        ProcessPoolExecutor(
-            workers, context, initializer=_begin, initargs=(material, messages)
-        ) as pool,
-    ):
-        futures = {pool.submit(_work, row, failures): (row.name, row.seed) for row in rows}
-        try:
-            while True:
-                done, waiting = wait(futures, _TICK, FIRST_EXCEPTION)
-                while not messages.empty():
-                    progress(*messages.get())
-                failed = {futures[future]: error for future in done if (error := future.result())}
-                if not waiting:
-                    return failed
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _begin(material: bytes, messages: SimpleQueue[_Message]) -> None:
-    global _plan, _messages  # set once in each worker
-    # Ctrl-C reaches every process of the terminal. Only the main process must handle it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-    # Unpickling is safe here: the main process created these bytes.
-    _plan = pickle.loads(material)  # noqa: S301  # nosec B301
-    _messages = messages
-
-
-def _work(row: Row, failures: tuple[type[Exception], ...]) -> Exception | None:
-    return _failure(_plan, row, lambda *message: _messages.put(message), failures)

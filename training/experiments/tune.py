@@ -1,12 +1,13 @@
 """`python -m training tune`: search for settings on validation scenes with optuna.
 
-A trial trains one machine with one choice of settings. The command writes these files:
-
-<folder>/<configuration>/study.log   all trials, in optuna's journal format
-                         <digest>/   training curve, reports and checkpoint of one trial
+<folder>/<configuration>/study.log   all trials, as a journal of optuna
+                         trial-<n>/  curve, reports and checkpoint of a trial
                          best.toml   the best configuration
 
-A search space is a TOML file. It lists choices or an interval for each searched setting:
+Several processes may run the same command. They share the trials through the journal. On several
+machines, --folder is on a shared file system.
+
+A search space is a TOML file of settings with choices or intervals:
 
     "machine.H1" = [100, 200, 400]
     "training.weight_decay" = { low = 0.01, high = 0.1, log = true }
@@ -18,7 +19,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
+import socket
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -93,7 +96,11 @@ def tune(
     by: Annotated[By, typer.Option(help="metric to maximise")] = "both",
     seed: Annotated[int, typer.Option(help="seed of the sampler")] = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="epochs of a trial")] = None,
-    prune: Annotated[bool, typer.Option(help="stop trials below the median trial")] = True,
+    study: Annotated[
+        Path | None,
+        typer.Option(help="journal of the trials, which processes share; default: in the folder"),
+    ] = None,
+    prune: Annotated[bool, typer.Option(help="stop trials below the median")] = True,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
         "runs/tuning"
@@ -110,19 +117,21 @@ def tune(
         original = load_config(configuration)
         distributions = load_space(_space(original, space), original)
         place = folder / original.name
+        journal = study or place / "study.log"
         if fresh:
             shutil.rmtree(place, ignore_errors=True)
+            journal.unlink(missing_ok=True)
         config = with_settings(original, {"training.epochs": epochs} if epochs else {})
         with console.status("reading and encoding scenes"):
             scenes = prepare(config, data_folder(configuration, config, data))
-        search = Search(place, config, scenes.training_data(), distributions, by)
-        study = search.open(scenes.digest, seed, prune=prune)
-        search.run(study, trials + 1)
-    console.print(_table(study, original.name))
-    if not _finished(study):
+        search = Search(place, config, scenes.training_data(), distributions, by, journal)
+        found = search.open(scenes.digest, seed, prune=prune)
+        search.run(found, trials + 1, seed)
+    console.print(_table(found, original.name))
+    if not _finished(found):
         console.print("[red]error:[/red] all trials failed or were stopped early")
         raise typer.Exit(1)
-    _conclude(search, study, original)
+    _conclude(search, found, original)
 
 
 def shipped_spaces() -> dict[str, Path]:
@@ -208,6 +217,7 @@ class Search:
         data: scenes for training and validation.
         space: distribution of each searched setting, by setting name.
         by: metric to maximise.
+        journal: file of the study; default: in the folder.
     """
 
     def __init__(
@@ -217,8 +227,10 @@ class Search:
         data: TrainingData,
         space: Mapping[str, BaseDistribution],
         by: By,
+        journal: Path | None = None,
     ) -> None:
         self.folder, self.config, self.data, self.space, self.by = folder, config, data, space, by
+        self.journal = journal or folder / "study.log"
 
     def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
         """Open the optuna study in the folder, or create it.
@@ -236,7 +248,8 @@ class Search:
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.folder.mkdir(parents=True, exist_ok=True)
-        backend = JournalFileBackend(str(self.folder / "study.log"))
+        self.journal.parent.mkdir(parents=True, exist_ok=True)
+        backend = JournalFileBackend(str(self.journal))
         warm_up = math.ceil(self.config.training.epochs * _WARM_UP) - 1
         study = optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
@@ -247,47 +260,64 @@ class Search:
             if prune
             else optuna.pruners.NopPruner(),
         )
-        # With an unchanged seed, a resumed search would try the first settings again.
-        study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.trials))
         identity = {"config": self.config.digest, "scenes": scenes, "by": self.by}
         if study.user_attrs.setdefault("identity", identity) != identity:
             raise ConfigError(
-                f"{self.folder} holds a search with another configuration, scenes or metric: use "
+                f"{self.journal} holds a search with another configuration, scenes or metric; use "
                 "--fresh or another folder"
             )
         study.set_user_attr("identity", identity)
         return study
 
-    def run(self, study: Study, trials: int) -> None:
-        """Run trials until the study has this number of trials.
+    def run(self, study: Study, trials: int, seed: int = 0) -> None:
+        """Run trials until the study has `trials`; the first trial uses the unchanged settings.
 
-        The first trial uses the unchanged settings.
+        Several processes may run trials of the study.
         """
+        import optuna
+
+        self._requeue(study)
+        while len(_counted(study)) < trials:
+            trial = study.ask()
+            if sum(other.number < trial.number for other in _counted(study)) >= trials:
+                # Another process took the last trial in the meantime.
+                study.tell(trial, state=optuna.trial.TrialState.FAIL)
+                return
+            trial.set_user_attr("process", _process())
+            # With one seed for all, each process would draw the same settings.
+            study.sampler = optuna.samplers.TPESampler(seed=seed + trial.number)
+            original = trial.user_attrs.get("as it is", trial.number == 0)
+            self._run(study, trial, {} if original else _suggested(trial, self.space))
+
+    def _requeue(self, study: Study) -> None:
+        """Queue the trials of ended processes again; the new trials resume from the checkpoints."""
+        from optuna.trial import TrialState
+
+        for halted in study.get_trials(states=(TrialState.RUNNING,)):
+            if _alive(halted.user_attrs.get("process", "")):
+                continue
+            attributes = {
+                "as it is": halted.user_attrs.get("as it is", halted.number == 0),
+                "folder": _folder(halted),
+            }
+            study.enqueue_trial(halted.params, user_attrs=attributes)
+            study.tell(halted.number, state=TrialState.FAIL)
+
+    def _run(self, study: Study, trial: Trial, settings: Mapping[str, Any]) -> None:
         import optuna
         from optuna.trial import TrialState
 
-        if not study.trials:
-            study.enqueue_trial({}, user_attrs={"as it is": True})
-        for halted in study.get_trials(states=(TrialState.RUNNING,)):
-            # Queue an interrupted trial again. The new trial resumes from the checkpoint.
-            original = halted.user_attrs.get("as it is", False)
-            study.enqueue_trial(halted.params, user_attrs={"as it is": original})
-            study.tell(halted.number, state=TrialState.FAIL)
-        while sum("settings" in known.user_attrs for known in study.trials) < trials:
-            trial = study.ask()
-            original = trial.user_attrs.get("as it is", False)
-            settings = {} if original else _suggested(trial, self.space)
-            state, reason, value = TrialState.COMPLETE, "", None
-            try:
-                value = self.value_of(trial, settings)
-            except FloatingPointError as error:
-                state, reason = TrialState.FAIL, str(error)
-            except optuna.TrialPruned:
-                state, reason = TrialState.PRUNED, "below the median of earlier trials"
-            trial.set_user_attr("settings", settings)
-            trial.set_user_attr("reason", reason)
-            study.tell(trial, value, state)
-            console.print(f"{shown(settings)}: {reason or value}", markup=False)
+        state, reason, value = TrialState.COMPLETE, "", None
+        try:
+            value = self.value_of(trial, settings)
+        except FloatingPointError as error:
+            state, reason = TrialState.FAIL, str(error)
+        except optuna.TrialPruned:
+            state, reason = TrialState.PRUNED, "below the median of earlier trials"
+        trial.set_user_attr("settings", settings)
+        trial.set_user_attr("reason", reason)
+        study.tell(trial, value, state)
+        console.print(f"{shown(settings)}: {reason or value}", markup=False)
 
     def value_of(self, trial: Trial, settings: Mapping[str, Any]) -> float:
         """Train the machine of one trial, and return its metric on validation scenes.
@@ -299,8 +329,7 @@ class Search:
         import optuna
 
         config = with_settings(self.config, settings)
-        place = self.folder / config.digest[:12]
-        trial.set_user_attr("digest", config.digest)
+        place = self.folder / _folder(trial)
         trainer = Trainer(config, self.data, place)
         trainer.resume()
         reported = 0
@@ -333,16 +362,12 @@ class Search:
             self.data.validation, self.data.structure, self.data.train, seen=None
         ):
             measure(place / f"{source}.json", contender, setting, source, tasks=tasks)
-        return self.metrics(trainer.config.digest)
+        return self.metrics(place)
 
-    def metrics(self, digest: str) -> dict[str, Metric]:
-        """Return the metrics of `FIGURES` for a finished trial, over all validation scenes.
-
-        Args:
-            digest: digest of the trial's configuration.
-        """
+    def metrics(self, place: Path) -> dict[str, Metric]:
+        """Return `FIGURES` of a finished trial in its folder, over all validation scenes."""
         texts = (
-            (self.folder / digest[:12] / f"{source}.json").read_text(encoding="utf-8")
+            (place / f"{source}.json").read_text(encoding="utf-8")
             for source in sorted({scene.source for scene in self.data.validation.scenes})
         )
         report = pooled([SourceReport.from_dict(json.loads(text)) for text in texts])
@@ -356,6 +381,36 @@ class Search:
 def shown(settings: Mapping[str, Any]) -> str:
     """Format the changed settings of a trial in one line."""
     return ", ".join(f"{name.partition('.')[2]} {v}" for name, v in settings.items()) or "as it is"
+
+
+def _counted(study: Study) -> list[FrozenTrial]:
+    """Return the trials that ended by themselves or that still run."""
+    return [
+        trial
+        for trial in study.trials
+        if "settings" in trial.user_attrs or trial.state.name == "RUNNING"
+    ]
+
+
+def _folder(trial: Trial | FrozenTrial) -> str:
+    """Return the name of a trial's folder, which a trial that is queued again keeps."""
+    return str(trial.user_attrs.get("folder", f"trial-{trial.number}"))
+
+
+def _process() -> str:
+    return f"{socket.gethostname()} {os.getpid()}"
+
+
+def _alive(process: str) -> bool:
+    """Return whether another process runs; those of other machines count as running."""
+    host, _, number = process.partition(" ")
+    if host != socket.gethostname():
+        return True
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return False
+    return process != _process()
 
 
 def _finished(study: Study) -> list[FrozenTrial]:
@@ -395,7 +450,7 @@ def _conclude(search: Search, study: Study, original: Config) -> None:
     """Write the best configuration to best.toml, with the original number of epochs."""
     best = study.best_trial
     base = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
-    settings, digest = best.user_attrs["settings"], best.user_attrs["digest"]
+    settings = best.user_attrs["settings"]
     tuned = with_settings(original, settings).model_copy(update={"name": f"{original.name}-tuned"})
     figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
     comment = [
@@ -403,7 +458,7 @@ def _conclude(search: Search, study: Study, original: Config) -> None:
         f"Metrics on validation scenes, {search.config.training.epochs} epochs: {figures}.",
     ]
     if settings and base is not None:
-        ours, theirs = search.metrics(digest), search.metrics(base.user_attrs["digest"])
+        ours, theirs = (search.metrics(search.folder / _folder(trial)) for trial in (best, base))
         gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
         comment.append(f"Paired difference from {original.name}: {', '.join(gaps)}.")
         comment.append(

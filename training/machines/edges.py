@@ -220,24 +220,25 @@ def find_triples(table: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
     return position, table[position] == keys
 
 
-def present_classes(v: Tensor, leading: Tensor | None = None) -> Tensor:
-    """Return the class indices of the present objects, (scenes, n) int64. Padding is -1.
+def present_classes(v: Tensor, leading: Tensor | None = None, least: int = 0) -> Tensor:
+    """Return the classes present in each row of v, (B, n) int64, padded with -1.
 
     Args:
-        v: presence of objects, (scenes, classes).
-        leading: present classes that come first in the result, (scenes, k).
+        leading: (B, k) present classes that come first, in the given order.
+        least: least number of columns n.
     """
     # numpy lists the active units several times faster than torch.
-    present = v.detach().numpy() > 0
-    lead = np.zeros((len(v), 0), np.int64) if leading is None else leading.numpy()
+    present = v.detach().cpu().numpy() > 0
+    lead = np.zeros((len(v), 0), np.int64) if leading is None else leading.cpu().numpy()
     rows = np.arange(len(v))[:, None]
     if lead.size:
         present[rows, lead] = False
     row, column = present.nonzero()
     counts = present.sum(1)
     width = lead.shape[1] + int(counts.max(initial=0))
+    width = max(width, least)
     classes = np.full((len(v), width), -1, dtype=np.int64)
     classes[:, : lead.shape[1]] = lead
     place = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
     classes[row, lead.shape[1] + place] = column
-    return torch.from_numpy(classes)
+    return torch.from_numpy(classes).to(v.device)

@@ -28,7 +28,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from training.machines.bernoulli import bernoulli
+from training.distributed import widest
+from training.machines.bernoulli import bernoulli, integers, uniform
 from training.machines.edges import Edges
 from training.machines.machine import BoltzmannMachine
 from training.machines.mean_field import Evidence, mean_field
@@ -200,12 +201,12 @@ def sample_h1(
         return _keep(clamp.h1, state.h1, bernoulli(prior, generator))
     h1 = state.h1
     weight = _observed_weight(machine, v, h1, given)
-    block = torch.randint(_PROPOSAL_BLOCKS, h1.shape, generator=generator)
+    block = integers(_PROPOSAL_BLOCKS, h1.shape, generator)
     for k in range(_PROPOSAL_BLOCKS):
         proposal = torch.where(block == k, bernoulli(prior, generator), h1)
         proposal = _keep(clamp.h1, h1, proposal)
         new = _observed_weight(machine, v, proposal, given)
-        accept = torch.rand(new.shape, generator=generator, dtype=new.dtype).log() < new - weight
+        accept = uniform(new.shape, generator, new.dtype).log() < new - weight
         h1 = torch.where(accept.unsqueeze(-1), proposal, h1)
         weight = torch.where(accept, new, weight)
     return h1
@@ -220,7 +221,7 @@ def presence_product(v: Tensor, W: Tensor) -> Tensor:
     if len(v) < _CHAINS:
         return v @ W
     # numpy lists the active units several times faster than torch.
-    on = np.flatnonzero(v.detach().numpy() != 0)
+    on = np.flatnonzero(v.detach().cpu().numpy() != 0)
     if on.size > _PRESENT * v.numel():
         return v @ W
     chains, classes = v.shape
@@ -265,7 +266,7 @@ def sample_relations(
         The layout of the relation units that can be 1 given v, and their values r, (chains, units).
         In a Triway machine, the units between the classes of `clamp.edges` come first.
     """
-    edges, r, known = machine.open_units(v, clamp.relations)
+    edges, r, known = machine.open_units(v, clamp.relations, widest(v, generator))
     logits, gate = machine.relation_logits(edges, v, h1), machine.gate(edges, v)
     if not machine.spec.G:
         return edges, torch.where(known, r, bernoulli(logits.sigmoid() * gate, generator))
@@ -282,8 +283,8 @@ def _drawing_order(like: Tensor, generator: torch.Generator) -> Tensor:
 
     The units of relation a from i to j and from j to i are always in different groups.
     """
-    group = torch.randint(_RELATION_GROUPS, like.shape, generator=generator)
-    later = torch.randint(2, like.shape, generator=generator).triu(1)
+    group = integers(_RELATION_GROUPS, like.shape, generator)
+    later = integers(2, like.shape, generator).triu(1)
     later = later + (1 - later.mT).tril(-1)
     return group + _RELATION_GROUPS * later
 

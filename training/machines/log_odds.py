@@ -36,7 +36,8 @@ class _ContextGain(torch.autograd.Function):
         growth = torch.expm1(W)
         mean = x.sigmoid()
         ctx.save_for_backward(mean, growth)
-        return torch.stack([torch.log1p(growth * row).sum(1) for row in mean])
+        rows = [torch.log1p(growth * row).sum(1) for row in mean]
+        return torch.stack(rows) if rows else mean.new_zeros(0, len(W))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:

@@ -72,7 +72,7 @@ class BoltzmannMachine(nn.Module, ABC):
     def index_triples(self) -> None:
         """Check the table of triples and build its search keys."""
         table = self.triples.long()
-        limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V])
+        limits = torch.tensor([self.spec.A, self.spec.V, self.spec.V], device=table.device)
         if bool((table < 0).any()) or bool((table >= limits).any()):
             raise ValueError(
                 "the table of triples has an index out of range; (a, i, j) must be below (A, V, V)"
@@ -159,16 +159,14 @@ class BoltzmannMachine(nn.Module, ABC):
 
     @abstractmethod
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
         """Return the relation units that can be 1 given the objects v.
 
-        The result is (edges, r, observed): layout, values and observed flags of the relation units.
+        r contains the values of the given units.
 
         Args:
-            v: presence of objects, (scenes, classes).
-            given: layout, values and observed flags of observed relations. The result contains the
-                same values for these relations.
+            least: least number of classes between which there are units, with padding.
         """
 
     @abstractmethod

@@ -70,7 +70,7 @@ class RBM(BoltzmannMachine):
         return edges, r, known
 
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
         """Return all relation units, with the values of the given relations."""
         if given is not None:

@@ -275,7 +275,7 @@ class Triway(BoltzmannMachine):
         return logits + self.residual[position] * found
 
     def open_units(
-        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None
+        self, v: Tensor, given: tuple[Edges, Tensor, Tensor] | None, least: int = 0
     ) -> tuple[Edges, Tensor, Tensor]:
         """Return the relation units between present classes.
 
@@ -286,11 +286,9 @@ class Triway(BoltzmannMachine):
         """
         frame = None if given is None else _pairs(given[0])
         if frame is not None and len(frame.subjects) != len(v):
-            raise ValueError(
-                f"the number of scenes with observed relations is wrong: pass {len(v)} rows, one "
-                "for each chain"
-            )
-        edges = self.edges(present_classes(v, None if frame is None else frame.subjects))
+            raise ValueError(f"observed relations must have one row per chain, {len(v)} rows")
+        leading = None if frame is None else frame.subjects
+        edges = self.edges(present_classes(v, leading, least))
         r = self.b.new_zeros(edges.shape)
         known = torch.zeros_like(r, dtype=torch.bool)
         if frame is not None and given is not None:

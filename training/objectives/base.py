@@ -13,6 +13,7 @@ from torch.nn.functional import softplus
 from training.batches import Batch, SceneTensors
 from training.config import ObjectiveConfig
 from training.machines import BoltzmannMachine
+from training.machines.bernoulli import uniform
 from training.machines.edges import Edges
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Objective(ABC):
         """
         self.config = config
         nothing = torch.zeros(machine.spec.V, dtype=torch.bool)
-        self.structure = nothing if structure is None else structure
+        self.structure = nothing if structure is None else structure.to(machine.b.device)
 
     # If True, training keeps the weights of the last epoch rather than of the best epoch. An
     # objective with a prior on the weights needs no early stopping.
@@ -46,7 +47,11 @@ class Objective(ABC):
 
     @abstractmethod
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return a scalar whose gradient is the update direction."""
+        """Return a scalar whose gradient is the update direction.
+
+        In several processes, the batch is a share of the global batch. The sum of their losses is
+        the loss of the global batch.
+        """
 
     def adjust_gradients(self, machine: BoltzmannMachine) -> None:  # noqa: B027
         """Change the gradients before the update, for example by centring.
@@ -69,7 +74,7 @@ class Objective(ABC):
         return machine
 
     def state(self) -> dict[str, Tensor]:
-        """Return the state of the objective for a checkpoint."""
+        """Return the state for a checkpoint, gathered from all processes."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:  # noqa: B027
@@ -77,8 +82,8 @@ class Objective(ABC):
 
 
 def withhold_rooms(batch: Batch, share: float, generator: torch.Generator) -> Tensor:
-    """Return the room types of the batch, (scenes,), of which a random share is unknown (-1)."""
-    hidden = torch.rand(len(batch), generator=generator) < share
+    """Return the room types of the batch, (B,), with a share of them hidden (-1)."""
+    hidden = uniform((len(batch),), generator) < share
     return torch.where(hidden, -1, batch.room)
 
 
@@ -86,7 +91,7 @@ def withhold_counts(batch: Batch, share: float, generator: torch.Generator) -> B
     """Return the batch with unknown instance counts (0) in a random share of its scenes."""
     if not share:
         return batch
-    withheld = torch.rand(len(batch), 1, generator=generator) < share
+    withheld = uniform((len(batch), 1), generator) < share
     return replace(batch, counts=batch.counts.masked_fill(withheld, 0))
 
 
@@ -114,8 +119,8 @@ def relation_nll(
     nll = bernoulli_nll(logits, r, weight).sum()
     if not machine.spec.G:
         return nll
-    share = torch.rand(len(r), 1, generator=generator)
-    given = r * observed * (torch.rand(r.shape, generator=generator) < share)
+    share = uniform((len(r), 1), generator)
+    given = r * observed * (uniform(r.shape, generator) < share)
     shifted = logits + machine.implied(edges, given, h1)
     return nll + bernoulli_nll(shifted, r, weight * (1 - given)).sum()
 

@@ -37,8 +37,9 @@ from torch.nn.functional import softplus
 
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
+from training.distributed import anywhere, gather, mean_part, share, total
 from training.machines import BoltzmannMachine
-from training.machines.bernoulli import bernoulli
+from training.machines.bernoulli import bernoulli, categorical, uniform
 from training.machines.gibbs import Clamp, bare_state, initial_state, run
 from training.machines.log_odds import object_log_odds
 from training.machines.mean_field import Evidence, mean_field
@@ -67,7 +68,7 @@ class Masked:
 def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) -> Masked | None:
     """Remove one random class from each scene that has at least two removable classes.
 
-    Return None if the batch has no such scene.
+    The result is None if the scenes of all processes have fewer.
 
     Args:
         structure: True for structure classes such as walls, (classes,) bool. Structure classes are
@@ -75,10 +76,10 @@ def mask_one_class(batch: Batch, structure: Tensor, generator: torch.Generator) 
     """
     removable = batch.v * ~structure
     enough = removable.sum(1) >= 2
-    if not bool(enough.any()):
+    if not anywhere(enough):
         return None
     batch, removable = batch.rows(enough), removable[enough]
-    target = torch.multinomial(removable, 1, generator=generator).squeeze(1)
+    target = categorical(removable, generator)
     v = batch.v.scatter(1, target.unsqueeze(1), 0.0)
     absent = (v == 0) & ~structure
     return Masked(batch, v, target, absent, removable.sum(1))
@@ -119,16 +120,19 @@ class ObjectChains:
             h2 = bernoulli(mean_field(machine, Evidence(v, room=room)).h2, generator)
             self._advance(machine, v, room, generator)
         chains = self.blocks
-        data = machine.free_energy(v, h2=h2, room=room).mean()
-        return data - machine.free_energy(chains["v"], h2=chains["h2"], room=chains["room"]).mean()
+        data = mean_part(machine.free_energy(v, h2=h2, room=room))
+        model = machine.free_energy(chains["v"], h2=chains["h2"], room=chains["room"])
+        return data - mean_part(model)
 
     def _advance(
         self, machine: BoltzmannMachine, v: Tensor, room: Tensor, generator: torch.Generator
     ) -> None:
         if not self.blocks:
-            pick = torch.randint(len(v), (self.count,), generator=generator)
-            state = initial_state(machine, v[pick], generator, Clamp(room=room[pick]))
-            self.blocks = {"v": state.v, "h1": state.h1, "h2": state.h2, "room": room[pick]}
+            v, room = gather(v), gather(room)
+            pick = share(torch.randint(len(v), (self.count,), generator=generator, device="cpu"))
+            v, room = v[pick], room[pick]
+            state = initial_state(machine, v, generator, Clamp(room=room))
+            self.blocks = {"v": state.v, "h1": state.h1, "h2": state.h2, "room": room}
         clamp = Clamp(room=self.blocks["room"])
         state = bare_state(machine, self.blocks["v"], self.blocks["h1"], self.blocks["h2"])
         state = run(machine, state, generator, self.steps, clamp, relations=False)
@@ -150,11 +154,11 @@ class CompositeLikelihood(Objective):
 
     def state(self) -> dict[str, Tensor]:
         """Return the persistent chains."""
-        return self.chains.blocks
+        return {name: gather(block) for name, block in self.chains.blocks.items()}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore the persistent chains."""
-        self.chains.blocks = dict(state)
+        self.chains.blocks = {name: share(block) for name, block in state.items()}
 
     def loss(self, machine: BoltzmannMachine, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the weighted sum of the terms, averaged over the scenes of the batch."""
@@ -176,7 +180,7 @@ class CompositeLikelihood(Objective):
         ranking = others.logsumexp(1) - chosen
         off = softplus(log_odds) * masked.absent.scatter(1, masked.target.unsqueeze(1), False)
         presence = masked.removable * softplus(-chosen) + off.sum(1)
-        return total + (ranking + self.config.presence_weight * presence).mean()
+        return total + mean_part(ranking + self.config.presence_weight * presence)
 
     def _log_odds(
         self,
@@ -190,10 +194,10 @@ class CompositeLikelihood(Objective):
         """
         v, batch = masked.v, masked.batch
         if self.config.structure_dropout:
-            drop = torch.rand(v.shape, generator=generator) < self.config.structure_dropout
+            drop = uniform(v.shape, generator) < self.config.structure_dropout
             v = v * ~(drop & self.structure)
         if self.config.object_dropout:
-            v = v * (torch.rand(v.shape, generator=generator) >= self.config.object_dropout)
+            v = v * (uniform(v.shape, generator) >= self.config.object_dropout)
         room = withhold_rooms(batch, self.config.room_dropout, generator)
         edges = None
         if machine.relations_act:
@@ -210,7 +214,7 @@ class CompositeLikelihood(Objective):
         includes the second term of `relation_nll`.
         """
         annotated = batch.observed.flatten(1).any(1)
-        if not bool(annotated.any()):
+        if not anywhere(annotated):
             return machine.b.sum() * 0.0
         some = batch.rows(annotated)
         if self.config.unlisted == "off":
@@ -223,7 +227,7 @@ class CompositeLikelihood(Objective):
         logits = machine.relation_logits(edges, some.v, h1)
         counted = observed * machine.gate(edges, some.v)
         nll = relation_nll(machine, edges, logits, r, observed, counted, h1, generator)
-        return nll / len(batch)
+        return nll / int(total(torch.tensor(len(batch))))
 
 
 def unlisted_off(batch: Batch, structure: Tensor) -> Batch:

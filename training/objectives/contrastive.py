@@ -25,6 +25,7 @@ from torch import Tensor
 
 from training.batches import Batch, relation_units
 from training.config import ObjectiveConfig
+from training.distributed import anywhere, gather, mean_part, share, total
 from training.machines import BoltzmannMachine
 from training.machines.bernoulli import bernoulli
 from training.machines.edges import Edges
@@ -55,7 +56,7 @@ def data_state(
     field = mean_field(machine, Evidence(batch.v, edges, r, observed, room), iterations=5)
     h1 = bernoulli(field.y.sigmoid(), generator)
     h2 = bernoulli(field.h2, generator)
-    if not bool((observed | ~edges.valid).all()):
+    if anywhere(~observed & edges.valid):
         p = machine.relation_logits(edges, batch.v, h1).sigmoid() * machine.gate(edges, batch.v)
         r = torch.where(observed, r, bernoulli(p, generator))
     return State(batch.v, h1, h2, r, edges), observed
@@ -86,9 +87,8 @@ def energy_difference(
         positive = machine.object_energy(data.v, data.h1, data.h2, data_room)
         positive = positive + relation_nll(machine, data.edges, data.v, data.h1, data.r, observed)
         negative = machine.object_energy(model.v, model.h1, model.h2, model_room)
-        return positive.mean() - negative.mean()
-    # One call computes the object parts of both terms. Sampled states always satisfy the gates, so
-    # a check of the gates is unnecessary.
+        return mean_part(positive) - mean_part(negative)
+    # Both terms in one pass. The states are reachable, so the gate need not be checked.
     bare, context = machine.linear_relations(data.edges, data.v, data.r)
     model_bare, model_context = machine.linear_relations(model.edges, model.v, model.r)
     free = machine.free_energy_given(
@@ -97,7 +97,7 @@ def energy_difference(
         torch.cat([data.h2, model.h2]) if machine.spec.H2 else None,
         torch.cat([data_room, model_room]),
     ).split([len(data.v), len(model.v)])
-    return (free[0] - bare).mean() - (free[1] - model_bare).mean()
+    return mean_part(free[0] - bare) - mean_part(free[1] - model_bare)
 
 
 class ContrastiveDivergence(Objective):
@@ -145,7 +145,7 @@ class PersistentCD(Objective):
             chains = gibbs_step(machine, chains, generator, relations=relations)
         self.chains = chains
         for offset, block in zip(self.offsets, (data.v, data.h1, data.h2), strict=True):
-            offset.lerp_(block.mean(0), 0.01)
+            offset.lerp_(total(mean_part(block)), 0.01)
         no_room = torch.full((len(chains.v),), -1)
         return energy_difference(machine, data, observed, chains, free, no_room)
 
@@ -157,18 +157,20 @@ class PersistentCD(Objective):
         if self.chains is not None:
             return self.chains
         if not self.saved:
-            b = machine.b.detach().sigmoid().expand(self.config.chains, -1)
+            chains = len(share(torch.arange(self.config.chains)))
+            b = machine.b.detach().sigmoid().expand(chains, -1)
             return initial_state(machine, bernoulli(b, generator), generator)
-        edges = machine.edges(self.saved["classes"])
-        return State(edges=edges, **{name: self.saved[name] for name in ("v", "h1", "h2", "r")})
+        edges = machine.edges(share(self.saved["classes"]))
+        blocks = {name: share(self.saved[name]) for name in ("v", "h1", "h2", "r")}
+        return State(edges=edges, **blocks)
 
     def state(self) -> dict[str, Tensor]:
         """Return the running means, the chains and the classes of the chains' relation units."""
         state = dict(zip(_OFFSETS, self.offsets, strict=True))
         if self.chains is None:
             return state
-        blocks = {name: getattr(self.chains, name) for name in ("v", "h1", "h2", "r")}
-        return state | blocks | {"classes": self.chains.edges.classes}
+        blocks = {name: gather(getattr(self.chains, name)) for name in ("v", "h1", "h2", "r")}
+        return state | blocks | {"classes": gather(self.chains.edges.classes)}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore the running means, and keep the chains for the next update."""

@@ -46,7 +46,9 @@ from torch.nn.utils.parametrize import (
 
 from training.batches import Batch, SceneTensors, relation_units
 from training.config import ObjectiveConfig
+from training.distributed import size, total
 from training.machines import BoltzmannMachine, build
+from training.machines.bernoulli import uniform
 from training.machines.mean_field import Evidence, mean_field
 from training.objectives.base import Objective, relation_nll, withhold_counts, withhold_rooms
 
@@ -80,7 +82,9 @@ class WordPrior(nn.Module):
 
     def __init__(self, words: Tensor, width: int, *, columns: bool) -> None:
         super().__init__()
-        self.words, self.columns = words, columns
+        self.register_buffer("words", words, persistent=False)
+        self.words: Tensor
+        self.columns = columns
         self.map = nn.Parameter(torch.zeros(words.shape[1], width))
 
     def forward(self, deviation: Tensor) -> Tensor:
@@ -115,7 +119,7 @@ class RelationLikelihood(Objective):
         weights = [config.source_weights.get(name, 1.0) for name in train.source_names]
         self.source_weights = torch.tensor(weights)
         if words is not None and config.word_weight:
-            add_word_prior(machine, words * config.word_weight)
+            add_word_prior(machine, words.to(machine.b.device) * config.word_weight)
 
     @classmethod
     def of(cls, config: ObjectiveConfig, machine: BoltzmannMachine, data: TrainingData) -> Self:
@@ -127,7 +131,7 @@ class RelationLikelihood(Objective):
         bake_word_prior(machine)
         if machine.has_residuals and machine.get_parameter("residual").requires_grad:
             return with_counted_residuals(
-                machine, train, self.offsets.detach(), self.source_weights
+                machine, train, self.offsets.detach().cpu(), self.source_weights.cpu()
             )
         return machine
 
@@ -165,7 +169,8 @@ class RelationLikelihood(Objective):
         logits = logits + offsets.gather(1, edges.relation.expand(len(batch), -1))
         known = observed * machine.gate(edges, batch.v) * weight
         nll = relation_nll(machine, edges, logits, r, observed, known, h1, generator)
-        return nll / len(batch) + self._prior(machine) / max(self.scenes, 1)
+        scenes = int(total(torch.tensor(len(batch))))
+        return nll / scenes + self._prior(machine) / max(self.scenes, 1) / size()
 
     def _prior(self, machine: BoltzmannMachine) -> Tensor:
         """Return the negative log prior of weights and offsets, up to a constant."""
@@ -180,12 +185,9 @@ class RelationLikelihood(Objective):
 
 
 def partly_shown(v: Tensor, generator: torch.Generator) -> Tensor:
-    """Return the scenes v, (scenes, classes), with random objects removed.
-
-    The probability of removal is drawn uniformly from 0 to 1 for each scene.
-    """
-    chance = torch.rand(len(v), 1, generator=generator)
-    return v * (torch.rand(v.shape, generator=generator) < chance)
+    """Hide objects of scenes (B, V) at random, each scene with its own uniform probability."""
+    chance = uniform((len(v), 1), generator)
+    return v * (uniform(v.shape, generator) < chance)
 
 
 def add_word_prior(machine: BoltzmannMachine, words: Tensor) -> None:
