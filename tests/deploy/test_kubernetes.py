@@ -115,9 +115,9 @@ def test_probes_ask_routes_of_the_service(container: dict[str, Any]) -> None:
         paths[probe] = get["path"]
     assert paths["livenessProbe"] == "/health/live"
     assert paths["readinessProbe"] == "/health/ready"
-    # Compilation on another CPU takes up to three minutes.
+    # Compilation on another CPU took 250 s on a busy machine.
     startup = container["startupProbe"]
-    assert startup["periodSeconds"] * startup["failureThreshold"] >= 180
+    assert startup["periodSeconds"] * startup["failureThreshold"] >= 500
 
 
 def test_ports_are_those_of_the_image(
