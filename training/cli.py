@@ -200,7 +200,7 @@ def evaluate_command(
             index = [k for k, scene in enumerate(some[part].scenes) if scene.source in wanted]
             if not index:
                 raise ConfigError(
-                    f"{reference}: the {part} part contains no scenes of {', '.join(wanted)}"
+                    f"{reference}: the {part} part has no scenes of the sources {', '.join(wanted)}"
                 )
             test = subset(some[part], torch.tensor(index, dtype=torch.int64))
             with console.status(reference) as status:

@@ -80,7 +80,7 @@ class Given:
     """E observed relations between the n classes of a scene. Each relation holds or does not hold.
 
     Attributes:
-        a: (E,) indices of the canonical relations.
+        a: (E,) number of the relation (left, on top, ...) of each unit.
         i, j: (E,) indices of the subject classes and of the object classes, from 0 to n - 1.
         r: (E,) 1 if the relation holds, else 0.
         g: (E,) product of the presence of subject and object class.
@@ -98,7 +98,7 @@ class Units(NamedTuple):
 
     Attributes:
         place: (E,) index of each unit's relation in the arguments of `select`.
-        a: (E,) indices of the canonical relations.
+        a: (E,) number of the relation (left, on top, ...) of each unit.
         base: (E,) logits ℓ_e without the term U_e·h1.
         z: (E, K') factors z_e of the weights U_e = G[a_e]'z_e. If G is empty, z_e is U_e.
     """

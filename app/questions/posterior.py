@@ -131,10 +131,10 @@ class Posterior(ScenePosterior):
         return found[absent]
 
     def absent_posterior(self, absent: Places, coverage: float) -> Floats:
-        """Return the log-odds that N absent classes are present but unlisted, (N,).
+        """Return the log-odds that each of N unlisted classes is present, (N,).
 
         Args:
-            absent: (N,) class indices.
+            absent: (N,) indices of the unlisted classes.
             coverage: probability that a present class is listed.
         """
         return with_unlisted(
@@ -159,7 +159,7 @@ def with_unlisted(
     coverage: float,
     closed: Floats | None = None,
 ) -> Floats:
-    """Return the log-odds that N absent classes are present but unlisted, (N,).
+    """Return the log-odds that each of N unlisted classes is present, (N,).
 
     The result is a weighted mean of two estimates:
 

@@ -355,7 +355,9 @@ class Runtime:
         try:
             found = self.models.resolve(reference).reference
         except (ModelUnavailableError, NotReadyError):
-            raise ModelUnusableError("The service refused to load this version.") from None
+            raise ModelUnusableError(
+                f"The service refused to load {reference}; GET /models gives the reason."
+            ) from None
         # If the reference is a name without a version, the alias follows the newest version.
         newest = reference == found.name
         return AliasTarget(name=found.name, version=None if newest else found.version)

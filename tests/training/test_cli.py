@@ -127,7 +127,7 @@ def test_from_rooms_to_answers(tmp_path, variant):
         (("train", "indoor-triway", "--data", "nowhere"), "pass the folder of this file"),
         (("publish", "nowhere", "1.0.0"), "no finished run"),
         (("evaluate", "nowhere", "--store", "nowhere"), "error"),
-        (("compare", "nowhere"), "must be a finished run or a model"),
+        (("compare", "nowhere"), "names neither the folder of a finished run nor a model"),
         (("compare", "baselines"), "first model must be trained"),
     ],
 )

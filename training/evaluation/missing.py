@@ -234,7 +234,7 @@ def rank_hidden(partial: Partial, structure: Tensor, score: ObjectScore) -> tupl
         ValueError: all scenes have fewer than two classes.
     """
     if not len(partial.v):
-        raise ValueError("T2 partial needs a scene with at least two classes")
+        raise ValueError("the task T2 partial needs a scene with at least two classes")
     values = ask_rows(score, partial.v)
     # -inf marks classes that are no candidates. So a candidate of probability 0 gets the smallest
     # finite score.

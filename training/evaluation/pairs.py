@@ -139,7 +139,7 @@ class PairAnswers:
         )
 
     def accuracy(self) -> Ratio:
-        """Return the share of pairs whose most probable relation of the eight is listed."""
+        """Return the share of pairs whose most probable relation is listed in the scene."""
         best = self.p == self.p.max(1, keepdims=True)
         right = (best & self.listed).sum(1) / best.sum(1)
         return Ratio.of_items(self.scene, right, self.scenes)

@@ -1,10 +1,12 @@
 """`python -m training tune`: search for settings on validation scenes with optuna.
 
-<folder>/<configuration>/study.log   all trials, as a journal of optuna
-                         <digest>/   curve, reports and checkpoint of a trial
+A trial trains one machine with one choice of settings. The command writes these files:
+
+<folder>/<configuration>/study.log   all trials, in optuna's journal format
+                         <digest>/   training curve, reports and checkpoint of one trial
                          best.toml   the best configuration
 
-A search space is a TOML file of settings with choices or intervals:
+A search space is a TOML file. It lists choices or an interval for each searched setting:
 
     "machine.H1" = [100, 200, 400]
     "training.weight_decay" = { low = 0.01, high = 0.1, log = true }
@@ -55,16 +57,17 @@ FIGURES = {
     "MRR": ("T2 missing", "MRR"),
     "R-precision": ("T1a relations", "R-precision, instance counts"),
 }
-"""Task and metric of the evaluation, by short name; these metrics rank the trials."""
+"""Metrics that rank the trials, by short name: (task, metric) of the evaluation."""
 
 _BY: dict[By, tuple[str, ...]] = {
     "mrr": ("MRR",),
     "r-precision": ("R-precision",),
     "both": tuple(FIGURES),
 }
-# All trials use the same scenes and seed, so that they differ only in the searched settings.
+# Settings that cannot be searched: trials are comparable only with the same scenes and seed.
 _FIXED = ("data.", "training.seed", "training.threads")
-# Median pruning starts after this number of finished trials, and this share of a trial's epochs.
+# Pruning stops a trial whose metric is below the median of earlier trials. It needs this number of
+# finished trials, and it starts after this share of the epochs of a trial.
 _RIVALS = 4
 _WARM_UP = 1 / 3
 
@@ -82,15 +85,15 @@ class _Interval(BaseModel):
 def tune(
     configuration: Annotated[str, typer.Argument(help="a TOML file, or a shipped configuration")],
     space: Annotated[
-        Path | None, typer.Option(help="TOML file of the search space; by default the shipped one")
+        Path | None, typer.Option(help="TOML file of the search space; by default the shipped file")
     ] = None,
     trials: Annotated[
-        int, typer.Option(min=1, help="number of trials, including earlier ones")
+        int, typer.Option(min=1, help="number of trials, including earlier trials")
     ] = 20,
     by: Annotated[By, typer.Option(help="metric to maximise")] = "both",
     seed: Annotated[int, typer.Option(help="seed of the sampler")] = 0,
     epochs: Annotated[int | None, typer.Option(min=1, help="epochs of a trial")] = None,
-    prune: Annotated[bool, typer.Option(help="stop trials below the median")] = True,
+    prune: Annotated[bool, typer.Option(help="stop trials below the median trial")] = True,
     data: Annotated[Path | None, typer.Option("--data", help="folder with the scene files")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="folder for the results")] = Path(
         "runs/tuning"
@@ -99,9 +102,9 @@ def tune(
 ) -> None:
     """Search for better settings on validation scenes only.
 
-    The first trial is the unchanged configuration. Optuna samples the settings of the other trials.
-    The command writes the best configuration to <folder>/<configuration>/best.toml. After Ctrl-C,
-    the same command continues with the next trial; finished trials are kept.
+    The first trial uses the unchanged configuration. Optuna chooses the settings of the other
+    trials. The command writes the best configuration to <folder>/<configuration>/best.toml. After
+    Ctrl-C, run the same command again: it keeps finished trials and resumes the interrupted trial.
     """
     with resumable(console):
         original = load_config(configuration)
@@ -123,7 +126,7 @@ def tune(
 
 
 def shipped_spaces() -> dict[str, Path]:
-    """Return the shipped search spaces by the name of their configuration."""
+    """Return the files of the shipped search spaces, by configuration name."""
     folder = Path(__file__).parents[1] / "configs/spaces"
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
@@ -132,18 +135,21 @@ def _space(config: Config, path: Path | None) -> Path:
     shipped = shipped_spaces()
     if path is None and config.name not in shipped:
         raise ConfigError(
-            f"no shipped search space for {config.name}, only for {', '.join(shipped)}: name a "
-            "TOML file with --space"
+            f"{config.name} has no shipped search space (available for: {', '.join(shipped)}). "
+            "Pass a TOML file with --space"
         )
     return path or shipped[config.name]
 
 
 def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
-    """Read a search space; all its values must be valid in the configuration.
+    """Read a search space, and check its values in the configuration.
+
+    Returns:
+        The distribution of each searched setting, by setting name.
 
     Raises:
-        ConfigError: the file is missing or not TOML, an entry is neither choices nor an interval,
-            or a setting is unknown, invalid or fixed.
+        ConfigError: the file is missing or not TOML, an entry is neither a list of choices nor an
+            interval, a value is invalid for its setting, or a setting cannot be searched.
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -156,7 +162,7 @@ def load_space(path: Path, config: Config) -> dict[str, BaseDistribution]:
     found = {}
     for name, entry in values.items():
         if name.startswith(_FIXED):
-            raise ConfigError(f"{name!r} must be the same in all trials: remove it from the space")
+            raise ConfigError(f"{name!r} must be equal in all trials: remove it from the space")
         try:
             found[name] = _distribution(entry)
         except (ValueError, ValidationError) as error:
@@ -194,13 +200,13 @@ def _first_line(error: Exception) -> str:
 
 
 class Search:
-    """Trials of a study: train, report each epoch, and measure on all validation scenes.
+    """A search for settings. Each trial trains a machine and measures it on validation scenes.
 
     Args:
-        folder: folder of the study.
-        config: the common configuration.
-        data: the scenes.
-        space: the settings to search.
+        folder: folder of the trials.
+        config: configuration whose settings the trials change.
+        data: scenes for training and validation.
+        space: distribution of each searched setting, by setting name.
         by: metric to maximise.
     """
 
@@ -215,10 +221,12 @@ class Search:
         self.folder, self.config, self.data, self.space, self.by = folder, config, data, space, by
 
     def open(self, scenes: str, seed: int, *, prune: bool) -> Study:
-        """Open the study on disk or create it.
+        """Open the optuna study in the folder, or create it.
 
         Args:
             scenes: digest of the scenes.
+            seed: seed of the sampler.
+            prune: True stops trials that are below the median of earlier trials.
 
         Raises:
             ConfigError: the folder holds a search with another configuration, scenes or metric.
@@ -239,19 +247,22 @@ class Search:
             if prune
             else optuna.pruners.NopPruner(),
         )
-        # With the same seed, a resumed sampler would repeat its first points.
+        # With an unchanged seed, a resumed search would try the first settings again.
         study.sampler = optuna.samplers.TPESampler(seed=seed + len(study.trials))
         identity = {"config": self.config.digest, "scenes": scenes, "by": self.by}
         if study.user_attrs.setdefault("identity", identity) != identity:
             raise ConfigError(
-                f"{self.folder} holds a search with another configuration, scenes or metric; use "
+                f"{self.folder} holds a search with another configuration, scenes or metric: use "
                 "--fresh or another folder"
             )
         study.set_user_attr("identity", identity)
         return study
 
     def run(self, study: Study, trials: int) -> None:
-        """Run trials until the study has `trials`; the first trial uses the unchanged settings."""
+        """Run trials until the study has this number of trials.
+
+        The first trial uses the unchanged settings.
+        """
         import optuna
         from optuna.trial import TrialState
 
@@ -279,7 +290,7 @@ class Search:
             console.print(f"{shown(settings)}: {reason or value}", markup=False)
 
     def value_of(self, trial: Trial, settings: Mapping[str, Any]) -> float:
-        """Train and measure one trial.
+        """Train the machine of one trial, and return its metric on validation scenes.
 
         Raises:
             FloatingPointError: the training diverged.
@@ -325,7 +336,11 @@ class Search:
         return self.metrics(trainer.config.digest)
 
     def metrics(self, digest: str) -> dict[str, Metric]:
-        """Return `FIGURES` of a finished trial, over all validation scenes."""
+        """Return the metrics of `FIGURES` for a finished trial, over all validation scenes.
+
+        Args:
+            digest: digest of the trial's configuration.
+        """
         texts = (
             (self.folder / digest[:12] / f"{source}.json").read_text(encoding="utf-8")
             for source in sorted({scene.source for scene in self.data.validation.scenes})
@@ -339,7 +354,7 @@ class Search:
 
 
 def shown(settings: Mapping[str, Any]) -> str:
-    """Format settings in one line."""
+    """Format the changed settings of a trial in one line."""
     return ", ".join(f"{name.partition('.')[2]} {v}" for name, v in settings.items()) or "as it is"
 
 
@@ -364,7 +379,7 @@ def _suggested(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str,
 
 
 def _table(study: Study, title: str) -> Table:
-    """Return a table of trials from best to worst; trials without a value come last."""
+    """Return a table of the trials from best to worst. Trials without a metric come last."""
     table = Table(*FIGURES, "state", "settings", title=title)
     trials = [trial for trial in study.trials if "settings" in trial.user_attrs]
     for trial in sorted(trials, key=lambda t: math.inf if t.value is None else -t.value):
@@ -377,7 +392,7 @@ def _table(study: Study, title: str) -> Table:
 
 
 def _conclude(search: Search, study: Study, original: Config) -> None:
-    """Write the best configuration with the original number of epochs."""
+    """Write the best configuration to best.toml, with the original number of epochs."""
     best = study.best_trial
     base = next((t for t in _finished(study) if not t.user_attrs["settings"]), None)
     settings, digest = best.user_attrs["settings"], best.user_attrs["digest"]
@@ -385,14 +400,15 @@ def _conclude(search: Search, study: Study, original: Config) -> None:
     figures = ", ".join(f"{name} {text}" for name, text in best.user_attrs["figures"].items())
     comment = [
         f"{original.name}, {shown(settings)}.",
-        f"Validation scenes, {search.config.training.epochs} epochs: {figures}.",
+        f"Metrics on validation scenes, {search.config.training.epochs} epochs: {figures}.",
     ]
     if settings and base is not None:
         ours, theirs = search.metrics(digest), search.metrics(base.user_attrs["digest"])
         gaps = (f"{name} {paired_difference(ours[name], theirs[name])}" for name in ours)
-        comment.append(f"Difference to {original.name}, paired by scenes: {', '.join(gaps)}.")
+        comment.append(f"Paired difference from {original.name}: {', '.join(gaps)}.")
         comment.append(
-            f"The best of {len(study.trials)} trials is optimistic: train both with more seeds."
+            f"The figures of the best of {len(study.trials)} trials are optimistic: train both "
+            "configurations with several seeds."
         )
     path = search.folder / "best.toml"
     text = "".join(f"# {line}\n" for line in comment) + "\n" + config_toml(tuned)

@@ -97,7 +97,7 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         ("", "row: Field required"),
         ('[[row]]\nname = "x"', "row.0.what: Field required"),
         (ONE.format(name="x", rest="change = {}"), "row.0.change: Extra inputs"),
-        (ONE.format(name="x", rest=""), "x: the row does not change indoor-triway"),
+        (ONE.format(name="x", rest=""), "x: the row has the same settings as indoor-triway"),
         (ONE.format(name="x y", rest='from = "seed-rbm"'), "x y: String should match"),
         (ONE.format(name="x", rest='from = "nobody"'), "x: there is no configuration 'nobody'"),
         (ONE.format(name="x", rest='changes = { "a.b" = 1 }'), "x: there is no setting 'a.b'"),
@@ -107,9 +107,9 @@ ONE = '[[row]]\nname = "{name}"\nwhat = ""\n{rest}\n'
         (SEED.format(settings='"machine.G" = 0, "machine.N" = 9'), "machine.N is defined for the"),
         (
             ONE.format(name="indoor-triway", rest='from = "seed-rbm"'),
-            "two rows have the name indoor",
+            "the name indoor-triway occurs twice",
         ),
-        (ONE.format(name="x", rest='from = "seed-rbm"') * 2, "two rows have the name x"),
+        (ONE.format(name="x", rest='from = "seed-rbm"') * 2, "the name x occurs twice"),
     ],
 )
 def test_bad_rows_say_what_is_wrong(tmp_path, text, message):

@@ -132,7 +132,7 @@ def test_bad_requests_are_refused_before_anything_runs(tmp_path):
     assert not (tmp_path / "tuning").exists()
     _, config, *_ = arguments(tmp_path)
     code, output = run("tune", config)
-    assert (code, "name a TOML file with --space" in output) == (1, True)
+    assert (code, "Pass a TOML file with --space" in output) == (1, True)
 
 
 def test_other_scenes_are_another_search(finished, tmp_path):
