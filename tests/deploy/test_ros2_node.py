@@ -21,7 +21,7 @@ from scene_client import Client, UnreachableError
 from scene_client.vision_msgs import SceneFields
 from tests.client.ros_messages import blank
 from tests.deploy.ros import PACKAGE, STORE, Ros, from_json, load_package
-from tests.services import LiveService
+from tests.services import LiveService, launch
 
 
 @pytest.fixture
@@ -104,6 +104,19 @@ def test_detections_become_answers_markers_and_a_diagnosis(
     assert len(texts) == 3
     assert texts[0].startswith(f"{best['label']}? {best['placements'][0]['relation']} ")
     assert {marker.header.frame_id for marker in shown} == {"base_link"}
+
+
+def test_the_api_key_comes_from_a_file(
+    run: Callable[..., Running], recorded: Any, shared_store: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "key").write_text("incorrect-zebra-capacitor-nail\n")
+    key = {"SCENE_API_KEY": "incorrect-zebra-capacitor-nail"}
+    with launch(shared_store, tmp_path / "log", **key) as service:
+        for file, topic in ((str(tmp_path / "key"), "~/answers"), ("", "/diagnostics")):
+            running = run(url=service.url, timeout=20.0, api_key_file=file)
+            running.hear("detections", recorded)
+            running.tick_until(lambda running=running, topic=topic: running.said(topic))
+            assert bool(running.said("~/answers")) is bool(file)
 
 
 class Slow:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -41,9 +42,11 @@ class SceneNode(Node):
     def __init__(self) -> None:
         super().__init__("scene")
         self.ghosts_shown = self._parameter("ghosts", 3)
+        key_file = self._parameter("api_key_file", "")
         self.client = Client(
             self._parameter("url", "http://127.0.0.1:8000"),
             timeout=self._parameter("timeout", 0.5),
+            api_key=Path(key_file).read_text("utf-8").strip() if key_file else None,
         )
         names = list(self._parameter("class_names", [""]))
         self.advisor = Advisor(
