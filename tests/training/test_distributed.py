@@ -80,7 +80,7 @@ def torchrun(processes: int, *arguments: str) -> str:
         text=True,
         timeout=600,
     )
-    assert result.returncode == 0, result.stderr
+    assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
 
 
